@@ -1,1 +1,1 @@
-"""Contact of elastic bodies: contact sides, their rows, friction and load steps."""
+"""Contact of elastic bodies: contact sides, contact rows, friction and load steps."""

@@ -1,12 +1,11 @@
-"""Check of the balance of loads on bodies by supports and contacts, before any solve.
+"""Check, before any solve, that supports and contacts can balance the loads on bodies.
 
 The potential energy has a lower bound if and only if no rigid motion r that the
 supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains energy from the load
 (fᵀr > 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, an
 equivalent condition is the existence of contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.
-The residual of the non-negative least-squares problem for λ is, by Moreau's
-decomposition, itself such a motion r, and at the same time the unbalanced part of the
-load.
+By Moreau's decomposition, the residual of the non-negative least-squares problem for λ
+is such a motion r (in coordinates of Z), and also the unbalanced part of the load.
 """
 
 from __future__ import annotations
@@ -28,7 +27,8 @@ MAX_IMBALANCE = 1e-6
 #: components of a motion below this share of the largest one are not reported
 _MIN_MOTION = 1e-3
 _AXES = "xyz"
-#: sides of polygons around discs: their corners are 1/cos(π/16) = 1.02 times as far out
+#: number of sides of polygons around discs; the radius of their corners is
+#: 1/cos(π/16) = 1.02 times that of the disc
 POLYGON = 16
 
 Floats = NDArray[np.float64]
@@ -38,15 +38,15 @@ class _BodyMotion(NamedTuple):
     """Rigid motion of one body."""
 
     name: str
-    centre: Floats  #: (dim,) of its nodes, m
-    velocity: Floats  #: (dim,) of the centre
-    #: (1,) in the plane, (3,) in space, as of `rigid_motions`: velocities at the
-    #: distance `size` from the centre
+    centre: Floats  #: (dim,) centre of the nodes, m
+    velocity: Floats  #: (dim,) velocity of the centre
+    #: (1,) in the plane, (3,) in space: velocity at distance `size` from the centre due
+    #: to the rotation about each axis; `size` is that of `_motions`
     rotation: Floats
 
 
 def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
-    """Return True if supports and closed, sticking contact leave no rigid motion.
+    """Return True if supports and closed, sticking contact exclude all rigid motions.
 
     rows : (m, n) normal rows, and tangential rows of contacts with friction
     """
@@ -63,8 +63,8 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     Raises
     ------
     InputError
-        When some body can move. The message names the body, and the direction or the
-        centre of rotation of the motion.
+        If the load can move a body. The message states the body, and the direction or
+        the centre of rotation of its motion.
 
     """
     R, centres, size = _motions(bodies)
@@ -74,7 +74,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     load, closing = R.T @ bodies.f, csr_array(B) @ R
     threshold = MAX_IMBALANCE * np.abs(bodies.f).sum()
     modes, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
-    # translations along an axis first: their message is the simpler one
+    # translations along an axis come first, because their message is simpler
     sliding = [
         (b, axis)
         for b in range(len(bodies.names))
@@ -88,7 +88,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         raise InputError(
             _message([bodies.names[first]], f"its load in {' and '.join(axes)}")
         )
-    # the residual of least squares is a motion that closes no gap and gains energy
+    # the least-squares residual is a motion that closes no gap and gains energy
     motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
     if np.linalg.norm(motion) <= threshold:
         return
@@ -104,26 +104,28 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Raise an error for a load that friction with its bounds cannot balance.
+    """Raise an error for a load that friction with prescribed bounds cannot balance.
 
-    There must be forces λ_n ≥ 0 of the contact rows B and ‖λ_t‖ ≤ g of the friction
-    rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program minimises the 1-norm of
-    this residual. In space, polygons with `POLYGON` sides around the discs replace
-    them: loads that exceed friction by less than 2 % are left to the solve.
+    A load can be balanced if there are forces λ_n ≥ 0 of the contact rows B and
+    ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
+    minimises the 1-norm of this residual. In space, circumscribed polygons with
+    `POLYGON` sides replace the discs. A load that exceeds friction by less than 2 % may
+    hence pass this check and fail in the solve.
 
-    step, share : number of the load step, and the share of the load that acts in it
+    step : number of the load step
+    share : load factor of this step
 
     Raises
     ------
     InputError
-        When no such forces exist. The message states the unbalanced share of the load.
+        If no such forces exist. The message states the unbalanced share of the load.
 
     """
     R, _, _ = _motions(bodies)
     allowed = _kernel(bodies.B_D @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
-    from scipy.optimize import linprog  # imported here: seldom needed, slow to load
+    from scipy.optimize import linprog  # imported here: rarely needed, slow to import
 
     motions = R @ allowed
     forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
@@ -150,9 +152,11 @@ def check_friction(
 
 
 def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
-    """Return the rows of polygons around discs, with columns of other unknowns.
+    """Return the rows of polygons around discs, as arguments of `linprog`.
 
-    Empty in the plane, where the bounds of the unknowns suffice.
+    The result is empty in the plane, where bounds of the unknowns suffice.
+
+    before, after : numbers of other unknowns before and after those of friction
     """
     vectors = friction.vectors
     if vectors.shape[1] == 1:
@@ -170,10 +174,11 @@ def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
 
 
 def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
-    """Return R (n, r bodies), the centres (bodies, dim) of rotation, and a length, m.
+    """Return R (n, r·bodies), the centres (bodies, dim) of rotation, and `size`, in m.
 
-    The columns of each body are translations, and rotations about its centre that move
-    points at distance `size` by 1. With this scaling, all entries of Rᵀf are forces.
+    The columns of a body are its translations, followed by rotations about its centre
+    that displace points at distance `size` by 1. With this scaling, all entries of Rᵀf
+    are forces.
     """
     size = float(np.ptp(bodies.mesh.points, axis=0).max())
     parts = bodies.points_of_bodies
@@ -201,7 +206,10 @@ def _is_free_motion(
 
 
 def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
-    """Return the residual (k,) of least squares over λ ≥ 0 on rows `closing` (m, k)."""
+    """Return the unbalanced part (k,) of a load for contact rows `closing` (m, k).
+
+    It is the residual of the least-squares problem over forces λ ≥ 0.
+    """
     from scipy.optimize import nnls  # imported here: only floating bodies need it
 
     sizes = np.linalg.norm(closing, axis=1)
@@ -211,7 +219,7 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     A = (rows / np.linalg.norm(rows, axis=1)[:, None]).T
     try:
         forces, _ = nnls(A, load, maxiter=100 * A.shape[1])
-    except RuntimeError:  # the iteration limit proves no imbalance: accept the load
+    except RuntimeError:  # the iteration limit does not prove an imbalance: accept
         return np.zeros_like(load)
     return np.asarray(load - A @ forces)
 
@@ -237,7 +245,7 @@ def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
 
 
 def _pivot(turning: _BodyMotion, size: float) -> str:
-    """Return the points that a rotation leaves in place, or moves along its axis."""
+    """Describe the pivot of a planar rotation, or the axis of a screw motion."""
     if turning.rotation.size == 1:
         (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.rotation
         return f"({x - vy:.4g}, {y + vx:.4g}) m"

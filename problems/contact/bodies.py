@@ -1,4 +1,4 @@
-"""Elastic bodies in contact: all data of a contact problem except its contact rows."""
+"""Elastic bodies in contact: the data of a contact problem except its contact rows."""
 
 from __future__ import annotations
 
@@ -32,15 +32,18 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """A pair of sides that may touch: boundaries of a `Mesh`, chains or faces."""
+    """A pair of sides that may touch; each is a chain of nodes, or faces in space."""
 
     slave: Nodes
-    master: Nodes  #: empty for a rigid one
+    master: Nodes  #: empty for a rigid master
     rigid: RigidBody | None = None  #: master that does not deform
-    clamped: Nodes = NO_NODES  #: slave nodes that get no row against a rigid master
+    clamped: Nodes = NO_NODES  #: slave nodes without a row against a rigid master
 
     def renumbered(self, nodes: Nodes) -> ContactPair:
-        """Return the pair for a mesh of some nodes (k,), ascending."""
+        """Return the pair in the numbering of a mesh that contains only `nodes`.
+
+        nodes : (k,) ascending global numbers
+        """
         slave, master, clamped = (
             np.searchsorted(nodes, part)
             for part in (self.slave, self.master, self.clamped)
@@ -49,27 +52,27 @@ class ContactPair(NamedTuple):
 
     @property
     def sides(self) -> tuple[Nodes, Nodes]:
-        """Slave and master."""
+        """Slave side and master side."""
         return self.slave, self.master
 
     @property
     def slave_nodes(self) -> Nodes:
-        """Nodes that may get a contact row, in the order of the chain or ascending."""
+        """Slave nodes in the order of the chain; in space, ascending."""
         return self.slave if self.slave.ndim == 1 else np.unique(self.slave)
 
     @property
     def nodes(self) -> Nodes:
-        """Nodes of both sides, some of them repeatedly."""
+        """Nodes of both sides; some are repeated."""
         return np.concatenate([self.slave.ravel(), self.master.ravel()])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSides:
-    """The contact sides of bodies, without the bodies' interior."""
+    """Contact sides of bodies, without the interior of the bodies."""
 
-    mesh: Mesh  #: nodes of the sides, m; no cells
+    mesh: Mesh  #: nodes of the sides, m; without cells
     body_of_node: NDArray[np.int64]  #: (N,)
-    names: tuple[str, ...]  #: of all bodies
+    names: tuple[str, ...]  #: names of all bodies
     pairs: tuple[ContactPair, ...]
     length: float  #: l, unit of length of `Bodies`, m
     force: float  #: F₀, unit of force of `Bodies`, N/m; N in space
@@ -85,18 +88,18 @@ class UnassembledBodies:
     Raises
     ------
     ValueError
-        When the nodes are not numbered body by body.
+        If the nodes are not numbered body by body.
 
     """
 
-    mesh: Mesh  #: of all bodies, m
+    mesh: Mesh  #: joined mesh of all bodies, m
     body: NDArray[np.int64]  #: (E,) body of each cell
     names: tuple[str, ...]
     materials: tuple[Material, ...]
     plane: Plane | None  #: None in space
     length: float  #: l, unit of length, m
     force: float  #: F₀, unit of force, N/m; N in space
-    f: Vector  #: (n,) full load of eq. (1)
+    f: Vector  #: (n,) full load of eq. (1), non-dimensional
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
     pairs: tuple[ContactPair, ...]  #: sides that may touch
 
@@ -119,7 +122,7 @@ class UnassembledBodies:
 
     @property
     def rigid(self) -> NDArray[np.float64]:
-        """Orthonormal rigid motions of each body, ignoring supports, (n, r bodies)."""
+        """Orthonormal rigid motions of each body, ignoring supports, (n, r·bodies)."""
         return np.asarray(block_diag(*map(rigid_modes, self.points_of_bodies)))
 
     @property
@@ -132,7 +135,7 @@ class UnassembledBodies:
     def mesh_size(self) -> float:
         """Mean distance between neighbouring nodes of the slave sides, over `length`.
 
-        Without contact pairs, the mean over the whole boundary.
+        Without contact pairs, the mean is that over the whole boundary.
         """
         mesh, chains = self.mesh, [pair.slave for pair in self.pairs]
         if not chains or mesh.dim > 2:  # around each facet
@@ -149,7 +152,7 @@ class UnassembledBodies:
 
     @property
     def moduli(self) -> Vector:
-        """Young's modulus of each body, (bodies,), non-dimensional as in K."""
+        """Young's modulus of each body, (bodies,), non-dimensional like K."""
         return np.array([m.E for m in self.materials]) * (self.length / self.force)
 
     @property
@@ -182,8 +185,8 @@ def assemble(
     Parameters
     ----------
     body : (E,) body of each cell
-    names, materials : one per body
-    units : (l, F₀), the units of the non-dimensional QPs, m and N/m, in space N
+    names, materials : name and material of each body
+    units : (l, F₀), the units of the non-dimensional QPs: m, and N/m or (in space) N
     fixed : displacement components that are zero
     load : (n,) nodal forces: N/m in the plane, N in space
 
@@ -218,10 +221,11 @@ def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
 
 
 def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
-    """Factorise K with all its rigid modes, for duals with Dirichlet rows in B.
+    """Factorise K with all rigid modes as kernel, for duals with support rows in B.
 
-    condense : compute (K⁺)_cc on the components c with entries in B once; otherwise, as
-        in the paper, BK⁺Bᵀ of eq. (3) takes one solve per row of B in each load step
+    condense : compute (K⁺)_cc once, on the components c with entries in B; otherwise,
+        as in the paper, BK⁺Bᵀ of eq. (3) requires one solve per row of B in every load
+        step
     """
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
@@ -237,11 +241,11 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
     Raises
     ------
     InputError
-        When a rigid motion of some body is left.
+        If the supports allow a rigid motion of some body.
 
     """
     prescribed = bodies.B_D.indices
-    # not left to the factorisation: rounding may make a singular K look regular
+    # the factorisation may not detect this: rounding can make a singular K regular
     if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
             "the supports leave a rigid motion of some body, so dual-bounds does not "
@@ -253,9 +257,9 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
 
 
 def factorise_supported(bodies: Bodies) -> GeneralisedInverse:
-    """Factorise K without the prescribed components; bodies may float.
+    """Factorise K without the prescribed components, also for floating bodies.
 
-    Further components are fixed where the supports allow rigid motions, see
+    Where the supports allow rigid motions, further components are fixed; see
     `problems.fem.inverse.supported_inverse`.
     """
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)

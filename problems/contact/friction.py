@@ -1,17 +1,19 @@
-"""Laws of friction, their discretisation, and the fixed point of Coulomb's law.
+"""Friction laws, their discretisation, and the fixed-point iteration for Coulomb's law.
 
-The tangential traction q is bounded. Where the sides slip, q opposes the slip and is at
-its bound; where |q| is smaller, they stick:
+The tangential traction q is bounded. Where the sides slip, q opposes the slip and
+attains its bound; where |q| is smaller, the sides stick:
 
     |q| ≤ bound + mu·p
 
-with a constant `bound` (Tresca) or a multiple of the pressure p (Coulomb). A discrete
-row carries a force λ_t with  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is the length
-of slave side that belongs to its node and λ_n the multiplier of its contact row.
+with a constant `bound` (Tresca) or a multiple of the pressure p (Coulomb). The force
+λ_t of a discrete row satisfies  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is the
+length of the slave side assigned to the node of the row and λ_n the multiplier of its
+contact row.
 
-Coulomb's law has no potential. It is solved by fixed-point iteration over problems of
-Tresca's type, each with the bound g = mu·λ_n of its predecessor's solution (Haslinger
-1983, Math. Methods Appl. Sci. 5), a contraction for small mu.
+Coulomb's law does not derive from a potential. It is solved by fixed-point iteration
+over problems with Tresca's law, each with the bound g = mu·λ_n from the solution of its
+predecessor (Haslinger 1983, Math. Methods Appl. Sci. 5). The iteration is a contraction
+for small mu.
 """
 
 from __future__ import annotations
@@ -31,16 +33,17 @@ from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 
-#: residual ‖g − mu·λ_n‖/‖g‖ at which the fixed point counts as converged
+#: largest residual ‖g − mu·λ_n‖/‖g‖ of a converged fixed-point iteration
 FIXED_POINT_TOLERANCE = 1e-10
-MAX_ITERATES = 1000  #: Tresca problems per fixed point
-#: Tresca problems without a new smallest residual before the iteration is given up
+MAX_ITERATES = 1000  #: largest number of Tresca problems per fixed-point iteration
+#: the iteration is abandoned after this many Tresca problems without a new smallest
+#: residual
 MAX_STAGNATION = 30
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """The law between two sides, |q| ≤ bound + mu·p; by default no friction.
+    """Friction law |q| ≤ bound + mu·p between two sides; the default has no friction.
 
     >>> FrictionLaw("coulomb", mu=0.3).acts
     True
@@ -57,7 +60,7 @@ class FrictionLaw:
 
 
 def law_of(params: Mapping[str, Any]) -> FrictionLaw:
-    """Return the law of the keys friction, bound and mu, which were checked before."""
+    """Return the law from the keys `friction`, `bound` and `mu`, already validated."""
     kind = str(params["friction"])
     return FrictionLaw(
         kind,
@@ -77,10 +80,10 @@ def friction_of(
 
     Parameters
     ----------
-    laws : one per pair
+    laws : friction law of each pair
     slip_origin : (n,) displacement from which slip is measured
-    normal_forces : (places,) normal force of each slave node, for the bound of
-        Coulomb's law
+    normal_forces : (places,) normal force of each slave node, which determines the
+        bound of Coulomb's law
 
     """
     if not rows.row.size:
@@ -107,22 +110,22 @@ def friction_of(
 def coulomb_fixed_point(
     first: Friction, normal: Callable[[Friction], Vector], step: int
 ) -> list[Friction]:
-    """Iterate to the fixed point of Coulomb's law; return the friction of each problem.
+    """Solve Coulomb's law by fixed-point iteration; return friction for each iterate.
 
-    The residuals of all but the last are stored as `Friction.unsettled`.
+    `Friction.unsettled` of every iterate except the last is its residual.
 
     Parameters
     ----------
     first : friction with the initial bound
-    normal : solves the problem with the bound of a friction; returns the multipliers
-        λ_n (m,) of the contact rows
+    normal : function that solves the Tresca problem for the bounds of its argument and
+        returns the multipliers λ_n (m,) of the contact rows
     step : number of the load step, for messages
 
     Raises
     ------
     InputError
-        When the iteration does not converge, or `normal` raises ArithmeticError since
-        no equilibrium exists with some bound.
+        If the iteration does not converge, or if `normal` raises ArithmeticError
+        because no equilibrium exists for a bound.
 
     """
     iterates, residuals, friction = list[Friction](), list[float](), first
@@ -150,12 +153,12 @@ def coulomb_fixed_point(
 
 
 def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
-    """Return an iterate of the fixed point of a load step: 1, 2, …; 0 is the last.
+    """Select a fixed-point iterate of a load step: 1, 2, …; 0 selects the last.
 
     Raises
     ------
     PastEndError
-        When the fixed point has fewer iterates.
+        If the load step has fewer iterates.
 
     """
     if iterate > len(problems):
@@ -167,7 +170,7 @@ def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
 
 
 def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
-    """Return the normal force (places,) of each slave node; zero for nodes without row.
+    """Return the normal force (places,) of each slave node; zero if it has no row.
 
     Parameters
     ----------
@@ -176,6 +179,6 @@ def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
 
     """
     force = np.zeros(places)
-    # solutions to a tolerance may have multipliers below zero, bounds must not
+    # multipliers of inexact solutions may be negative, friction bounds may not
     force[place] = np.maximum(normal, 0.0)
     return force

@@ -1,24 +1,26 @@
-"""Coulomb's law between many bodies in the forces of its contacts, by convex problems.
+"""Coulomb's law for contacts between many bodies, by sequences of convex problems.
 
-Contacts have forces r, blocks (N, T₁[, T₂]) in friction cones K, ‖r_T‖ ≤ μ r_N, and
-velocities u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
+The unknowns are the contact forces r, in blocks (N, T₁[, T₂]) in friction cones K,
+‖r_T‖ ≤ μ r_N. The velocities are u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
 
     û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
 
-It has no potential, but its solutions are limits of two sequences of convex problems,
-in which the data of each problem are computed from the solution of its predecessor:
+This law does not derive from a potential, but two sequences of convex problems may
+converge to its solutions. The data of each problem are computed from the solution of
+its predecessor:
 
 * ``cones``: min ½rᵀWr + (q + s)ᵀr over K with s = (μ‖u_T‖, 0), initially 0 (Acary,
   Cadoux, Lemaréchal and Malick 2011, Z. Angew. Math. Mech. 91);
-* ``tresca``: the same with s = 0 over r_N ≥ 0, ‖r_T‖ ≤ g, with the bound g = μ r_N
-  (Haslinger 1983, Math. Methods Appl. Sci. 5); its first problem is that of ``cones``.
+* ``tresca``: the same objective with s = 0 over r_N ≥ 0, ‖r_T‖ ≤ g, with the bound
+  g = μ r_N (Haslinger 1983, Math. Methods Appl. Sci. 5); the first problem is that of
+  ``cones``.
 
-If rigid bodies have more contacts than equations of motion, W is singular, and the
-forces of a problem are not unique. The bounds of ``tresca`` then drift in the null
-space, and the loop does not converge for three stacked boxes. It therefore takes
-proximal steps: it adds ½δ‖r − r'‖² with the forces r' of the predecessor; the term
-vanishes as the loop converges. ``cones`` does so from the first problem that has no
-solution.
+If rigid bodies have more contacts than equations of motion, W is singular, and contact
+forces are not unique. The bounds of ``tresca`` then drift in the null space, and the
+loop does not converge for three stacked boxes. This loop therefore takes proximal
+steps: it adds ½δ‖r − r'‖² to the objective, where r' are the forces of the predecessor.
+The term vanishes as the loop converges. The loop ``cones`` takes proximal steps from
+the first problem without a solution on.
 """
 
 from __future__ import annotations
@@ -39,34 +41,36 @@ from mortarbench.harness.sets.discs import Discs
 from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
 
 LOOPS = ("cones", "tresca")
-#: largest asymmetry of W, relative to its largest entry, that counts as rounding: it
-#: changes the scaled natural map by about as much, and 1e-6 is asked for
+#: largest asymmetry of W, relative to its largest entry, that counts as rounding. The
+#: change of the scaled natural map is about as large, far below the required 1e-6
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9
-MAX_DENSE_ROWS = 3000  #: of a W whose eigenvalues are all computed, in 20 s
+#: largest dimension of W for which all eigenvalues are computed (about 20 s)
+MAX_DENSE_ROWS = 3000
 #: eigenvalues of W below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-10
-#: δ of the proximal step relative to the largest eigenvalue of W. Three boxes by
-#: ``tresca`` take 56 problems with 1e-2, 15 with 1e-3, 9 with 1e-4; 1e-5 diverges
+#: δ of the proximal step relative to the largest eigenvalue of W. For three stacked
+#: boxes, ``tresca`` takes 56 problems with 1e-2, 15 with 1e-3 and 9 with 1e-4, and
+#: diverges with 1e-5
 PROXIMITY = 1e-4
 ACTIVE = 1e-6  #: forces below this fraction of the largest count as zero
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionalContact:
-    """Contacts with Coulomb friction: W, q, μ, and equations A r = b of the forces.
+    """Contacts with Coulomb friction: W, q, μ, and equations A r = b for the forces.
 
     Raises
     ------
     InputError
-        If W is unsymmetric, so that the steps are not convex problems.
+        If W is not symmetric, in which case the steps are not convex problems.
 
     """
 
     W: Any  #: (n, n) sparse, stored as its symmetric part
-    q: Vector  #: (n,) velocity without forces
-    mu: Vector  #: (k,) coefficient of friction; n/k components per contact
+    q: Vector  #: (n,) velocity in the absence of contact forces
+    mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
     A: Any = None  #: (p, n) = Vᵀ
     b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,)
 
@@ -95,7 +99,7 @@ class FrictionalContact:
 
     @cached_property
     def _eigenvalues(self) -> Vector:
-        """All eigenvalues of W in ascending order; of a large W the largest one."""
+        """All eigenvalues of W, ascending; only the largest if W is large."""
         if self.q.size <= MAX_DENSE_ROWS:
             return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
         return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
@@ -136,9 +140,9 @@ class FrictionalContact:
         Parameters
         ----------
         r, multipliers : (n,) forces and λ (p,)
-        omega : velocity per force, to compare them; default: the largest eigenvalue of
-            W, with which the result does not depend on units. FCLIB's error has 1 in
-            the units of the file
+        omega : factor that converts forces to velocities. The default is the largest
+            eigenvalue of W, which makes the result independent of units. FCLIB's error
+            has omega = 1 in the units of the file
 
         """
         omega = self.stiffness if omega is None else omega
@@ -152,7 +156,7 @@ class FrictionalContact:
         )
 
     def scaled(self, force: float, velocity: float) -> FrictionalContact:
-        """Return the problem in units of force and velocity."""
+        """Return the problem in the given units of force and velocity."""
         return replace(
             self, W=self.W * (force / velocity), q=self.q / velocity, b=self.b / force
         )
@@ -184,27 +188,27 @@ class FrictionalContact:
 
 
 class ConvexStep(NamedTuple):
-    """A convex problem of a sequence that leads to Coulomb's law."""
+    """One convex problem of a sequence for Coulomb's law."""
 
     qp: QP
-    error: float  #: scaled natural map, in Coulomb's law, of its solution
+    error: float  #: scaled natural map of Coulomb's law at the solution of `qp`
 
 
 def coulomb_steps(
     contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
 ) -> list[ConvexStep]:
-    """Return the sequence of convex problems until it converges, or its first `count`.
+    """Return convex problems of the sequence `loop`, at most `count`.
 
     Parameters
     ----------
     loop : one of `LOOPS`
-    solve : solves convex problems; raises ArithmeticError if one has no solution
-    count : number of problems, or 0 for all
+    solve : solves a convex problem; raises ArithmeticError if it has no solution
+    count : number of problems; 0 continues until convergence
 
     Raises
     ------
     InputError
-        When a problem has no solution, or the sequence does not converge.
+        If a problem has no solution, or if the sequence does not converge.
 
     """
     steps, errors, method = (
@@ -234,7 +238,7 @@ def coulomb_steps(
 
 
 class _ProximalMethod:
-    """Solves convex problems, by proximal steps from the first one without solution."""
+    """Solver of the convex problems, with proximal steps once a solve has failed."""
 
     def __init__(
         self, contact: FrictionalContact, solve: Callable[[QP], Solution]
@@ -243,11 +247,11 @@ class _ProximalMethod:
         self._solve, self._delta = solve, PROXIMITY * contact.stiffness
 
     def solve(self, qp: QP, r: Vector) -> Solution:
-        """Solve `qp`, or with proximal steps  qp + ½δ‖x − r‖²."""
+        """Solve `qp`; with proximal steps, its objective plus ½δ‖x − r‖²."""
         if not self.is_proximal:
             try:
                 return self._solve(qp)
-            except ArithmeticError:  # W is singular, and no force is large enough
+            except ArithmeticError:  # W is singular and the objective unbounded
                 self.is_proximal = True
         P = csc_array(qp.P + self._delta * eye_array(r.size))
         try:
@@ -257,7 +261,7 @@ class _ProximalMethod:
 
 
 def _successor(contact: FrictionalContact, loop: str, s: Solution) -> QP:
-    """Return the problem with the data of its predecessor's solution."""
+    """Return the next problem of the sequence from the solution of the last one."""
     if loop == "tresca":
         normal = np.maximum(s.x[contact.cones.index[:, 0]], 0.0)
         return contact.tresca_step(contact.mu * normal)
@@ -266,7 +270,7 @@ def _successor(contact: FrictionalContact, loop: str, s: Solution) -> QP:
 
 
 def states(contact: FrictionalContact, r: Vector) -> NDArray[Any]:
-    """Return "open", "stick" or "slip" (k,) of each contact with forces r (n,)."""
+    """Return the state "open", "stick" or "slip" of each contact (k,) for r (n,)."""
     normal = r[contact.cones.index[:, 0]]
     least = ACTIVE * float(np.abs(r).max(initial=0.0))
     slips = contact.tangential(r) >= (1 - ACTIVE) * contact.mu * normal

@@ -1,4 +1,4 @@
-"""Contact rows of several pairs, by the method that the keys of a case select."""
+"""Contact rows of several pairs, by node-to-segment or mortar methods."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def linearisation(
     laws: Sequence[FrictionLaw] = (),
     fixed_segments: Nodes | None = None,
 ) -> Callable[[Vector], ContactRows]:
-    """Return the map from a displacement (n,) in m to the contact rows of all pairs.
+    """Return a function that maps a displacement (n,) in m to the rows of all pairs.
 
-    The map raises InputError when it yields no row at u = 0.
+    It raises InputError if no row results at u = 0.
 
-    contact : "nts" (node to segment, in space node to face) or "mortar"; rows of pairs
-        with a rigid master are nodal
-    basis : of the multipliers of mortar contact, "dual" or "standard"
-    laws : law of friction of each pair; empty: no friction
-    fixed_segments : (places,) for node-to-segment contact, the segment of each slave
-        node as in `closest_segments`; −1: the closest one at each u
+    contact : "nts" (node to segment, or node to face in space) or "mortar"; pairs with
+        a rigid master have nodal rows
+    basis : multiplier basis of mortar contact, "dual" or "standard"
+    laws : friction law of each pair; empty without friction
+    fixed_segments : (places,) segment of each slave node for node-to-segment contact,
+        numbered as in `closest_segments`; −1 selects the closest segment at each u
     """
     pairs = len(bodies.pairs)
     nodal, integral = METHODS[bodies.mesh.dim]
@@ -106,10 +106,11 @@ def linearisation(
 def contact_stiffness(
     bodies: Bodies, fixed_segments: Nodes | None = None
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
-    """Return the map from u (n,) in m and λ (m,) in N/m to the blocks −λ_i g_i''(u).
+    """Return a function that evaluates the blocks −λ_i g_i''(u).
 
-    The rows are those of node-to-segment contact, one per slave node; the blocks are
-    those of `problems.contact.node_to_segment.geometric_stiffness`.
+    Its arguments are u (n,) in m and λ (m,) in N/m; it returns the result of
+    `problems.contact.node_to_segment.geometric_stiffness` for all pairs. Contact is
+    node to segment, with one row per slave node.
 
     fixed_segments : see `linearisation`
     """
@@ -138,7 +139,7 @@ def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
 
     Returns
     -------
-    (places,) first node of each segment, as a position in its master's chain
+    (places,) first node of each segment, as a position in the chain of its master
 
     """
     segments = []

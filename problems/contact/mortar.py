@@ -3,7 +3,7 @@
 Source: Popp, Gee and Wall, "A finite deformation mortar contact formulation using a
 primal-dual active set strategy", Int. J. Numer. Meth. Engng 79 (2009) 1354-1391; for
 partly covered slave elements: Popp, Seitz, Gee and Wall, Comput. Methods Appl. Mech.
-Engrg. 264 (2013) 67-80. The terms "normal field" and "ray" are used here only.
+Engrg. 264 (2013) 67-80. The terms "normal field" and "ray" are not from these papers.
 
 On the slave segment between the nodes 1 and 2 let ξ ∈ [−1, 1], N_1 = (1 − ξ)/2,
 N_2 = (1 + ξ)/2, and let ν(ξ) = N_1 n_1 + N_2 n_2 interpolate the averaged normals of
@@ -16,14 +16,15 @@ node j
     Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + (the left-hand side at u^k),
     D_jk = ∫ Φ_j N_k ν,   M_jl = ∫ Φ_j N^m_l ν,   g̃_j = ∫ Φ_j |ν| g.
 
-*Balance.* At every Gauss point a row pulls the slave by Φ_j ν at x(ξ) and the master by
-−Φ_j ν at x(ξ) + g n, on the same line. So the forces of a row are in equilibrium and
-have no moment, up to rounding, on curved sides as well. (With n_j outside the integrals
+*Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
+−Φ_j ν on the master at x(ξ) + g n, along the same line. So the forces of a row are in
+equilibrium and have no moment, up to rounding, even on curved sides. (With n_j outside
+the integrals
 the moments are O(h²). A body supported by contact alone then rotates until a row far
 from the contact, at the end of an arc, balances the moments of the active rows.) Not
 normalising ν amounts to a weight of 1 − O(h²). The integrands of D are then
-polynomials, which the Gauss points integrate exactly: D does not depend on where the
-master's nodes divide the slave, and a row of the dual basis pulls the slave along n_j.
+polynomials, which the Gauss rule integrates exactly: D is independent of the position
+of the master's nodes, and a row of the dual basis acts on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -44,9 +45,9 @@ part, and N̄_j = N_j(ξ̄), the only linear solution is
 
 (for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
 
-The tangential rows of friction have (−ν_y, ν_x) in place of ν; across an open gap their
-forces have a moment. With either basis, the bound of a row is the constant bound of the
-traction times ∫ N_j |ν|.
+Friction rows have (−ν_y, ν_x) in place of ν; across an open gap, their forces have a
+moment. For both bases, the friction bound of a row under Tresca's law is the bound of
+the traction times ∫ N_j |ν|.
 
 Each row is divided by ∫ N_j |ν| over the covered part. Thus B is dimensionless, g̃ a
 length, and λ a nodal force per thickness as in node-to-segment contact, up to O(h²) on
@@ -74,11 +75,11 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-#: integration segments shorter than this, in ξ, are rounding of the projection and are
-#: left out
+#: integration segments shorter than this, in ξ, are due to rounding of the projection
+#: and are dropped
 MIN_SEGMENT = 1e-8
-#: averaged normals of a straight side differ by at most this: smaller components of
-#: ν − n_j count as zero, so that B is as sparse there as with one normal
+#: averaged normals of a straight side differ by at most this. Smaller components of
+#: ν − n_j count as zero, so that B is as sparse on straight sides as with one normal
 NORMAL_ROUNDING = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -95,7 +96,7 @@ class Mortar:
     D: csr_array  #: (s, 2s) ∫ Φ_j N_k ν, m
     M: csr_array  #: (s, 2v) ∫ Φ_j N^m_l ν, m
     gap: Vector  #: (s,) g̃_j = ∫ Φ_j |ν| g, m²
-    cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 for nodes without a master within reach
+    cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 for nodes that the master does not cover
 
 
 class Overlaps(NamedTuple):
@@ -103,7 +104,7 @@ class Overlaps(NamedTuple):
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 2) ends in ξ of the slave segment, ascending
+    xi: NDArray[np.float64]  #: (p, 2) both ends, as ξ on the slave segment, ascending
 
 
 class GaussPoints(NamedTuple):
@@ -134,17 +135,17 @@ def mortar(
     ----------
     points : (N, 2) reference positions X, m
     u : (2N,) displacement u^k at which to linearise, m
-    slave, master : (s,), (v,) chains of nodes, their bodies on the left
-    basis : of the multiplier, "dual" or "standard"
-    reach : limits of angle and distance of integration segments. Without a limit on the
-        angle, rays can graze a distant master; as the dual basis is negative in places,
-        weighted gaps would then be negative between bodies that are apart
+    slave, master : (s,), (v,) chains of nodes with their body on the left
+    basis : multiplier basis, "dual" or "standard"
+    reach : limits on the angle and distance of integration segments. Without a limit on
+        the angle, rays can graze a distant master. Because the dual basis is negative
+        in places, weighted gaps between separate bodies would then be negative
     tangential : add tangential rows for friction
 
     Raises
     ------
     InputError
-        When a position is not finite or a side has no segment.
+        If a position is not finite or a side has no segment.
 
     """
     s = current_surface(points, u, slave, "slave")
@@ -200,7 +201,7 @@ def overlaps(slave: Surface, master: Surface) -> Overlaps:
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
-    # the part [low, high] of the master segment AB between the lines along the normals
+    # [low, high] is the part of the master segment AB between the lines of the normals
     low, high = np.zeros(len(e)), np.ones(len(e))
     for side, (x_j, n_j) in zip((1.0, -1.0), zip(x, n, strict=True), strict=True):
         f_A, f_B = side * cross(x_j - A, n_j), side * cross(x_j - B, n_j)  # ≥ 0 inside
@@ -221,19 +222,19 @@ def overlaps(slave: Surface, master: Surface) -> Overlaps:
 def project(x: Points, n: Points, p: Points) -> Vector:
     """Project points p (k, 2) along normal fields onto slave segments; return ξ (k,).
 
-    x and n (2, k, 2) are the ends of the segments and the normals there. With
+    x and n (2, k, 2) are the ends of the segments and the normals at these ends. With
     x(ξ) = a_0 + p + ξ a_1 and n(ξ) = b_0 + ξ b_1,
 
         f(ξ) = (x(ξ) − p) × n(ξ) = q_2 ξ² + q_1 ξ + q_0.
 
-    The root returned is the one with f′ ≤ 0, the only root in [−1, 1] where p lies
-    between the lines along the end normals. Where no ray meets p, the value is finite
+    The function returns the root with f′ ≤ 0. If p lies between the lines along the end
+    normals, this is the only root in [−1, 1]. If no ray meets p, the value is finite
     but meaningless.
     """
     a_0, a_1 = (x[0] + x[1]) / 2 - p, (x[1] - x[0]) / 2
     b_0, b_1 = (n[0] + n[1]) / 2, (n[1] - n[0]) / 2
     q_2, q_1, q_0 = cross(a_1, b_1), cross(a_0, b_1) + cross(a_1, b_0), cross(a_0, b_0)
-    # (−q_1 − √…)/(2 q_2), rewritten: for q_2 → 0 it would cancel
+    # (−q_1 − √…)/(2 q_2), rewritten to avoid cancellation for q_2 → 0
     root = np.sqrt(np.maximum(q_1**2 - 4 * q_2 * q_0, 0.0)) - q_1
     return 2 * q_0 / np.where(root > 0, root, np.inf)
 
@@ -241,7 +242,7 @@ def project(x: Points, n: Points, p: Points) -> Vector:
 def cast_rays(
     slave: Surface, master: Surface, parts: Overlaps, reach: Reach
 ) -> GaussPoints:
-    """Cast rays from the Gauss points; leave out segments beyond the reach."""
+    """Cast rays from the Gauss points; drop segments beyond the reach."""
     e, m, ends = parts
     half = (ends[:, 1] - ends[:, 0]) / 2
     xi = ends.mean(axis=1)[:, None] + half[:, None] * ABSCISSAE
@@ -277,7 +278,7 @@ def _dual(gauss: GaussPoints) -> NDArray[np.float64]:
 
     centre = mean(gauss.xi)
     offset = gauss.xi - centre
-    offset = offset - mean(offset)  # correct the rounding of ξ̄: v may be tiny
+    offset = offset - mean(offset)  # correct rounding of ξ̄, because v may be tiny
     N = _shape(centre)
     slope = 2 * N[..., 0] * N[..., 1] / mean(offset**2) * offset
     return N + np.stack([-slope, slope], axis=-1)
@@ -289,9 +290,9 @@ def _shape(xi: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
-    """Add values (p, 2) at nodes (p, 2) into a vector (count,)."""
+    """Sum values (p, 2) at nodes (p, 2) into a vector (count,)."""
     total = np.bincount(nodes.ravel(), values.ravel(), minlength=count)
-    return total.astype(np.float64)  # bincount of an empty array has integers
+    return total.astype(np.float64)  # bincount of an empty array returns integers
 
 
 def _sum(
@@ -311,9 +312,9 @@ def _sum(
 def _rows(
     integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], shape: tuple[int, int]
 ) -> csr_array:
-    """Assemble (D u_s − M u_m)_j / cover_j for slave nodes j as a matrix acting on u.
+    """Assemble the matrix u ↦ (D u_s − M u_m)_j / cover_j for slave nodes j.
 
-    shape : (N, dim) of all nodes
+    shape : (N, dim), number of nodes of the mesh and dimension
     """
     N, dim = shape
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()

@@ -9,8 +9,8 @@ order in the total displacement u, with N_a and n fixed at u^k,
 
 This is the paper's B_M u ≤ c_M (Section 2). The paper calls the method "Mortar", but
 the condition is pointwise and fails the contact patch test; problems.contact.mortar
-passes it. n is the normal of the segment that contains the closest point, or at a
-vertex the averaged normal of the two segments. Where the closest point is inside a
+passes it. The normal n is that of the segment that contains the closest point, or at a
+vertex the averaged normal of the two segments. If the closest point is inside a
 segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
 
 Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
@@ -22,10 +22,11 @@ so that the friction forces are −Tᵀλ_t, as the contact forces are −Bᵀλ
 Beyond an end of the master, its last node is the closest point, with the normal of the
 last segment.
 
-A slave node can be assigned to a fixed segment: it then stays on the outer side of the
-whole line through that segment, wherever its closest point is. Newton's method needs
-this at a re-entrant vertex of the master, where the force of either segment pushes the
-node onto the other one and the closest segment alternates between iterations.
+A slave node can be assigned to a fixed segment. It then stays on the outer side of the
+whole line through that segment, irrespective of its closest point. Newton's method
+requires this at a re-entrant vertex of the master, where the force of each segment
+pushes the node onto the other segment and the closest segment alternates between
+iterations.
 """
 
 from __future__ import annotations
@@ -48,18 +49,18 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
-#: distance in ξ from an end of a segment within which a closest point is the vertex
+#: closest points within this distance in ξ of an end of a segment move to the vertex
 VERTEX_TOLERANCE = 1e-9
 
 
 class ContactRows(NamedTuple):
-    """Linear inequalities B u ≤ c on the total displacement u, and the slip T u."""
+    """Contact rows B u ≤ c for the total displacement u, and rows of the slip T u."""
 
     B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
     c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
-    share: Vector  #: (m_I,) length ∫N_j of the slave side that belongs to the row, m
+    share: Vector  #: (m_I,) length ∫N_j of the slave side assigned to the row, m
     place: Nodes  #: (m_I,) position of the row's node in the slave chain
 
 
@@ -82,22 +83,22 @@ def node_to_segment(
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    Returns one contact row per slave node, see the module's docstring for B, c and T.
+    The result has one contact row per slave node; see the module for B, c and T.
 
     Parameters
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
-    slave : (s,) chain of nodes, its body on the left
-    master : (v,) chain of nodes, its body on the left
+    slave : (s,) chain of nodes with its body on the left
+    master : (v,) chain of nodes with its body on the left
     tangential : add tangential rows for friction
-    fixed_segments : (s,) position in the master chain of the first node of each slave
-        node's fixed segment; −1: the closest segment
+    fixed_segments : (s,) fixed segment of each slave node, given by the position of its
+        first node in the master chain; −1 selects the closest segment
 
     Raises
     ------
     InputError
-        When a position is not finite or the master has no segment of positive length.
+        If a position is not finite or the master has no segment of positive length.
 
     """
     x = current_positions(points, u, slave, "slave")
@@ -112,7 +113,7 @@ def node_to_segment(
     node = np.column_stack([slave, master[ends]])
     weight = np.column_stack([-np.ones(len(slave)), N])
     B = rows_along(node, weight, closest.normal, points.size)
-    # friction has the weights of its contact row along the tangents
+    # friction rows have the weights of their contact row, along the tangents
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
         directions = tangents(closest.normal)
@@ -138,8 +139,8 @@ def geometric_stiffness(
 
         g'' = a''/L − (a' L'ᵀ + L' a'ᵀ)/L² − a L''/L² + 2a L' L'ᵀ/L³.
 
-    Where the closest point is a vertex of the master, the derivative is taken to be
-    zero: that of the averaged normal is not implemented.
+    If the closest point is a vertex of the master, the derivative is set to zero,
+    because that of the averaged normal is not implemented.
 
     Parameters
     ----------
@@ -148,8 +149,8 @@ def geometric_stiffness(
 
     Returns
     -------
-    blocks (s, 6, 6), Pa, and their displacement components (s, 6): those of the slave
-    node and of both ends of its segment
+    blocks (s, 6, 6), Pa, and their displacement components (s, 6), which are those of
+    the slave node and of both ends of its segment
 
     """
     x = current_positions(points, u, slave, "slave")
@@ -188,7 +189,7 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
     """Return the closest points of x (s, 2) on a chain, with outward normals."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
-    # snap to vertices, whose normal is the average: rounding must not select a segment
+    # snap to vertices, where the normal is averaged: rounding must not select a segment
     at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
@@ -199,9 +200,9 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
 def _projections(
     x: Points, line: Surface, fixed_segments: Nodes | None
 ) -> ClosestPoints:
-    """Return closest points of slave nodes x (s, 2), or feet on their fixed segments.
+    """Return closest points of slave nodes x (s, 2), or projections on fixed segments.
 
-    On the line of a fixed segment, ξ may be outside of [0, 1].
+    On the line of a fixed segment, ξ may be outside [0, 1].
     """
     closest = closest_points(x, line)
     if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():

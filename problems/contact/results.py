@@ -29,7 +29,7 @@ IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
 class BulkResults(NamedTuple):
-    """Results of the bodies apart from their contact."""
+    """Results of the bodies that do not refer to contact."""
 
     nodes: int
     elements: int
@@ -48,7 +48,7 @@ def quantities(
 ) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses, see `results_of`.
 
-    stresses : nodal stresses (N,) by name; default: those of linear elasticity
+    stresses : nodal stresses (N,) by name; by default those of linear elasticity
     """
     l, owner = bodies.length, bodies.body_of_node
     stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
@@ -71,17 +71,18 @@ def results_of(
 ) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses by name.
 
-    energy: ½uᵀKu − fᵀu, J/m. contact_force: the force −ΣBᵀλ of contact and friction on
-    the master's body (on the slave's if the master is rigid), N/m; absent with several
-    pairs, where a sum over pairs is meaningless and `contacts` has the single forces.
-    In space energies are in J and forces in N.
-    max_von_mises: largest patch-recovered stress per body, Pa. contacts: results per
-    pair, see `pair_results`. With friction also the items of `friction_quantities`.
+    `energy` is ½uᵀKu − fᵀu in J/m. `contact_force` is the total force −ΣBᵀλ of contact
+    and friction on the body of the master (of the slave if the master is rigid) in N/m.
+    It is absent if there are several pairs, whose sum is meaningless; `contacts` then
+    contains the force of each pair. In space, energies are in J and forces in N.
+    `max_von_mises` is the largest patch-recovered stress per body in Pa. `contacts` has
+    the results per pair, see `pair_results`. With friction, the items of
+    `friction_quantities` are added.
 
     Parameters
     ----------
-    bodies, primal, s, friction : of all nodes, or of the nodes of the sides alone; with
-        friction, the diagonal of P is used
+    bodies, primal, s, friction : data of all nodes, or of the nodes of contact sides
+        alone; with friction, the diagonal of P is used
 
     """
     forces = contact_forces(bodies, primal, s, friction)
@@ -109,13 +110,13 @@ def results_of(
 def _contact_force(
     bodies: Bodies | ContactSides, forces: NDArray[np.float64]
 ) -> dict[str, list[float]]:
-    """Return the total force of a single pair on one body; {} for several pairs."""
+    """Return the total force on one body of a single pair; {} for several pairs."""
     if len(bodies.pairs) > 1:
         return {}
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
-    # contact forces act on both bodies: sum those on one of them, or they cancel
+    # contact forces on both bodies cancel: sum over one of them
     loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
@@ -123,14 +124,15 @@ def _contact_force(
 def friction_quantities(
     bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
-    """Return counts of friction states, the residual of Coulomb's law, dissipation.
+    """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
-    open, stick, slip: numbers of contact rows with friction that are inactive, active
-    below the bound, and active at the bound. sliding_without_contact: number of
-    inactive rows that carry shear, which Tresca's law allows; they do not count as
-    open. shear_without_contact: their share of Σ‖λ_t‖. friction_residual:
-    ‖g − mu·λ_n‖/‖g‖ for Coulomb's law, 0 for Tresca's. dissipation: Σ g‖Tu − s‖, the
-    work of friction in this step, J/m; J in space.
+    `open`, `stick` and `slip` are the numbers of frictional contact rows that are
+    inactive, active below the bound, and active at the bound. `sliding_without_contact`
+    is the number of inactive rows with shear, which Tresca's law allows; these rows do
+    not count as open. `shear_without_contact` is their share of Σ‖λ_t‖.
+    `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for Tresca's.
+    `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m, or J in
+    space.
     """
     state = states(primal, s, friction)
     shear = norms(s.z[primal.h.size :][friction.vectors])
@@ -153,12 +155,12 @@ def pair_results(
 ) -> dict[str, dict[str, Any]]:
     """Return the results of each contact pair by its name.
 
-    force: force on each of its bodies, N/m. largest_pressure: largest value at a slave
-    node, Pa. smallest_gap: m; negative where bodies overlap. half_width: half the
-    length of the undeformed slave side that belongs to nodes under pressure, m; in
-    space, pressed_area is the area that belongs to these nodes, m². With friction:
-    friction_force, its part of the force on the slave, N/m, and the numbers of nodes
-    that stick and slip.
+    `force` is the force on each body of the pair in N/m; `largest_pressure` is the
+    largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if bodies
+    overlap; `half_width` is half the undeformed length in m of the slave side under
+    pressure (in space, `pressed_area` is its area in m²). With friction,
+    `friction_force` is the contribution of friction to the force on the slave in N/m,
+    and the numbers of nodes that stick and slip are included.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)
@@ -237,9 +239,9 @@ def contact_forces(
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
     """Recover nodal stresses (N,) by name, Pa, from the displacement u (n,), m.
 
-    In the plane sxx, syy and sxy, with szz = ν(σ_x + σ_y) in plane strain; in space all
-    six components. von_mises is computed from the recovered components rather than
-    recovered by itself, so that all names are consistent.
+    The components are sxx, syy and sxy in the plane, with szz = ν(σ_x + σ_y) in plane
+    strain, and all six in space. `von_mises` is computed from the recovered components
+    instead of being recovered itself, so that all values are consistent.
     """
     stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))
     nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]

@@ -6,8 +6,8 @@ x = X + u^k and n fixed there,
 
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
-which is exact for planes. Each row has the entries of one node only, so that rows are
-orthonormal. Tangential rows for friction are T = −t at the node, with the tangents t.
+which is exact for planes. The nonzero entries of a row belong to one node, so that the
+rows are orthonormal. Friction rows are T = −t at the node, with the tangents t.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class RigidBody(Protocol):
-    """A body that nodes cannot enter."""
+    """A rigid body, described by its signed distance function."""
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -42,7 +42,7 @@ class RigidBody(Protocol):
 class RigidPlane:
     """The half space below a plane."""
 
-    point: tuple[float, ...]  #: on the plane, m
+    point: tuple[float, ...]  #: a point on the plane, m
     normal: tuple[float, ...]  #: outward unit normal
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
@@ -53,7 +53,7 @@ class RigidPlane:
 
 @dataclass(frozen=True)
 class RigidSphere:
-    """A ball; in the plane a disc."""
+    """A ball, or a disc in the plane."""
 
     centre: tuple[float, ...]  #: m
     radius: float  #: m
@@ -67,8 +67,8 @@ class RigidSphere:
 class RigidCylinder:
     """An infinite circular cylinder in space."""
 
-    point: tuple[float, ...]  #: on the axis, m
-    axis: tuple[float, ...]  #: unit vector
+    point: tuple[float, ...]  #: a point on the axis, m
+    axis: tuple[float, ...]  #: unit vector along the axis
     radius: float  #: m
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
@@ -96,20 +96,20 @@ def rigid_rows(
     clamped: Nodes = NO_NODES,
     tangential: bool = False,
 ) -> ContactRows:
-    """Return rows that keep the nodes of a side out of a rigid body, linearised at u.
+    """Return the contact rows of a side against a rigid body, linearised at u.
 
     Parameters
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
     side : boundary of a `Mesh`
-    clamped : nodes of the side without a row: all their components are prescribed
+    clamped : nodes of the side without a row, all components of which are prescribed
     tangential : add tangential rows for friction
 
     Raises
     ------
     InputError
-        When a position is not finite, or at the centre of a sphere or cylinder.
+        If a position is not finite, or at the centre of a sphere or cylinder.
 
     """
     dim, nodes = points.shape[1], side if side.ndim == 1 else np.unique(side)
@@ -131,7 +131,7 @@ def rigid_rows(
 
 
 def _rows(values: Points, components: Nodes, n: int) -> csr_array:
-    """Return rows (k, n) with values (k, dim), zeros left out, at components."""
+    """Return rows (k, n) with values (k, dim) at components, dropping zeros."""
     k, dim = values.shape
     start = dim * np.arange(k + 1)
     parts = values.ravel(), components.ravel(), start

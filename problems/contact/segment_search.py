@@ -1,18 +1,18 @@
 """Closest-point search on chains of segments, at near-linear cost.
 
-The segments are grouped by four along the chain into a tree of *fat chords*: a
-sub-chain from node A to node B lies within some deviation δ of its chord AB, and AB
-lies within δ of the sub-chain (as a point moves along the sub-chain, its closest point
-on AB passes over all of AB). Hence for the distance from any point p
+The segments are grouped by four along the chain into a tree of *fat chords*. A
+sub-chain from node A to node B lies within a deviation δ of its chord AB, and AB lies
+within δ of the sub-chain: as a point moves along the sub-chain, its closest point on AB
+traverses all of AB. Hence the distance from any point p satisfies
 
     |p − AB| − δ  ≤  |p − sub-chain|  ≤  |p − AB| + δ.
 
 Descending the tree, a query follows a sub-chain unless these bounds rule it out. On a
 smooth chain δ decreases with the square of the sub-chain's length, so that each query
-follows O(1) sub-chains per level at any distance; bounding boxes or balls would admit
-more of them with growing distance. Leaves are segments with δ = 0, so the result is
-exact. The worst case is a point equally far from the whole chain (the centre of an
-arc), for which no sub-chain can be ruled out.
+follows O(1) sub-chains per level at any distance, whereas with bounding boxes or balls
+their number would grow with the distance. Leaves are segments with δ = 0, so that the
+result is exact. The worst case is a point equidistant from the whole chain (the centre
+of an arc), for which no sub-chain can be ruled out.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
-ROOTS = 16  #: most sub-chains on the top level; another level above them costs more
-#: relative rounding of distances, so that equally close segments do not rule each other
-#: out
+ROOTS = 16  #: largest number of sub-chains on the top level; more levels cost more
+#: relative rounding of distances; without it, equally close segments could rule each
+#: other out
 ROUNDING = 1e-12
 
 
@@ -41,7 +41,8 @@ ROUNDING = 1e-12
 class Reach:
     """Limits of angle and distance within which points of two sides may touch."""
 
-    cosine: float = -0.5  #: largest n_s·n_m; −½: normals at most 60° from opposite
+    #: largest n_s·n_m; −½ admits normals that deviate by at most 60° from opposite
+    cosine: float = -0.5
     #: largest distance, m; None: the larger extent of the two sides
     distance: float | None = None
 
@@ -72,7 +73,7 @@ Criterion = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 
 
 class Nearest(NamedTuple):
-    """Closest points on a chain; segments are numbered as in its Surface."""
+    """Closest points on a chain; segments are numbered as in its `Surface`."""
 
     segment: Nodes  #: (s,)
     xi: Vector  #: (s,) coordinate on the segment, from 0 at its first node to 1
@@ -81,7 +82,7 @@ class Nearest(NamedTuple):
 def nearest(x: Points, line: Surface) -> Nearest:
     """Return the closest point of a chain to each point of x (s, 2).
 
-    Of several segments that are equally close, up to rounding, the first one counts.
+    If several segments are equally close up to rounding, the first one is selected.
     """
 
     def keep(level: Chords, query: Nodes, node: Nodes) -> NDArray[np.bool_]:
@@ -102,8 +103,8 @@ def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
     """Return the pairs of slave and master segments that may overlap along normals.
 
     With f_j(p) = (x_j − p) × n_j, a point p lies between the lines along the averaged
-    normals of nodes j and j + 1 where f_j(p) ≥ 0 ≥ f_{j+1}(p). The master segment of
-    each pair has a point with f_j ≥ 0 and a point with f_{j+1} ≤ 0.
+    normals of nodes j and j + 1 if f_j(p) ≥ 0 ≥ f_{j+1}(p). The master segment of each
+    returned pair has a point with f_j ≥ 0 and a point with f_{j+1} ≤ 0.
 
     Returns
     -------
@@ -158,8 +159,8 @@ def _levels(line: Surface) -> list[Chords]:
 def _levels_from_leaves(line: Surface) -> Iterator[Chords]:
     """Yield the levels of the tree, from the segments to the roots.
 
-    The chords of the parts of a sub-chain end at nodes within some h of its own chord,
-    so these chords lie within h of it, and δ = h + (largest δ of the parts) bounds the
+    If the end nodes of the parts of a sub-chain lie within a distance h of its chord,
+    so do the chords of the parts, and δ = h + (largest δ of the parts) bounds the
     deviation of the sub-chain.
     """
     nodes = np.concatenate([line.start, line.end[-1:]])
@@ -188,7 +189,7 @@ def _chords(start: Points, end: Points, deviation: Vector) -> Chords:
 
 
 def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
-    """Return coordinate in [0, 1] and distance of the closest point on each chord."""
+    """Return the closest point on each chord: coordinate in [0, 1] and distance."""
     edge = level.edge.take(node, axis=0)
     offset = x - level.start.take(node, axis=0)
     xi = np.einsum("px,px->p", offset, edge) * level.inverse[node]
@@ -198,7 +199,7 @@ def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
 
 
 def _minimum_per_query(values: Vector, query: Nodes) -> Vector:
-    """Return, for each pair, the minimum over its query; queries are sorted."""
+    """Return, for each pair, the minimum over all pairs of its query (sorted)."""
     first = _first_of_each(query)
     pairs = np.diff(first, append=query.size)
     return np.minimum.reduceat(values, first).repeat(pairs)

@@ -1,10 +1,10 @@
 """Contact results along the slave side of each pair: forces, pressures, gaps, states.
 
 The rows of the primal QP are ordered pair by pair, and along the slave side within a
-pair. A rigid master has one row per slave node that is not clamped. Any other row is
-assigned to the first pair, from the pair of the preceding row on, whose two sides
-contain all nodes of the row. If two pairs share nodes on both sides, rows on these
-nodes therefore belong to the first of them.
+pair. A pair with a rigid master has one row per slave node that is not clamped. Any
+other row is assigned to the first pair, starting at the pair of the preceding row,
+whose two sides contain all nodes of the row. If two pairs share nodes on both sides,
+rows on these nodes are therefore assigned to the first pair.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def contact_sides(
 ) -> tuple[ContactSide, ...]:
     """Return forces, pressures and gaps along the slave side of each pair, in SI units.
 
-    The nodal force is the sum of contact and friction. The pressure is the component of
-    the contact force along the normal of the deformed side, divided by the undeformed
-    length ∫N_j (in space, area) that belongs to the node. The gap is the slack c − Bu
-    of the node's row; with mortar contact, this is the mean gap around the node with
-    the weights of the row. With friction, the shear is the friction force along the
-    tangent (−n_y, n_x) over the same length, in space its size over the area, and each
-    node has one of the `states`.
+    Nodal forces are the sum of contact and friction forces. The pressure is the
+    component of the contact force along the normal of the deformed side, divided by the
+    undeformed length ∫N_j (area in space) assigned to the node. The gap is the slack
+    c − Bu of the row of the node; for mortar contact, it is a weighted mean of the gap
+    around the node. With friction, each node has one of the `states`, and the shear is
+    the friction force along the tangent (−n_y, n_x) divided by this length; in space,
+    it is the magnitude of the friction force divided by this area.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
@@ -98,17 +98,17 @@ def contact_sides(
 def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     """Classify tangential vectors (v,) as "open", "stick", "slip" or `SLIDING`.
 
-    Those of inactive rows are open, or `SLIDING` if they carry shear, which Tresca's
-    law allows and Coulomb's does not. One of an active row sticks if its slip is at
-    most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, the slip that the unused part of the bound would
-    cause if only the nodes of the row could move.
+    A vector of an inactive row is open, or `SLIDING` if its shear is nonzero, which
+    Tresca's law allows and Coulomb's does not. A vector of an active row sticks if its
+    slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ. This is the slip that the unused part of
+    the bound would cause if only the nodes of the row could move.
     """
     vectors = friction.vectors
     if not vectors.size:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
-    # T diag(K)⁻¹ Tᵀ of each row; components without stiffness count as of stiffness 1
+    # T diag(K)⁻¹ Tᵀ of each row, with stiffness 1 for components without stiffness
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
     shear, first = norms(tangential[vectors]), vectors[:, 0]
     room = (friction.bound[first] - shear) * softness[vectors].mean(axis=1)
@@ -126,7 +126,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
 
 
 def pair_names(bodies: Bodies | ContactSides) -> list[str]:
-    """Return pair names "SLAVE on MASTER", with a number where a name repeats."""
+    """Return pair names "SLAVE on MASTER", numbered if a name is repeated."""
     names: list[str] = []
     for pair in bodies.pairs:
         slave, master = bodies_of(bodies, pair)
@@ -144,7 +144,7 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 
 
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
-    """Return the slice of rows of B (m, n) that belongs to each pair."""
+    """Return, for each pair, the slice of its rows in B (m, n)."""
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
     # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
@@ -153,8 +153,8 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
         if pair.rigid is not None:
             end = first + pair.slave_nodes.size - pair.clamped.size
         else:
-            # the rows of the pair end before the first row with a node beyond its two
-            # sides, or that of a rigid master, which has nodes of the slave only
+            # the rows of the pair end before the first row with a node outside both
+            # sides, or the first row against a rigid master, with slave nodes only
             other, opposite = np.ones(N), np.zeros(N)
             other[pair.nodes] = 0.0
             opposite[pair.master if pair.master.size else pair.slave] = 1.0
@@ -169,11 +169,11 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
 def slave_places(
     B: csr_array, slave: Nodes, dim: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the slave node of each row, the one with the largest entries of B.
+    """Return the slave node of each row, the node with the largest entries of B.
 
     Returns
     -------
-    positions (r,) in `slave`, and unit vectors (r, dim) along the entries there
+    positions (r,) in `slave`, and unit vectors (r, dim) along the entries of that node
 
     """
     components = [B[:, dofs_of(slave, dim, axis)] for axis in range(dim)]

@@ -1,16 +1,16 @@
 """Load steps with re-linearised contact, and Coulomb's law in each (paper, Section 2).
 
-A load step starts from the solution of its predecessor. Its contact rows are linearised
-at that solution, and `relin` − 1 more times at its own; each linearisation is a
-`Stage`. The QP of a stage is posed on undivided bodies by one process
-(`problems.duality.undivided`), or on subdomains by MPI ranks
-(`problems.duality.divided`). relin = 1 is the paper's scheme, of first order in
+A load step starts from the solution of its predecessor. Contact is linearised at that
+solution, and `relin` − 1 more times at the solution of the preceding linearisation;
+each linearisation is a `Stage`. The QP of a stage is that of undivided bodies on one
+process (`problems.duality.monolithic`), or of subdomains on MPI ranks
+(`problems.duality.decomposed`). The scheme of the paper is relin = 1, of first order in
 1/steps.
 
 With friction, slip is measured from the solution of the preceding load step
 (``quasi-static``: T(u − u_prev), which depends on the path) or from the undeformed
-state (``static``: T u). Each stage iterates Coulomb's law to its fixed point,
-g ← mu·λ_n, starting with the normal forces of the stage before.
+state (``static``: T u). Each stage solves Coulomb's law by the fixed-point iteration
+g ← mu·λ_n, starting from the normal forces of the preceding stage.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from mortarbench.problems.fem.mesh import Nodes
 class Forces(NamedTuple):
     """Non-dimensional nodal forces at some components; zero at all others."""
 
-    component: Nodes  #: (k,) without repetitions
+    component: Nodes  #: (k,) distinct components
     value: Vector  #: (k,)
 
 
 class State(NamedTuple):
-    """Initial state of a stage, with displacements of w components."""
+    """Initial state of a stage, with w displacement components."""
 
     u: Vector  #: (w,) displacement at which contact is linearised
     slip_origin: Vector  #: (w,) displacement from which slip is measured
@@ -48,23 +48,24 @@ class State(NamedTuple):
 
 
 def continue_slip(end: State) -> State:
-    """Return the end of the preceding stage as initial state, with its slip origin."""
+    """Return the final state of the preceding stage, with unchanged slip origin."""
     return end
 
 
 def restart_slip(end: State) -> State:
-    """Return the end of the preceding stage, with slip measured from there."""
+    """Return the final state of the preceding stage as the new slip origin."""
     return end._replace(slip_origin=end.u)
 
 
 def with_normal_forces(
     begin: Callable[[State], State], force: float
 ) -> Callable[[State], State]:
-    """Start Coulomb's law of each stage from the same normal force at every slave node.
+    """Return `begin` with the normal force of every slave node replaced by `force`.
 
-    The normal forces of the previous stage bound friction by what the previous load
-    needed. Where friction alone supports a body, that bound cannot balance a larger
-    load, and the first problem of the fixed point would have no solution.
+    The normal forces of the preceding stage limit friction to the forces required by
+    the preceding load. If a body is supported by friction alone, this bound cannot
+    balance a larger load, and the first problem of the fixed-point iteration for
+    Coulomb's law would have no solution.
     """
 
     def begin_with(end: State) -> State:
@@ -81,8 +82,8 @@ class Stage:
     step: int  #: number of the load step, 1, 2, …
     part: float  #: load factor: share of `forces` that acts
     forces: Forces  #: full load
-    fixed: Nodes  #: components that supports prescribe as zero
-    laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty: no friction
+    fixed: Nodes  #: components fixed by supports
+    laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction
     #: map from the end of the preceding stage to the initial state of this one
     begin: Callable[[State], State] = continue_slip
 
@@ -98,7 +99,7 @@ def load_steps(
 ) -> tuple[Stage, ...]:
     """Return the stages of a load that grows in equal steps, `relin` stages per step.
 
-    quasi_static : measure slip from the preceding load step; False: from rest
+    quasi_static : measure slip from the preceding load step, instead of from rest
     """
     return tuple(
         Stage(
@@ -116,16 +117,16 @@ def load_steps(
 
 
 class LinearisedProblem(Protocol):
-    """A linearised contact problem, whose dual accepts any friction bound."""
+    """A linearised contact problem; its dual can be solved for any friction bounds."""
 
     @property
     def friction(self) -> Friction:
-        """Friction of the rows, with the initial bound."""
+        """Discrete friction with the initial bound."""
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the bound of `friction`.
 
-        start : solution with another bound, as initial guess
+        start : solution for another bound, used as initial guess
         """
 
     def normal_multipliers(self, s: Solution) -> Vector:
@@ -139,24 +140,24 @@ P = TypeVar("P", bound=LinearisedProblem)
 
 
 class Iterate(NamedTuple, Generic[P]):
-    """Iterate of the fixed-point iteration of a stage: problem and friction bound."""
+    """Fixed-point iterate of a stage: linearised problem and friction bound."""
 
     problem: P
-    friction: Friction  #: with the bound of this iterate
-    solution: Callable[[], Solution]  #: solve the dual, once
+    friction: Friction  #: friction with the bound of this iterate
+    solution: Callable[[], Solution]  #: returns the dual solution, solved once
 
 
 @dataclass(frozen=True, eq=False)
 class LoadPath(Generic[P]):
-    """Load path: the stages of one analysis, solved on demand, each only once.
+    """Load path: the stages of one analysis, solved once and on demand.
 
     Raises
     ------
     ArithmeticError
-        When a reference solve is not accurate.
+        If a reference solve is not accurate.
     InputError
-        When a fixed point of Coulomb's law does not converge, has fewer iterates than
-        requested, or reaches bounds without an equilibrium.
+        If the fixed-point iteration for Coulomb's law does not converge, has fewer
+        iterates than requested, or reaches bounds for which no equilibrium exists.
 
     """
 
@@ -168,14 +169,14 @@ class LoadPath(Generic[P]):
     )
 
     def problem(self, step: int, iterate: int = 0) -> Iterate[P]:
-        """Return the problem of a load step (1, 2, …) in its last linearisation.
+        """Return an iterate of the last linearisation of a load step (1, 2, …).
 
-        iterate : number of the iterate of Coulomb's law, 1, 2, …; 0: the last one
+        iterate : number of the iterate for Coulomb's law, 1, 2, …; 0 selects the last
         """
         return select_iterate(self.problems(self.last_of(step)), iterate, step)
 
     def iterates(self, step: int) -> int:
-        """Count the iterates of Coulomb's law in a load step; 1 for other laws."""
+        """Return the number of iterates of a load step; 1 without Coulomb's law."""
         return len(self.problems(self.last_of(step)))
 
     def last_of(self, step: int) -> int:
@@ -183,7 +184,7 @@ class LoadPath(Generic[P]):
         return max(i for i, stage in enumerate(self.stages) if stage.step == step)
 
     def problems(self, i: int) -> list[Iterate[P]]:
-        """Return the iterates of stage i (0, 1, …); solve earlier ones first."""
+        """Return the iterates of stage i (0, 1, …); solves preceding stages first."""
         while len(self._history) <= i:
             stage = self.stages[len(self._history)]
             state = stage.begin(self._end_state())
@@ -201,14 +202,14 @@ class LoadPath(Generic[P]):
 
 
 def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
-    """Iterate Coulomb's law to its fixed point; other laws have a single iterate."""
+    """Return the iterates for Coulomb's law, or the single iterate of other laws."""
     if not any(law.mu for law in stage.laws):
         first = linearised.friction
         return [Iterate(linearised, first, cache(lambda: linearised.solve(first)))]
     solutions = list[Solution]()
 
     def normal(friction: Friction) -> Vector:
-        # the bound changes little between iterates: start from the last solution
+        # bounds change little between iterates, so start from the last solution
         start = solutions[-1] if solutions else None
         solutions.append(linearised.solve(friction, start))
         return linearised.normal_multipliers(solutions[-1])
@@ -224,6 +225,6 @@ def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
 
 
 def forces_of(f: Vector) -> Forces:
-    """Return the non-zero components of a load (n,)."""
+    """Return the nonzero components of a load (n,)."""
     component = np.flatnonzero(f)
     return Forces(component, f[component])

@@ -20,14 +20,14 @@ from mortarbench.problems.fem.mesh import (
 
 Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
 
-#: segments shorter than this times the longest of their chain count as points: the
-#: direction of their edge is rounding
+#: segments shorter than this times the longest one of their chain count as points,
+#: because their direction is dominated by rounding
 MIN_RELATIVE_LENGTH = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Facets with the body on their left; segments of zero length are left out.
+    """Facets with the body on their left; segments of zero length are dropped.
 
     A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
     a face is that of the plane through the midpoints of its edges. The normal of a node
@@ -83,7 +83,8 @@ def current_surface(points: Points, u: Vector, side: Nodes, name: str) -> Surfac
     Raises
     ------
     InputError
-        When a position is not finite, no segment has a length, or a face no area.
+        If a position is not finite, all segments have zero length, or a face has zero
+        area.
 
     """
     if side.ndim == 1:
@@ -94,7 +95,14 @@ def current_surface(points: Points, u: Vector, side: Nodes, name: str) -> Surfac
 
 
 def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Points:
-    """Return X + u of some nodes, (len(nodes), dim); raise InputError unless finite."""
+    """Return the positions X + u of `nodes` (k,), (k, dim).
+
+    Raises
+    ------
+    InputError
+        If a position is not finite.
+
+    """
     x = points[nodes] + as_vectors(u, points.shape[1])[nodes]
     if not np.isfinite(x).all():
         k = int(np.flatnonzero(~np.isfinite(x).all(axis=1))[0])
@@ -116,7 +124,7 @@ def surface(x: Points, name: str) -> Surface:
             "expected a chain of at least two nodes"
         )
     normal = -tangents(edge[first] / length[first, None])[:, 0]
-    # nodes of skipped segments take the normals of the nearest segments left
+    # nodes of dropped segments have the normals of the nearest remaining segments
     after = np.searchsorted(first, np.arange(len(x)))
     before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(first) - 1)
@@ -128,7 +136,7 @@ def surface(x: Points, name: str) -> Surface:
 def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
     """Return the faces (f, 4) and normals of a side in space at positions x (v, 3)."""
     a, b, c, d = np.moveaxis(x[faces], 1, 0)
-    area = np.cross(c - a, d - b)  # twice, also where c = d
+    area = np.cross(c - a, d - b)  # twice the area vector, also for triangles (c = d)
     size = np.linalg.norm(area, axis=1, keepdims=True)
     flat = size[:, 0] <= MIN_RELATIVE_LENGTH * size.max(initial=0.0)
     if flat.any():
@@ -149,9 +157,10 @@ def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
 def tangents(normal: Points) -> Points:
     """Return unit tangents (…, dim − 1, dim) of unit normals (…, dim).
 
-    In the plane, the normal rotated anticlockwise by a right angle, (−n_y, n_x). In
-    space two orthogonal ones, −e_x and −e_y for the normal e_z (Duff et al., Building
-    an orthonormal basis, revisited, J. Comput. Graph. Tech. 6, 2017).
+    In the plane, the tangent is the normal rotated anticlockwise by a right angle,
+    (−n_y, n_x). In space, there are two orthogonal tangents, which are −e_x and −e_y
+    for the normal e_z (Duff et al., Building an orthonormal basis, revisited, J.
+    Comput. Graph. Tech. 6, 2017).
     """
     if normal.shape[-1] == 2:
         return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None, :]
@@ -166,7 +175,7 @@ def tangents(normal: Points) -> Points:
 def unit(vectors: Points, otherwise: Points) -> Points:
     """Normalise vectors (…, dim) of order one; replace zero vectors by `otherwise`.
 
-    The sum of two opposite normals is zero: there the chain folds back onto itself.
+    The sum of two opposite normals is zero where a chain folds back onto itself.
     """
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
     vanishes = length <= MIN_RELATIVE_LENGTH

@@ -1,1 +1,1 @@
-"""The QPs of a contact problem: its primal, its duals, and its load steps."""
+"""QPs of a contact problem: primal and dual forms, for every load step."""

@@ -1,4 +1,4 @@
-"""Cases of a contact problem in each form."""
+"""Cases of a contact problem in primal or dual form."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ Factorise = Callable[[], GeneralisedInverse]
 def case_of(
     problem: ContactProblem, form: str, choice: Choice, reference: Reference
 ) -> Case:
-    """Return the case of a selected QP of a contact problem, in one of FORMS."""
+    """Return the case for the QP that `choice` selects, in one of FORMS."""
     elastic = problem.bodies
     path, decomposed = monolithic_path(problem, reference), None
     whole, friction, _ = path.problem(choice.step, choice.iterate)
@@ -93,7 +93,10 @@ def case_of(
 
 
 def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
-    """Return a case whose pictures include the exact tractions of `ContactProblem`."""
+    """Return `case` with the exact contact tractions added to its fields.
+
+    exact : (k, 3), see `ContactProblem.exact`
+    """
     solved = case.fields
     assert solved is not None
 
@@ -118,11 +121,11 @@ class MonolithicSolution:
         return self.sides.solution.x[component]
 
     def largest(self, value: float) -> float:
-        """Return the value: there is a single process."""
+        """Return `value` unchanged, because there is only one process."""
         return value
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield the displaced bodies, one after another."""
+        """Yield the displaced mesh of each body."""
         bodies, u = self.bodies, self.sides.solution.x * self.bodies.length
         for b in range(len(bodies.names)):
             mesh = Mesh(bodies.mesh.points, bodies.mesh.cells[bodies.body == b], {})
@@ -145,14 +148,16 @@ def contact_case(
 
     Parameters
     ----------
-    floating, clamped : factorise K with its rigid modes, and without the fixed
-        components; called only if the form needs it
-    supported : like clamped, also for bodies that only contact supports; called to
-        certify an answer
-    quantities : physical results of a solution of the primal problem; its z holds the
-        multipliers of the contact rows, then those of friction
-    friction : friction law with a prescribed bound; its work is part of the objective
-    parts : the decomposed problem; if given, its dual is returned
+    floating : factorises K and returns K⁺ with the rigid modes as kernel; called only
+        for the form `dual`
+    clamped : returns K⁺ with the fixed components eliminated; called only for the form
+        `dual-bounds`
+    supported : like `clamped`, but also admits bodies that are supported by contact
+        alone; called to certify an answer
+    quantities : evaluates physical results from a solution of the primal problem,
+        whose z lists the multipliers of the contact rows, then those of friction
+    friction : friction law with a prescribed bound; the objective includes its work
+    parts : decomposed problem; if present, `form` is ignored and the case is its dual
 
     """
     matrices: Mapping[str, Any] = {}
@@ -174,7 +179,7 @@ def contact_case(
         start = perf_counter()
         transform = dualise if form == "dual" else dual_bounds
         transformed = transform(primal, inverse, friction=friction)
-        # the factor may exist already from another load step; its time counts anyway
+        # the factorisation counts even if it was computed for an earlier load step
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length
@@ -213,7 +218,7 @@ def contact_case(
 def _paper(
     dual: QP, primal: QP, friction: Friction, form: str, inverse: GeneralisedInverse
 ) -> dict[str, Any]:
-    """Return the matrices of the dual under their names in the paper, (2)-(5)."""
+    """Return the matrices of the dual, keyed by their names in (2)-(5) of the paper."""
     B, c = contact_rows(primal, friction)
     if form == "dual":
         B, c = csr_array(vstack([primal.A, B])), np.append(primal.b, c)

@@ -1,7 +1,7 @@
 """Load steps of decomposed elastic bodies in contact, on one process or several ranks.
 
-No array of global size is needed: contact is linearised at the displacement of the
-contact sides, from their nodes alone.
+No array of global size is allocated: the linearisation of contact only requires the
+positions and displacements of the nodes on the contact sides.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 class DecomposedLinearisation:
     """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
-    Its methods are called by all ranks together and return the same values on each.
+    All ranks must call its methods together; each rank receives the same values.
     """
 
     stage: Stage
@@ -90,7 +90,7 @@ class DecomposedLinearisation:
         return self.dual.share().qp
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the distributed dual with the given friction bounds."""
+        """Solve the distributed dual with the bounds of `friction`."""
         limits = self.dual.bounds(friction.bound)
         return self.reference(self._qp.with_bounds(*limits), start)
 
@@ -101,7 +101,10 @@ class DecomposedLinearisation:
         return z[: self.sides.place.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return the nondimensional u (w,) at the sides and the normal forces."""
+        """Return u (w,) on the contact sides and the normal nodal forces (places,).
+
+        Both are nondimensional.
+        """
         dual, sides = self.dual, self.sides
         solution = local_solution(dual.subdomains, dual.halo, s)
         vars(self).pop("_qp", None)  # explicit blocks are large and no longer needed
@@ -114,7 +117,7 @@ def decomposed_path(
 ) -> LoadPath[DecomposedLinearisation]:
     """Return the load path of a decomposed contact problem; called by all ranks.
 
-    reference : solves a distributed dual, on all ranks together
+    reference : solver of a distributed dual, called by all ranks together
     """
     layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
     previous = list[LocalDual]()
@@ -124,7 +127,7 @@ def decomposed_path(
         parts = decompose(
             elastic, layout, choice.glue, stage, sides.contact, choice.cluster
         )
-        if previous:  # the bodies are unchanged: their subdomain classes are reused
+        if previous:  # the bodies are unchanged, so reuse their subdomain classes
             previous[0] = LocalDual(previous[0].subdomains.with_problem(parts))
         else:
             previous.append(dual_on(parts, ranks))
@@ -150,9 +153,10 @@ def distributed_qp_of(
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, ranks have cut the bodies differently,
-        or the fixed point of Coulomb's law does not converge or has fewer iterates than
-        selected. Also for friction in space, whose discs ranks do not support.
+        If there are fewer subdomains than ranks; if the ranks computed different
+        subdivisions; if the fixed-point iteration for Coulomb's law diverges or has
+        fewer iterates than selected; or for friction in space, because multipliers in
+        discs are not implemented on several ranks.
 
     """
     laws = [law for stage in problem.stages for law in stage.laws]
@@ -209,7 +213,10 @@ def decompose(
 
 
 def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
-    """Return the map from components to forces; zero where none is given."""
+    """Return a function that maps components (k,) to their nodal forces (k,).
+
+    Components that are not listed in `forces` are unloaded.
+    """
     order = np.argsort(forces.component)
     components = forces.component[order]
 
@@ -231,19 +238,19 @@ def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearisedSides:
-    """Contact linearised from the nodes of the sides alone, nondimensional."""
+    """Nondimensional linearised contact, restricted to nodes of the contact sides."""
 
-    bodies: ContactSides  #: of N nodes
-    node: Nodes  #: (N,) their global numbers
-    nodes: int  #: number of all nodes
-    B: csr_array  #: (m, 2N)
-    c: Vector  #: (m,)
+    bodies: ContactSides  #: contact sides with N nodes in all
+    node: Nodes  #: (N,) global numbers of these nodes
+    nodes: int  #: number of nodes of the bodies
+    B: csr_array  #: (m, dim·N) contact rows B u ≤ c in local components
+    c: Vector  #: (m,) right-hand side
     friction: Friction  #: without rows if there is no friction
     place: Nodes  #: (m,) slave node of each row
 
     @property
     def component(self) -> Nodes:
-        """Global components of the columns, (2N,)."""
+        """Global components of the columns of `B`, (dim·N,)."""
         return dofs_of(self.node, self.bodies.mesh.dim)
 
     @property
@@ -253,7 +260,7 @@ class LinearisedSides:
 
     @property
     def contact(self) -> Contact:
-        """Rows of contact, then of friction, in global components."""
+        """Contact rows followed by friction rows, in global components."""
         friction, B, c = self.friction, self.B, self.c
         if friction.bound.size:
             B = csr_array(vstack([B, friction.T]))
@@ -364,7 +371,7 @@ def _quantities(
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:
-    """Return C₁₁ / (C₁₁ + C₆₆) of elasticity matrices (k, v, v)."""
+    """Return C₁₁ / (C₁₁ + C₆₆), (k,), for elasticity matrices (k, v, v)."""
     return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
@@ -376,7 +383,7 @@ def elastic_class(
     Parameters
     ----------
     D : (k, v, v) elasticity matrices of the materials, nondimensional
-    E : (k,) their moduli, nondimensional
+    E : (k,) Young's moduli of the materials, nondimensional
 
     """
     cells, dim = part.cells, part.points.shape[1]
@@ -398,11 +405,13 @@ STRESS_LAYERS = 3
 def local_meshes(
     solution: LocalSolution, length: float, layers: int = 0
 ) -> Iterator[DisplacedMesh]:
-    """Return the displaced local subdomains, batch by batch; called by all ranks.
+    """Return an iterator over batches of displaced local subdomains.
+
+    All ranks must call this function together.
 
     Parameters
     ----------
-    length : unit of displacements, m
+    length : unit of length of the displacements, m
     layers : number of layers of neighbouring cells to add
 
     """
@@ -447,7 +456,7 @@ class _Patch(NamedTuple):
     """Subdomains of one body with layers of neighbouring cells."""
 
     node: Nodes  #: (N,) global numbers
-    cells: Nodes  #: (E, 4) places of corners in `node`
+    cells: Nodes  #: (E, 4) corners, as indices into `node`
     inner: NDArray[np.bool_]  #: (N,) True for nodes of the subdomains
 
 
@@ -485,7 +494,7 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
 
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
-    """Return the subdomains that share any of some nodes with others."""
+    """Return the subdomains that contain a node of `node` shared by several."""
     multiplicity = layout.multiplicity(node)
     several = multiplicity > 1
     copies = range(int(multiplicity.max(initial=1)))

@@ -4,9 +4,10 @@ The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I
 returns the new problem together with a function that maps a solution of it to a
 solution (point and all multipliers) of the primal problem.
 
-Friction with a given bound g adds Σ g‖Tu − s‖ to the objective. Its rows T, s come last
-in B and c, and their multipliers satisfy ‖λ_t‖ ≤ g: bounds in the plane, discs in
-space. In z of the primal problem they follow the multipliers of the contact rows.
+Friction with a prescribed bound g adds Σ g‖Tu − s‖ to the objective. The friction rows
+T, s follow the contact rows in B and c, and the friction multipliers λ_t follow those
+of contact in z of the primal solution. They satisfy ‖λ_t‖ ≤ g: bounds in the plane,
+discs in space.
 """
 
 from __future__ import annotations
@@ -38,14 +39,16 @@ class Transformed(NamedTuple):
     recover: Callable[[Solution], Solution]
     sign: float  #: primal objective = sign·new objective + constant, at the solutions
     constant: float
-    #: primal point (n,), valid at the interface only; cheaper than `recover`
+    #: returns a primal point (n,) that is valid at the interface only; cheaper than
+    #: `recover`
     interface_displacement: Callable[[Solution], Vector]
 
 
 def primal_form(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
     """Return the primal problem as a QP, including the work of friction.
 
-    The inverse map drops the variables of `harness.mechanics.with_friction`.
+    The inverse map drops the auxiliary variables that
+    `harness.mechanics.with_friction` introduces.
     """
     qp, n = with_friction(primal, friction), primal.q.size
     if not friction.bound.size:
@@ -72,7 +75,7 @@ def dualise(
         min ½λᵀFλ − dᵀλ   subject to   λ_I ≥ 0,  RᵀBᵀλ = Rᵀf
         F = BK⁺Bᵀ,  d = BK⁺f − c,  B = [B_E; B_I],  c = [c_E; c_I]
 
-    The inverse map is (6),  u = K⁺(f − Bᵀλ) − Rα,  with α the multipliers of
+    The inverse map is (6),  u = K⁺(f − Bᵀλ) − Rα,  where α are the multipliers of
     RᵀBᵀλ = Rᵀf. (Equation (4) of the paper has Rᵀb instead of Rᵀf.) The multipliers of
     the bounds are Bu − c, and at the solutions  ½uᵀKu − fᵀu = −(½λᵀFλ − dᵀλ) − ½fᵀK⁺f.
 
@@ -81,7 +84,7 @@ def dualise(
     primal : QP with P = K and no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
     free : K⁺f (n,), if already computed
-    friction : law with a prescribed bound; its rows follow those of the contact
+    friction : law with a prescribed bound; its rows follow the contact rows
 
     """
     f, m_E = -primal.q, primal.b.size
@@ -116,21 +119,21 @@ def dual_bounds(
     free: Vector | None = None,
     friction: Friction = NO_FRICTION,
 ) -> Transformed:
-    """Return the dual with respect to the contact rows alone, with λ ≥ 0 only.
+    """Dualise the contact rows alone; without friction, the dual has λ ≥ 0 only.
 
     ::
 
         min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,    F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The inverse map is  u = K⁺(f − B_Iᵀλ).  The multipliers of the supports, the
-    reactions, follow from stationarity.
+    The inverse map is  u = K⁺(f − B_Iᵀλ).  The multipliers of the supports (reactions)
+    follow from stationarity.
 
     Parameters
     ----------
     primal : QP whose equality rows are unit vectors with zero right-hand side
-    clamped : K⁺ that is zero at these components
+    clamped : K⁺ with zero rows and columns at the components that these rows fix
     free : K⁺f (n,), if already computed
-    friction : law with a prescribed bound; its rows follow those of the contact
+    friction : law with a prescribed bound; its rows follow the contact rows
 
     """
     f = -primal.q
@@ -155,7 +158,7 @@ def dual_bounds(
 
 
 def with_friction_bound(dual: QP, friction: Friction) -> QP:
-    """Return a dual with other friction bounds; its inverse map is the same."""
+    """Return `dual` with the bounds of `friction`; the inverse map is unchanged."""
     contact = dual.q.size - friction.bound.size
     free = int(np.isinf(dual.lb[:contact]).sum())
     sets = multiplier_sets(free, contact - free, friction.bound, friction.tangents)
@@ -169,8 +172,10 @@ def multiplier_sets(
 
     Parameters
     ----------
-    free, normal : numbers of equality rows and of contact rows
-    bound, tangents : (k,) bound of each friction row, and its number of directions
+    free : number of equality rows
+    normal : number of contact rows
+    bound : (k,) friction bound g of each friction row
+    tangents : number of friction rows per node, 1 or 2
 
     """
     contact = free + normal
@@ -187,7 +192,7 @@ def _dual(
     free: Vector,
     sets: tuple[ConvexSet, ...],
 ) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  over sets; `free` is K⁺f."""
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  over `sets`; `free` is K⁺f."""
     m, B = c.size, structure.B
     return QP(
         P=inverse.congruence(B),

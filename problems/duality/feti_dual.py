@@ -1,14 +1,14 @@
-"""The dual of a contact problem on decomposed bodies, with its inverse (Total FETI).
+"""The dual of a contact problem on decomposed bodies, with its inverse map.
 
 ::
 
     min ½λᵀFλ − dᵀλ   subject to   λ_I ≥ 0,   RᵀBᵀλ = Rᵀf
     F = BK⁺Bᵀ,   d = BK⁺f − c,   K = diag(K_s),   R = diag(R_s)
 
-as in `problems.duality.dualisation`, but assembled from subdomains (Dostál, Horák and
-Kučera 2006): F is an operator, a sum over subdomains stored as plain arrays
-(`problems.feti.operators`), and RᵀBᵀ is sparse. Where averages join subdomains to
-clusters, K̃⁺ and RN take the places of K⁺ and R
+The problem is that of `problems.duality.dualisation`, assembled from subdomains (Total
+FETI; Dostál, Horák and Kučera 2006). F is an operator, a sum over subdomains stored as
+plain arrays (`problems.feti.operators`), and RᵀBᵀ is sparse. If averages join
+subdomains into clusters, K̃⁺ and RN replace K⁺ and R
 (`problems.feti.subdomain_classes.Clusters`).
 """
 
@@ -33,16 +33,16 @@ def feti_dual(
 ) -> Transformed:
     """Return the dual of a contact problem on decomposed bodies.
 
-    The inverse map computes  v = K⁺(f − Bᵀλ) − Rα  with α the multipliers of
-    RᵀBᵀλ = Rᵀf, and averages the copies of each node, which agree at the solution:
-    u = (TᵀT)⁻¹Tᵀv. The multipliers of the supports, the reactions, follow from
-    stationarity.
+    The inverse map computes  v = K⁺(f − Bᵀλ) − Rα,  where α are the multipliers of
+    RᵀBᵀλ = Rᵀf, and averages over the copies of each node, u = (TᵀT)⁻¹Tᵀv. At the
+    solution, all copies are equal. The multipliers of the supports (reactions) follow
+    from stationarity.
 
     Parameters
     ----------
-    bodies : decomposed bodies; their last constraint rows are the contact rows of
-        `primal`, followed by those of friction
-    primal : the problem of the undivided bodies
+    bodies : decomposed bodies, whose last constraint rows are the contact rows of
+        `primal` followed by the friction rows
+    primal : QP of the undivided bodies
     friction : friction law with a prescribed bound
 
     """
@@ -77,19 +77,20 @@ def feti_dual(
 
 
 def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
-    """Return the matrices of the dual under their names in the paper: F, d, B, c, R."""
+    """Return F, d, B, c and R of the dual, keyed by their names in the paper."""
     R = bodies.units.kernel
     return {"F": dual.P, "d": -dual.q, "B": bodies.B, "c": bodies.c, "R": R}
 
 
 def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
-    """Return the quantities of a decomposition.
+    """Return the size of a decomposition, as quantities of a result.
 
-    kinds: number of classes of congruent subdomains, each with one factor. torn_dofs:
-    unknowns including all copies. multipliers: rows of B. coarse_unknowns: rigid
-    motions of all subdomains, or of all clusters. explicit_subdomains: number of
-    subdomains with explicit blocks (K⁺)_bb and S_bb; the others take a solve in every
-    product. explicit_mib: memory for these blocks, MiB.
+    The keys are `subdomains`; `kinds`, the number of classes of congruent subdomains,
+    each with one factor; `torn_dofs`, the number of unknowns including all copies;
+    `multipliers`, the number of rows of B; `coarse_unknowns`, the number of rigid
+    motions of all subdomains or clusters; `explicit_subdomains`, the number of
+    subdomains with explicit blocks (K⁺)_bb and S_bb (the others require a solve in
+    every product); and `explicit_mib`, the memory for these blocks in MiB.
     """
     explicit = dual.P.arrays["explicit"]
     sizes = np.array(

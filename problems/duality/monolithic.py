@@ -1,8 +1,8 @@
 """Load steps of undivided bodies in contact, with one factor of K for all QPs.
 
-Contact rows are linearised at displacements of the contact sides, which follow from the
-dual solution of a step by one small product. Displacements elsewhere are recovered on
-demand, by one solve with the factor of K each.
+Contact rows are linearised at the displacements of the contact sides, which one small
+product yields from the dual solution of the previous step. Displacements elsewhere are
+recovered on demand, by one solve with the factor of K per step.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ from mortarbench.problems.fem.mesh import Nodes
 
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
-#: largest KKT residual of a reference solve; the next step is linearised there
+#: largest admissible KKT residual of a reference solution; contact in the next step is
+#: linearised at this solution
 MAX_REFERENCE_RESIDUAL = 1e-6
 
 
@@ -55,12 +56,12 @@ class MonolithicLinearisation:
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
     dual: Callable[
         [], Transformed
-    ]  #: the dual for these rows; friction bounds are replaced later
+    ]  #: returns the dual for these rows; `solve` replaces its friction bounds
     reference: Reference
     part: float  #: load factor
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the dual with the given friction bounds.
+        """Solve the dual with the bounds of `friction`.
 
         Raises
         ------
@@ -83,7 +84,7 @@ class MonolithicLinearisation:
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (n,), valid on the contact sides, and the normal nodal forces."""
+        """Return u (n,), valid on the contact sides, and normal forces (places,)."""
         places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces
@@ -96,7 +97,10 @@ class MonolithicPath(LoadPath[MonolithicLinearisation]):
     _answers: dict[int, Solution] = field(default_factory=dict, init=False)
 
     def primal(self, k: int) -> QP:
-        """Return the QP of step k ≥ 1 in its last linearisation, without friction."""
+        """Return the primal QP of the last linearisation of step k ≥ 1.
+
+        The QP excludes the work of friction.
+        """
         return self.problem(k).problem.primal
 
     def answer(self, k: int) -> Solution:
@@ -128,9 +132,11 @@ def load_path(
 
     Parameters
     ----------
-    factorise : returns the K⁺ for `transform`; called before the first solve
-    laws : one per contact pair; empty without friction
-    initial_force : normal force per slave node, the start of Coulomb's fixed point
+    factorise : returns the generalised inverse K⁺ that `transform` requires; called
+        once, before the first solve
+    laws : friction law of each contact pair; empty without friction
+    initial_force : normal force per slave node at the start of the fixed-point
+        iteration for Coulomb's law
 
     """
     stages = load_steps(
@@ -191,7 +197,7 @@ def _path(
     initial_force: float,
 ) -> MonolithicPath:
     inverse = cache(factorise)
-    # loads and supports recur in several stages; K⁺f is stored for the full load
+    # stages share loads and supports; K⁺f is stored for the full load
     bodies_by_stage, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
 
     def bodies_of(stage: Stage) -> Bodies:
@@ -199,8 +205,8 @@ def _path(
         if names not in bodies_by_stage:
             f = np.zeros(bodies.mesh.dofs)
             f[stage.forces.component] = stage.forces.value
-            held = support_rows(bodies.mesh, stage.fixed)
-            bodies_by_stage[names] = replace(bodies, f=f, B_D=held)
+            supports = support_rows(bodies.mesh, stage.fixed)
+            bodies_by_stage[names] = replace(bodies, f=f, B_D=supports)
         return bodies_by_stage[names]
 
     def pose(stage: Stage, at: State) -> MonolithicLinearisation:
@@ -222,14 +228,18 @@ def _path(
         )
 
     places = sum(pair.slave_nodes.size for pair in bodies.pairs)
-    nothing = np.zeros(bodies.mesh.dofs)
+    zero = np.zeros(bodies.mesh.dofs)
     return MonolithicPath(
-        stages, pose, State(nothing, nothing, np.full(places, initial_force))
+        stages, pose, State(zero, zero, np.full(places, initial_force))
     )
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
-    """Return the nondimensional QP (1),  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M."""
+    """Return the nondimensional primal QP, equation (1) of the paper.
+
+    It minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the load
+    of `bodies` times `load_factor`.
+    """
     n = bodies.mesh.dofs
     return QP(
         P=bodies.K,

@@ -11,9 +11,9 @@ the total displacement, so that errors are relative to u and not to an increment
 
     min ½uᵀK u + (r − K u^j)ᵀu   subject to   B_D u = 0,   B u ≤ c.                (1)
 
-*K* is the tangent Π''(u^j) if that is positive definite on the motions that the
-supports allow, which a Cholesky factorisation shows. Otherwise the negative eigenvalues
-of the tangents of single cells are raised (`problems.fem.finite_strain.convexified`).
+*K* is the tangent Π''(u^j) if it is positive definite on the motions that the supports
+allow, which is tested by a Cholesky factorisation. Otherwise negative eigenvalues of
+the tangents of single cells are raised (`problems.fem.finite_strain.convex_tangent`).
 The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
 previous iteration ("geometric" contact stiffness), may be added to the tangent; without
 them convergence is linear if both sides deform. The term ρB_DᵀB_D is added to K. It
@@ -27,17 +27,18 @@ descent direction of the exact penalty function (Nocedal and Wright, (18.27))
     φ(u) = Π(u) + w Σ max(0, −g_i(u)),
 
 and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A
-full step that halves the smallest residual so far is accepted without it, because
-curved constraints may increase φ near the solution (Maratos effect). This can happen
-only finitely often.
+full step that halves the smallest residual so far is accepted without this test,
+because curved constraints may increase φ near the solution (Maratos effect). Each such
+step halves the smallest residual, so that only finitely many occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
 segments. If the iteration does not converge, pressing nodes keep their closest segments
 and may slide slightly beyond them along their lines.
 
-*Convergence*: `NewtonPath.residual`, of equilibrium and gaps at the new u with the
-multipliers of the QP, is at most TOLERANCE. *Load*: if that is not reached, the load
-step is halved, repeatedly down to the fraction 2^−MAX_HALVINGS.
+*Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new u
+with the multipliers of the QP, is at most TOLERANCE plus a bound of its rounding error.
+*Load*: if the iteration fails, the load increment is halved, down to the fraction
+2^−MAX_HALVINGS of the load step.
 """
 
 from __future__ import annotations
@@ -85,17 +86,17 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.mesh import dofs_of
 
-TOLERANCE = 1e-9  #: of `NewtonPath.residual` at the end of a load step
+TOLERANCE = 1e-9  #: largest `NewtonPath.residual` at the end of a load step
 #: rounding of nodal forces relative to |K||u|: strains are differences of displacements
 FORCE_ROUNDING = 2 * float(np.finfo(float).eps)
-MAX_ITERATIONS = 60  #: of Newton's method at one load
+MAX_ITERATIONS = 60  #: largest number of Newton iterations at one load
 KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
-MAX_HALVINGS = 8  #: of a load step
-MIN_STEP = 2.0**-16  #: of the line search
+MAX_HALVINGS = 8  #: largest number of halvings of a load increment
+MIN_STEP = 2.0**-16  #: smallest step length of the line search
 #: rounding of the merit function relative to the energies; without it, steps near the
 #: solution, whose decrease is below rounding, are rejected
 MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
-ARMIJO_FRACTION = 1e-4  #: required share of the predicted decrease
+ARMIJO_FRACTION = 1e-4  #: required share of the decrease predicted by the slope
 #: weight of the penalty relative to the largest multiplier; above 1 it is exact
 PENALTY_FACTOR = 1.5
 MAX_ROTATION = 1e-8  #: rotational share of a rigid motion that counts as rounding
@@ -109,36 +110,37 @@ class Gaps(NamedTuple):
     """The gaps of the contact rows as functions of the displacement."""
 
     linearise: Linearise
-    curvature: Curvature | None = None  #: None without contact stiffness
+    curvature: Curvature | None = None  #: None if contact stiffness is neglected
     #: returns, for a displacement (n,) in m and a mask (places,) of slave nodes, gaps
     #: with these nodes kept on their closest segments; None if there are no segments
     keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
 class NoEquilibriumError(ArithmeticError):
-    """Newton's method found no equilibrium at some load."""
+    """Failure of Newton's method to reach an equilibrium at a load."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Iteration:
     """One iteration of Newton's method: its QP and the result."""
 
-    #: bodies with K and f of (1), f = K u^j − r; otherwise undeformed
+    #: the undeformed bodies, with their K and f replaced by K and K u^j − r of (1)
     tangent: Bodies
     primal: QP
     rows: ContactRows
     gaps: Gaps
     u: Vector  #: u^j (n,), nondimensional
     load_factor: float  #: κ
-    constant: float  #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, the constant of the model (1) of Π
-    clipped: int  #: number of cells with a tangent made positive semidefinite
-    answer: Solution  #: of (1)
+    #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, the constant of the quadratic model of Π
+    constant: float
+    clipped: int  #: number of cells whose tangent was made positive semidefinite
+    answer: Solution  #: solution of (1)
     length: float = 1.0  #: accepted step length
-    residual: float = np.inf  #: after the step
+    residual: float = np.inf  #: `NewtonPath.residual` after the step
 
 
 class Configuration(NamedTuple):
-    """A displacement with all quantities evaluated there."""
+    """A displacement with the energy, its gradient and the gaps evaluated there."""
 
     u: Vector
     rows: ContactRows
@@ -155,8 +157,8 @@ class NewtonPath:
     Raises
     ------
     InputError
-        If the method finds no equilibrium of a load step, if a step has fewer
-        iterations than requested, or if the supports allow a body to rotate.
+        If Newton's method does not reach the equilibrium of a load step, if a step has
+        fewer iterations than requested, or if the supports allow a body to rotate.
 
     """
 
@@ -169,7 +171,7 @@ class NewtonPath:
     _parts: list[int] = field(default_factory=list, init=False)
 
     def iteration(self, k: int, newton: int = 0) -> Iteration:
-        """Return iteration 1, 2, … of step k (1 … steps), or the last one for 0."""
+        """Return Newton iteration 1, 2, … of step k (1 … steps); 0 selects the last."""
         iterations = self.iterations(k)
         if newton > len(iterations):
             raise PastEndError(
@@ -181,26 +183,26 @@ class NewtonPath:
     def iterations(self, k: int) -> list[Iteration]:
         """Return the Newton iterations of step k at its full load."""
         while len(self._steps) < k:
-            found, parts = self._load_step(len(self._steps) + 1)
-            self._steps.append(found)
+            iterations, parts = self._load_step(len(self._steps) + 1)
+            self._steps.append(iterations)
             self._parts.append(parts)
         return self._steps[k - 1]
 
     def parts(self, k: int) -> int:
-        """Return the number of parts of load step k; 1 if it was not halved."""
+        """Return the number of increments of load step k; 1 if it was not halved."""
         self.iterations(k)
         return self._parts[k - 1]
 
     def state(self, at: Iteration, s: Solution) -> tuple[float, float, float]:
         """Evaluate Π, the residual and the largest penetration at a solution of a QP.
 
-        All are nondimensional; s solves `at.primal`. The penetration refers to the
-        closest segments, even where nodes keep others.
+        The values are nondimensional, and s is a solution of `at.primal`. Penetrations
+        are measured to the closest segments, even for nodes that keep other segments.
 
         Raises
         ------
         InvertedCellError
-            If a cell is inverted there.
+            If a cell is inverted at s.x.
 
         """
         lam = self._at_places(replace(at, answer=s))
@@ -238,11 +240,11 @@ class NewtonPath:
             reached, (u, lam) = load_factor, self._end(iterations)
 
     def _advice(self, load_factor: float) -> str:
-        """Return advice for a load at which no equilibrium is found.
+        """Return advice for a load at which the iteration did not converge.
 
-        The entries of F = I + ∂u/∂X carry the rounding error of 1. In cells of size h
-        this causes forces of about eps·h|K|·1 at any load, and for a tiny load they
-        exceed TOLERANCE.
+        The entries of F = I + ∂u/∂X have rounding errors of about eps. In cells of size
+        h these cause forces of about eps·h|K|·1 at any load. Relative to a tiny load,
+        such forces exceed TOLERANCE.
         """
         h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
         rounded = h * self._free_norm(
@@ -256,8 +258,9 @@ class NewtonPath:
         if share <= TOLERANCE:
             return "a smaller load, or supports that hold the bodies better"
         return (
-            f"a larger load, or kinematics=linear: of strains this small, rounding "
-            f"leaves {share:.0e} of the forces, and {TOLERANCE:g} is asked for"
+            f"a larger load, or kinematics=linear: at strains this small, the relative "
+            f"rounding error of the forces is {share:.0e}, above the tolerance "
+            f"{TOLERANCE:g}"
         )
 
     def _start(self, k: int) -> tuple[Vector, Vector]:
@@ -274,7 +277,7 @@ class NewtonPath:
         return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
 
     def _at_places(self, at: Iteration) -> Vector:
-        """Return multipliers (places,) of all slave nodes; zero without a row."""
+        """Return multipliers (places,) of all slave nodes; zero where no row exists."""
         force = np.zeros(self._places)
         force[at.rows.place] = np.maximum(at.answer.z, 0.0)
         return force
@@ -284,8 +287,8 @@ class NewtonPath:
     ) -> list[Iteration]:
         """Return the iterations at one load, from u and the multipliers (places,).
 
-        If the iteration does not converge, pressing nodes keep their segments from then
-        on.
+        If the iteration stalls or takes KEEP_AFTER iterations, pressing nodes keep
+        their segments from then on.
         """
         gaps = self.gaps
         at = self._configuration(u, load_factor, gaps)
@@ -340,9 +343,10 @@ class NewtonPath:
     def residual(self, at: Configuration, lam: Vector, load_factor: float) -> float:
         """Return the residual of equilibrium and contact for multipliers (places,).
 
-        It is the largest of: ‖r + Bᵀλ‖ on the free components, relative to the larger
-        norm of load and Bᵀλ; the largest penetration; and the largest |g_i| λ_i / max λ
-        (complementarity). Gaps are in units of the length of the bodies.
+        The residual is the maximum of three terms: ‖r + Bᵀλ‖ on the free components,
+        relative to the larger of the norms of the load and of Bᵀλ; the largest
+        penetration; and the largest |g_i| λ_i / max λ (complementarity). Gaps are
+        divided by the unit of length of the bodies.
         """
         pressing = lam[at.rows.place]
         contact = at.rows.B.T @ pressing
@@ -367,8 +371,8 @@ class NewtonPath:
     def _rounding(self, at: Configuration, lam: Vector, iteration: Iteration) -> float:
         """Return a bound of the rounding error of `residual`.
 
-        The strains of a cell are differences of displacements, so that the forces Ku
-        carry a rounding error proportional to |K||u|, however small they are.
+        Strains are differences of displacements, so that the rounding error of the
+        forces Ku is proportional to |K||u|, however small Ku is.
         """
         rounded = self._free_norm(abs(iteration.tangent.K) @ np.abs(at.u))
         return FORCE_ROUNDING * rounded / self._forces(at, lam, iteration.load_factor)
@@ -396,10 +400,10 @@ class NewtonPath:
     def _convex(
         self, at: Configuration, lam: Vector, curvature: Curvature | None
     ) -> tuple[csc_array, GeneralisedInverse, int]:
-        """Return a positive definite tangent with its factor and the clipped cells.
+        """Return a positive definite tangent, its factor and `Iteration.clipped`.
 
-        If the tangent is indefinite, the negative eigenvalues of the contact stiffness
-        are removed first, then those of the tangents of cells.
+        If the tangent is indefinite, negative eigenvalues of the contact stiffness are
+        removed first. If that does not suffice, those of the cell tangents follow.
         """
         supports = self.bodies.B_D
         factorised: list[tuple[csc_array, GeneralisedInverse]] = []
@@ -433,7 +437,10 @@ class NewtonPath:
         *,
         convex: bool = False,
     ) -> csc_array:
-        """Assemble −Σ λ_i g_i'', nondimensional; empty without contact stiffness."""
+        """Assemble the nondimensional −Σ λ_i g_i''; zero if `curvature` is None.
+
+        convex : remove the negative eigenvalues of each block
+        """
         n = at.u.size
         if curvature is None:
             return csc_array((n, n))
@@ -459,7 +466,7 @@ class NewtonPath:
 
     @cached_property
     def _kernel_defect(self) -> str:
-        """Reason why the kernel of the tangent is not translations; empty if it is."""
+        """Reason why the kernel does not consist of translations; empty if it does."""
         try:
             free_translations(self.bodies)
         except InputError as e:
@@ -534,7 +541,7 @@ def _merit(at: Configuration, weight: float) -> float:
 def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
     """Return an orthonormal basis (n, r) of the rigid motions that the supports allow.
 
-    They refer to the undeformed bodies; translations are exact for any deformation.
+    Rotations are those of the undeformed bodies; translations hold for any deformation.
     """
     rigid = bodies.rigid
     fixed = rigid[bodies.B_D.indices]
@@ -542,13 +549,13 @@ def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
 
 
 def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
-    """Return per body an orthonormal basis (2N_body, r) of its free translations.
+    """Return, for each body, an orthonormal basis (2N_body, r) of free translations.
 
     Raises
     ------
     InputError
-        If a body can rotate: the tangent may be indefinite on rotations, and the
-        contact that supports the body is not part of it.
+        If the supports allow a body to rotate. The tangent, which does not include
+        contact, may be indefinite on rotations.
 
     """
     owner, bases = bodies.body_of_node, []
@@ -561,16 +568,16 @@ def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
         remaining = null_space(R[fixed[dofs]]) if fixed[dofs].any() else np.eye(3)
         if np.abs(remaining[2]).max(initial=0.0) > MAX_ROTATION:
             raise InputError(
-                f"kinematics=finite: the supports leave body {name!r} to rotate, where "
-                "a stressed body has a stiffness of either sign; expected supports "
-                "that leave translations at most"
+                f"kinematics=finite: the supports allow body {name!r} to rotate, and "
+                "the stiffness of a stressed body may be negative on rotations; "
+                "expected supports that allow translations at most"
             )
         bases.append(R @ remaining)
     return bases
 
 
 def sliding_inverse(tangent: Bodies) -> GeneralisedInverse:
-    """Factorise K for the form `dual`, with its free translations as kernel."""
+    """Factorise K for the form `dual`; the kernel consists of free translations."""
     kernels = free_translations(tangent)
     owner, points = tangent.body_of_node, tangent.mesh.points
     dim, none = tangent.mesh.dim, np.zeros(0, dtype=np.int64)

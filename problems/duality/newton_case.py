@@ -1,4 +1,4 @@
-"""Cases of one Newton iteration at finite strain, in each form."""
+"""Cases of one Newton iteration at finite strain, in primal or dual form."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ def newton_path(
 ) -> NewtonPath:
     """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
-    linearise : linearisation of contact by the method in params, if any
-    params : keys of the case: material, and contact, contact_stiffness where they apply
+    linearise : linearisation of contact by the method in `params`
+    params : keys of the case; `material` is required, `contact` and
+        `contact_stiffness` are optional
     """
     gaps = Gaps(linearise)
     if params.get("contact") == "nts":
@@ -62,7 +63,10 @@ def newton_path(
 
 
 def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Gaps:
-    """Return the gaps of slave nodes to segments, with second derivatives."""
+    """Return the gaps of slave nodes to segments.
+
+    Second derivatives are included if `stiffness` is "geometric".
+    """
     geometric = stiffness == "geometric"
 
     def keep_segments(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
@@ -78,7 +82,7 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Return the cells of bodies in units of l and F₀, like their K."""
+    """Return the nondimensional cells of bodies, in the units l and F₀ of their K."""
     l, F = bodies.length, bodies.force
     mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
     laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
@@ -94,14 +98,14 @@ def newton_case(
 ) -> Case:
     """Return the case of a Newton iteration in one of the FORMS of `case_forms`.
 
-    Its objective is the quadratic model of the potential Π about the iterate; the
-    quantity `energy` is Π itself. The kernel of K contains only translations, also in
-    the form `dual`, so that all forms belong to the same QP.
+    The objective is the quadratic model of the potential Π at the iterate, whereas the
+    quantity `energy` is Π itself. All forms have the same K, whose kernel consists of
+    translations, so that they describe the same QP.
 
     Parameters
     ----------
     step, newton : see `NewtonPath.iteration`
-    results : further quantities from a solution of the primal problem
+    results : evaluates further quantities from a solution of the primal problem
 
     """
     at = path.iteration(step, newton)
@@ -134,16 +138,16 @@ def newton_case(
         quantities=collected,
     )
     assert case.mechanics is not None
-    back, constant = case.mechanics.to_primal, at.constant * unit
+    to_primal, constant = case.mechanics.to_primal, at.constant * unit
 
-    def drawn(s: Solution) -> Fields:
-        s = back(s)
+    def deformed_fields(s: Solution) -> Fields:
+        s = to_primal(s)
         stresses = cauchy_stresses(path.cells, bodies, s.x)
         return fields(bodies, primal, s, stresses=stresses)
 
     return replace(
         case,
-        fields=drawn,
+        fields=deformed_fields,
         constant=case.constant + constant,
         mechanics=replace(
             case.mechanics, constant=constant, rigid=translations(bodies)
@@ -152,10 +156,10 @@ def newton_case(
 
 
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
-    """Return nonlinear quantities of an answer; NaN if it inverts a cell.
+    """Evaluate the nonlinear problem at an answer; NaN if a cell is inverted.
 
-    energy: Π, J/m. residual: of equilibrium and contact, see `NewtonPath.residual`.
-    penetration: the largest one, m.
+    The keys are `energy`, Π in J/m; `residual`, see `NewtonPath.residual`; and
+    `penetration`, the largest penetration in m.
     """
     try:
         energy, residual, penetration = path.state(at, s)
@@ -172,7 +176,7 @@ def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
 def cauchy_stresses(cells: Cells, bodies: Bodies, u: Vector) -> dict[str, Vector]:
     """Recover the Cauchy stresses at the nodes (N,), Pa; NaN if a cell is inverted.
 
-    u : (n,) nondimensional
+    u : (n,) nondimensional displacement
     """
     stress = cauchy_stress(cells, u) * (bodies.force / bodies.length)
     if not np.isfinite(strain_energy(cells, u)):
@@ -183,7 +187,7 @@ def cauchy_stresses(cells: Cells, bodies: Bodies, u: Vector) -> dict[str, Vector
 
 
 def translations(bodies: Bodies) -> Vector:
-    """Return the orthonormal translations of each body, (n, 2·bodies)."""
+    """Return orthonormal translations of each body as columns, (n, 2·bodies)."""
     owner = bodies.body_of_node
     sizes = np.bincount(owner, minlength=len(bodies.names))
     return np.asarray(

@@ -1,7 +1,7 @@
-"""The description of a contact problem by its family, before assembly.
+"""Description of a contact problem, returned by its family, before assembly.
 
-The QPs of undivided bodies (`problems.duality.monolithic`) and of decomposed bodies, on
-one process or several ranks (`problems.duality.decomposed`), are derived from it.
+The QPs of undivided bodies (`problems.duality.monolithic`) and of decomposed bodies on
+one or several processes (`problems.duality.decomposed`) are derived from it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Shape(Protocol):
 
     @property
     def mesh(self) -> Mesh:
-        """All bodies, joined, m."""
+        """Joined mesh of all bodies, m."""
 
     @property
     def body(self) -> NDArray[np.int64]:
@@ -73,10 +73,13 @@ class Shape(Protocol):
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains or faces by name, in the plane available without the mesh."""
+        """Contact sides by name: chains of nodes in the plane, faces in space.
+
+        In the plane they are available without generating the mesh.
+        """
 
     def layout(self, size: int) -> Subdivision:
-        """Return the subdivision for a size, whose meaning depends on the shape."""
+        """Return a subdivision; the meaning of `size` depends on the shape."""
 
 
 B = TypeVar("B", StructuredGrid, HalfDisc)
@@ -84,7 +87,7 @@ B = TypeVar("B", StructuredGrid, HalfDisc)
 
 @dataclass(frozen=True, eq=False)
 class _Joined(Generic[B]):
-    """Plane bodies of parametric shape, numbered one after another."""
+    """Plane bodies of parametric shape, with consecutive numbers of nodes."""
 
     parts: tuple[B, ...]
     dim = 2
@@ -113,17 +116,18 @@ class StructuredGrids(_Joined[StructuredGrid]):
     """Structured grids; subdomains have at most size² cells."""
 
     def layout(self, size: int) -> Layout:
-        """Cut each grid into blocks of at most `size` cells a side."""
+        """Cut each grid into blocks of at most `size` cells per side."""
         return Layout.of(self.parts, size)
 
 
 class HalfDiscs(_Joined[HalfDisc]):
-    """Half discs; subdomains are blocks of rings and sectors."""
+    """Half discs; subdomains are blocks of cells between rings and radii."""
 
     def layout(self, size: int) -> Subdivision:
-        """Cut each half disc into blocks of at most size² cells, aspect ratio near 1.
+        """Cut each half disc into compact blocks of at most size² cells.
 
-        The triangles at the centre form the last ring.
+        The aspect ratios of blocks are near 1. The triangles at the centre count as the
+        last ring of cells.
         """
         blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
         return half_discs_in_blocks(self.parts, blocks)
@@ -131,10 +135,11 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 @dataclass(frozen=True, eq=False)
 class StructuredSolids:
-    """Hexahedra numbered as in boxes; subdomains are compact blocks of cells."""
+    """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
 
-    parts: tuple[Mesh, ...]  #: see `problems.fem.mesh.box`, with different boundaries
-    divisions: tuple[tuple[int, int, int], ...]  #: cells of each along x, y and z
+    #: numbered as in `problems.fem.mesh.box`; names of boundaries are distinct
+    parts: tuple[Mesh, ...]
+    divisions: tuple[tuple[int, int, int], ...]  #: cells of each part along x, y and z
     dim = 3
 
     @cached_property
@@ -153,11 +158,11 @@ class StructuredSolids:
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Faces of the sides by name."""
+        """Faces of the contact sides by name."""
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
-        """Cut each box into compact blocks of at most `size` cells a side."""
+        """Cut each box into compact blocks of at most `size` cells per side."""
         labels = [
             compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
             for mesh, (x, y, z) in zip(self.parts, self.divisions, strict=True)
@@ -182,7 +187,7 @@ class StructuredSolids:
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """An unstructured mesh; `size` is the number of subdomains, cut by METIS."""
+    """Unstructured mesh; METIS cuts it into `size` subdomains."""
 
     mesh: Mesh
     body: NDArray[np.int64]
@@ -199,7 +204,7 @@ class Meshed:
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
-        """Cut the bodies by graph partitioning."""
+        """Cut the bodies into `size` subdomains by graph partitioning."""
         label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
         return mesh_in_subdomains(self.mesh, label, self.body, self.named)
 
@@ -213,7 +218,7 @@ class ElasticBodies:
     materials: tuple[Material, ...]  #: one per body
     plane: Plane | None  #: None in space
     length: float  #: l, m: unit of length of the QPs
-    force: float  #: F₀, N/m, in space N: unit of force of the QPs
+    force: float  #: F₀, N/m in the plane, N in space: unit of force of the QPs
     fixed: Nodes  #: components with u = 0
     forces: Forces
     pairs: tuple[ContactPair, ...]
@@ -250,22 +255,22 @@ class ElasticBodies:
 
     @cached_property
     def floating(self) -> GeneralisedInverse:
-        """K⁺ and the kernel R of all rigid motions."""
+        """K⁺ of the floating bodies, with the kernel R of all rigid motions."""
         return factorise_floating(self.assembled)
 
     @cached_property
     def clamped(self) -> GeneralisedInverse:
-        """K⁺, zero at fixed components; InputError if bodies can still move."""
+        """K⁺, zero at fixed components; InputError if a rigid motion remains."""
         return factorise_clamped(self.assembled)
 
     @cached_property
     def supported(self) -> GeneralisedInverse:
-        """K⁺ as `clamped`, also for bodies that only contact supports."""
+        """K⁺ like `clamped`, but also for bodies supported by contact alone."""
         return factorise_supported(self.assembled)
 
 
 def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
-    """Return elastic bodies from meshed ones; keeps their stiffness, if any."""
+    """Return meshed bodies as `ElasticBodies`; an assembled stiffness is kept."""
     fixed = bodies.B_D.indices
     named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
     result = ElasticBodies(
@@ -286,12 +291,11 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
 
 
 class InterfaceState(NamedTuple):
-    """Data and solution of contact, at least at the nodes of the contact sides."""
+    """Data and solution of contact, restricted to the contact sides or complete."""
 
     bodies: Bodies | ContactSides
-    primal: (
-        QP  #: at these nodes; of P only the diagonal is used, and only with friction
-    )
+    #: QP at the nodes of `bodies`; of P only the diagonal is used, only for friction
+    primal: QP
     solution: Solution
     friction: Friction
 
@@ -299,7 +303,7 @@ class InterfaceState(NamedTuple):
 class DisplacedMesh(NamedTuple):
     """Cells of one body with their displacement."""
 
-    body: int
+    body: int  #: number of the body
     mesh: Mesh  #: N nodes
     inner: NDArray[
         np.bool_
@@ -308,7 +312,7 @@ class DisplacedMesh(NamedTuple):
 
 
 class ContactSolution(Protocol):
-    """Solution of a contact problem; ranks call its members together."""
+    """Solution of a contact problem; all ranks must call its members together."""
 
     @property
     def sides(self) -> InterfaceState:
@@ -316,7 +320,7 @@ class ContactSolution(Protocol):
 
     @property
     def problems(self) -> int:
-        """Number of Tresca problems solved for Coulomb's law; 1 without it."""
+        """Number of Tresca problems solved for Coulomb's law; 1 for other laws."""
 
     def at(self, component: Nodes) -> Vector:
         """Return the nondimensional displacement at global components (k,)."""
@@ -328,25 +332,25 @@ class ContactSolution(Protocol):
         """Return the maximum of a value over all ranks."""
 
 
-def no_further_results(found: ContactSolution) -> dict[str, Any]:
-    """Return no quantities beyond those of all elastic bodies."""
+def no_further_results(solution: ContactSolution) -> dict[str, Any]:
+    """Return no quantities beyond those common to all elastic bodies."""
     return {}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactProblem:
-    """Elastic bodies with their contact law and the stages of their load."""
+    """Elastic bodies with their contact law and load stages."""
 
     bodies: ElasticBodies
     stages: tuple[Stage, ...]
-    #: returns, for bodies or their contact sides and laws of friction, the map from a
-    #: displacement in m to contact rows
+    #: returns the function that maps a displacement in m to contact rows, for bodies
+    #: (or their contact sides) and the friction laws of their contact pairs
     linearise: Callable[
         [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
     ]
     #: normal force per slave node for the first friction bound of Coulomb's law
     initial_force: float = 0.0
-    #: quantities of a solution beyond those of all elastic bodies
+    #: evaluates quantities beyond those common to all elastic bodies
     results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
     #: (k, 3) x in m, exact pressure and shear in Pa on the slave side; None if unknown
     exact: NDArray[np.float64] | None = None
@@ -356,8 +360,8 @@ class Choice(NamedTuple):
     """Selection of one QP of a contact problem."""
 
     step: int = 1  #: load step, from 1
-    iterate: int = 0  #: of the fixed point of Coulomb's law, from 1; 0: the last one
-    size: int = 0  #: of subdomains, see `Shape.layout`; 0: undivided bodies
+    iterate: int = 0  #: fixed-point iterate for Coulomb's law, from 1; 0: the last one
+    size: int = 0  #: argument of `Shape.layout`; 0: undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
     cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
 
@@ -367,7 +371,7 @@ CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
-    """Return the QP that the keys of a case select.
+    """Return the choice of a QP by the keys of a case.
 
     Raises
     ------
@@ -394,7 +398,7 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
 def cached_problem(
     state: Callable[[Mapping[str, Any]], ContactProblem],
 ) -> Callable[[Mapping[str, Value]], ContactProblem]:
-    """Cache the last few problems by the keys that do not select among their QPs."""
+    """Cache the last four problems, ignoring the keys `CHOICES` of a case."""
     cached = lru_cache(maxsize=4)(lambda items: state(dict(items)))
 
     @wraps(state)

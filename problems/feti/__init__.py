@@ -1,1 +1,1 @@
-"""Total FETI: bodies torn into subdomains, glued by multipliers."""
+"""Total FETI: bodies torn into subdomains that multipliers glue together."""

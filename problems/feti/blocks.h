@@ -1,7 +1,7 @@
-/* The product of a dense block with the columns of all subdomains of a class.
+/* Product of a dense block with the columns of all subdomains of a class.
 
-   Compiled twice, for processors with AVX2 and FMA and for all others; the loader selects
-   one of them when the module is imported. */
+   It is compiled twice, for processors with AVX2 and FMA and for all others; the loader
+   selects a version when the module is imported. */
 
 #include <string.h>
 
@@ -20,12 +20,14 @@ typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 
 enum {
     ROWS = 4,   /* rows of M per tile */
-    WIDTH = 12, /* columns of X per tile: 12 vectors of sums, 3 of X, 1 of M: 16 registers */
+    WIDTH = 12, /* columns of X per tile: 12 vector sums, 3 vectors of X and 1 of M fill the
+                   16 registers */
     LINE = 8,   /* doubles in a cache line */
-    DEPTH = 256 /* rows of X per pass: DEPTH * WIDTH doubles, 24 KiB, stay in the L1 cache */
+    DEPTH = 256 /* rows of X per pass: DEPTH * WIDTH doubles (24 KiB) fit the L1 cache */
 };
 
-/* Y += M X for a few rows of M and w <= 3 vectors of four columns; X is packed by rows. */
+/* Y += M X for ROWS rows of M, or one, and w <= 3 vectors of four columns; X is packed by
+   rows. `some` <= 4w is the number of columns that exist. */
 INLINE void
 add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y,
          Py_ssize_t columns, Py_ssize_t some)
@@ -51,7 +53,7 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
                 Y[r * columns + c] += sum[r][c / 4][c % 4];
 }
 
-/* The same for all rows of M (rows, n) and `some` <= 4w columns. */
+/* Y += M X for all rows of M (rows, n) and `some` <= 4w columns; X is packed by rows. */
 INLINE void
 add_strip(in M, Py_ssize_t rows, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y,
           Py_ssize_t columns, Py_ssize_t some)
@@ -63,7 +65,7 @@ add_strip(in M, Py_ssize_t rows, Py_ssize_t n, in X, Py_ssize_t depth, int w, ou
         add_tile(M + i * n, n, X, depth, 1, w, Y + i * columns, columns, some);
 }
 
-/* Y = M X with M (rows, n), X (n, columns) and Y (rows, columns), all stored by rows. */
+/* Y = M X with M (rows, n), X (n, columns) and Y (rows, columns), all row-major. */
 TWICE static void
 product(in M, Py_ssize_t rows, Py_ssize_t n, in X, out Y, Py_ssize_t columns)
 {

@@ -2,8 +2,8 @@
 """Products of dense blocks with the columns of all subdomains of a class.
 
 BLAS copies (packs) the block in every product, which takes a third of the time of a
-product with two dozen columns. This module is compiled when the package is installed;
-`blocks.pyi` declares its types.
+product with two dozen columns; this module does not copy it. It is compiled when the
+package is installed; `blocks.pyi` declares its types.
 """
 
 from libc.stdlib cimport calloc, free
@@ -27,19 +27,19 @@ ctypedef struct block:
 
 
 cdef class BlockDiagonal(LinearMap):
-    """The map of packed vectors by blocks M_g (r_g, n_g), each for S_g subdomains.
+    """Block diagonal map of packed vectors; block M_g (r_g, n_g) acts on S_g subdomains.
 
-    The part of a vector that belongs to a block is a matrix (n_g, S_g), stored by rows.
+    The part of a vector that belongs to a block is a matrix (n_g, S_g), row-major.
 
-    blocks : each an array (r_g, n_g); or, if symmetric, the upper triangle, column by
-        column, as an array (n_g (n_g + 1)/2,) if S_g = 1, or an object with `@`
-    sizes : n_g
-    members : S_g
+    blocks : for each g an array (r_g, n_g), or an object with `@`; for S_g = 1 and a
+        symmetric block also its upper triangle, column by column, (n_g (n_g + 1)/2,)
+    sizes : n_g for each g
+    members : S_g for each g
 
     Raises
     ------
     ValueError
-        If the shape of a block does not fit.
+        If the shape of a block does not match its size and number of members.
 
     """
 

@@ -1,16 +1,16 @@
-"""The dual of decomposed bodies, distributed over ranks of MPI.
+"""The dual of decomposed bodies, distributed over MPI ranks.
 
-A rank holds some subdomains and, of every vector of multipliers, the rows that it
-*owns*. A row of B that touches subdomains of several ranks is owned by one of them,
-round-robin, and is a *ghost* row of the others. These receive its multiplier before
-they multiply, and send back their contributions:
+Each rank stores some of the subdomains and, for every vector of multipliers, the rows
+that it *owns*. A row of B that touches subdomains of several ranks is owned by one of
+them, round-robin, and is a *ghost* row of the others. The other ranks receive its
+multiplier before a product with B_pᵀ, and send back their contributions afterwards:
 
     F λ = Σ_ranks B_p K_p⁺ B_pᵀ λ
 
 No rank stores an array of global size, only the columns of B and the rows of vectors
-that its subdomains touch. Graph partitioning (METIS) distributes the subdomains such
-that the work is balanced and few rows are shared. The explicit blocks of a class that
-occurs on several ranks are formed on one of them and sent to the others.
+that its subdomains touch. Graph partitioning (METIS) distributes the subdomains so
+that the work is balanced and few rows are shared. If a class occurs on several ranks,
+one of them computes its explicit blocks and sends them to the others.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ from mortarbench.problems.feti.subdomain_classes import (
     Subdomains,
 )
 
-#: share of the work on a class that follows the factorisation of its stiffness matrix;
-#: an estimate that only balances the ranks
+#: share of the work on a class spent after the factorisation of its stiffness matrix;
+#: an estimate, used only to balance the load of the ranks
 BLOCK_SHARE = 0.25
 
 
@@ -97,17 +97,17 @@ def partition(
 
 
 def assign_owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return an owner for each of some rows (t,), round-robin among those it touches.
+    """Return the owner (t,) of each row, round-robin among the ranks that touch it.
 
-    rows : global numbers of the rows
-    reach : (t, ranks) the ranks that touch them, ascending
+    rows : (t,) global numbers of the rows
+    reach : (t, ranks) nonzero where a rank touches a row, with sorted indices
     """
     turn = rows % np.diff(reach.indptr)
     return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work of a product in each subdomain (S,): its dense block."""
+    """Return the work (S,) of a product per subdomain: the size of its dense block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 
@@ -126,15 +126,15 @@ def balanced_partition(
 ) -> NDArray[np.int64]:
     """Partition subdomains over ranks, balancing both work and size (S,).
 
-    METIS balances a single weight, and the first one is the work. If the sizes are then
-    out of balance, as on graded half discs, where few subdomains have most of the work,
-    several combinations of both weights are tried. Among those that keep the work
-    balanced, the one with the best balance of sizes is returned.
+    METIS balances a single weight. The work is tried first. If the sizes are then out
+    of balance, as on graded half discs, where few subdomains account for most of the
+    work, several combinations of work and size are tried. Among the partitions that
+    keep the work balanced, the one with the best balance of sizes is returned.
 
     Parameters
     ----------
     graph : (S, S) number of rows shared by two subdomains
-    cluster : (S,) cluster of each subdomain; a rank has whole clusters
+    cluster : (S,) cluster of each subdomain; clusters are not split between ranks
 
     Returns
     -------
@@ -197,16 +197,15 @@ def _partitioned(
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """Rows of B that a rank touches: owned rows and ghosts, which neighbours own.
+    """Rows of B that a rank touches: its owned rows, and ghosts owned by neighbours.
 
-    Messages hold the values of the rows of one neighbour in the order of the rows, in
-    both directions.
+    A message contains the values of all rows shared with one neighbour, sorted by row.
     """
 
     ranks: Ranks
-    rows: Nodes  #: (t,) all rows that its subdomains touch or that it owns, ascending
+    rows: Nodes  #: (t,) all rows that this rank touches or owns, ascending
     owned: Nodes  #: (o,) places of the owned rows in `rows`
-    #: (l,) places among the owned rows of those that are ghosts elsewhere, by rank
+    #: (l,) places in `owned` of the rows that are ghosts elsewhere, ordered by rank
     exported: Nodes
     #: (t − o,) places in `rows` of the ghosts, ordered by their owners
     ghosts: Nodes
@@ -221,7 +220,12 @@ class Halo:
         return shared
 
     def start_gather(self, x: Vector) -> Callable[[], Vector]:
-        """Send owned values (o,); return a function that waits for ghosts (t − o,)."""
+        """Send the values x (o,) of owned rows to the ranks where they are ghosts.
+
+        Returns
+        -------
+        function that waits for the values (t − o,) of the ghosts of this rank
+        """
         with self.ranks.clocked("exchange"):
             return self.ranks.exchange(
                 x[self.exported], self.export_counts, self.ghost_counts
@@ -232,8 +236,8 @@ class Halo:
 
         Returns
         -------
-        function that waits for the contributions of other ranks and adds them to the
-        values of the owned rows (o,), in place
+        function that waits for the contributions of other ranks, adds them to its
+        argument, the values (o,) of the owned rows, in place, and returns it
 
         """
         with self.ranks.clocked("exchange"):
@@ -265,7 +269,7 @@ def build_halo(
 
     Parameters
     ----------
-    rows : (t,) all rows that its subdomains touch, ascending
+    rows : (t,) all rows that the local subdomains touch, ascending
     reach : (t, ranks) nonzero where a rank touches a row
     owner : (t,) rank that owns each row
 
@@ -291,7 +295,7 @@ def build_halo(
 
 @dataclass(frozen=True, eq=False)
 class RowsOverRanks:
-    """Local rows of B in products Bᵀx and By with distributed vectors.
+    """Local rows of B for the products Bᵀx and By with distributed vectors.
 
     Messages are posted first and completed after the products with owned rows, so that
     communication and computation overlap.
@@ -301,9 +305,9 @@ class RowsOverRanks:
     owned: CompressedRows  #: (o, M) owned rows
     transposed: CompressedRows  #: (M, o)
     ghosts: CompressedRows  #: (t − o, M) ghost rows
-    #: (k, t − o) nonzero rows of their transpose
+    #: (k, t − o) nonzero rows of the transpose of `ghosts`
     ghosts_transposed: CompressedRows
-    reached: Nodes  #: (k,) places of these rows
+    reached: Nodes  #: (k,) numbers of these rows in the transpose
 
     @classmethod
     def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
@@ -336,9 +340,9 @@ class RowsOverRanks:
 
 @dataclass(frozen=True, eq=False)
 class RankOperator:
-    """F over ranks; acts on the owned slices of vectors of multipliers."""
+    """F distributed over ranks; acts on the owned slices of vectors of multipliers."""
 
-    local: DualOperator  #: all touched rows and the local subdomains
+    local: DualOperator  #: part of F from the local subdomains, on all touched rows
     halo: Halo
 
     @property
@@ -375,10 +379,10 @@ class RankOperator:
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
     def average_forces(self) -> DistributedColumns:
-        """Return the multipliers whose forces act on averages alone, as rows (c, o).
+        """Return a basis, as rows (c, o), of the multipliers with Fλ = 0.
 
-        Bᵀλ = Cᵀμ for independent rows μᵀC: these forces are orthogonal to all
-        displacements with Cv = 0, so that Fλ = 0. Without clusters, c = 0.
+        They satisfy Bᵀλ = Cᵀμ for some μ, with C of `Clusters`: their forces are
+        orthogonal to all displacements with Cv = 0. Without clusters, c = 0.
         """
         halo, packed, clusters = self.halo, self.local.packed, self.local.clusters
         touched = csr_array((0, halo.rows.size))
@@ -412,14 +416,15 @@ class RankOperator:
         return product
 
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
-        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, for the sum of the parts of all ranks.
+        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows.
 
-        Most equality rows are uncoupled (all of them if gluing is orthonormal) and only
-        need a division. The system of the coupled ones is solved redundantly on all
-        ranks. Contact rows are coupled along the contact: their system is factorised in
-        distributed form, or redundantly if ranks share many of these rows.
+        Most equality rows (all of them if gluing is orthonormal) are uncoupled and only
+        require a division. The system of the coupled equality rows is solved
+        redundantly on all ranks. Contact rows are coupled along the contact sides:
+        their system is factorised in distributed form, or redundantly if ranks share
+        many of these rows.
 
-        part : (t, t) contribution of the local subdomains to B W Bᵀ
+        part : (t, t) contribution of the local subdomains to B W Bᵀ, summed over ranks
         """
         halo, equalities = self.halo, self.local.equalities
         diagonal = halo.accumulate(part.diagonal())
@@ -448,7 +453,10 @@ class RankOperator:
 def _coupled(
     part: csr_array, halo: Halo, diagonal: Vector, selected: NDArray[np.bool_]
 ) -> Nodes:
-    """Return the selected rows that the sum of all parts couples beyond rounding."""
+    """Return the selected rows that the sum of `part` over all ranks couples.
+
+    Entries below `COUPLING_ROUNDING`, relative to the diagonal, count as zero.
+    """
     row, column = part.tocoo().coords
     beside = np.flatnonzero((row != column) & selected[row] & selected[column])
     row, column = row[beside], column[beside]
@@ -474,12 +482,12 @@ def _distributed_inverse(
 
     Parameters
     ----------
-    part, rows : contribution of this rank, and its rows
-    diagonal : (o,) of the sum, at owned rows
+    part, rows : contribution of this rank, and the rows that it touches
+    diagonal : (o,) diagonal of the sum at owned rows
 
     Returns
     -------
-    places of these rows among the owned ones, and the inverse there
+    places of the factorised rows among the owned ones, and the inverse on these rows
 
     """
     size = 1 / np.sqrt(halo.gather(diagonal)[np.searchsorted(halo.rows, rows.rows)])
@@ -507,7 +515,7 @@ def _replicated_inverse(
 
     Returns
     -------
-    places of these rows among the owned ones, and the inverse there
+    places of the selected rows among the owned ones, and the inverse on these rows
 
     """
     ranks, entries = halo.ranks, part.tocoo()
@@ -537,20 +545,21 @@ def _replicated_inverse(
 class Assignment(NamedTuple):
     """Ranks that factorise and condense a class of congruent subdomains."""
 
-    work: int  #: in any unit, the same for all classes
-    ranks: list[int]  #: those with subdomains of the class
-    factor_rank: int  #: factorises the stiffness matrix
-    block_rank: int  #: forms the blocks with that factor and sends them to the others
+    work: int  #: estimated work, in one arbitrary unit for all classes
+    ranks: list[int]  #: ranks with subdomains of the class
+    factor_rank: int  #: rank that factorises the stiffness matrix
+    block_rank: int  #: rank that computes the blocks and sends them to the others
 
 
 def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
     """Assign the factorisation and the blocks of each class to one rank each.
 
-    In order of decreasing work, each class goes to the rank with the smallest load so
-    far (longest processing time first, Graham 1969). Then ranks with higher loads hand
-    the formation of blocks, which follows the factorisation, to others.
+    In order of decreasing work, each class is assigned to the rank with the smallest
+    load so far (longest processing time first, Graham 1969). The computation of blocks,
+    which follows the factorisation, is then moved from ranks with higher loads to
+    others.
 
-    work : for each rank, the work on its classes by name
+    work : for each rank, a map from the names of its classes to their work
     """
     have: dict[str, list[int]] = {}
     for rank, one in enumerate(work):
@@ -573,10 +582,10 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
 
 
 def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
-    """Return how many blocks a rank forms before factors are exchanged.
+    """Return the number of blocks that a rank computes before factors are exchanged.
 
-    These are blocks with factors of its own, formed while slower ranks still factorise.
-    All of them come first if no factors are exchanged.
+    Such blocks only require factors of this rank, and are computed while slower ranks
+    still factorise. If no factors are exchanged, all blocks are computed at once.
     """
     factors: dict[int, float] = {}
     for task in tasks.values():
@@ -599,10 +608,10 @@ def condense_over_ranks(
 ) -> Iterator[tuple[int, Condensed]]:
     """Yield the blocks of all groups; equal groups are condensed on one rank only.
 
-    First each rank computes the factors assigned to it of classes that several ranks
-    have, then forms some blocks while slower ranks factorise. Then factors are
-    exchanged, remaining blocks formed, and blocks exchanged. Blocks of a class on this
-    rank alone are yielded as soon as they are formed, and not stored.
+    For classes that occur on several ranks, each rank computes the factors assigned to
+    it, then some blocks while slower ranks factorise. Next, factors are exchanged, the
+    remaining blocks are computed, and blocks are exchanged. Blocks of a class that
+    occurs on this rank alone are yielded immediately and not stored.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     groups_by_name = dict(zip(names, groups, strict=True))
@@ -664,7 +673,7 @@ def _exchange_blocks(
     out: Sequence[tuple[int, Dense]],
     coming: Sequence[tuple[int, tuple[int, ...]]],
 ) -> list[Dense]:
-    """Send arrays to ranks, and receive arrays of given shapes from ranks."""
+    """Send the arrays `out` to ranks; receive arrays of the shapes in `coming`."""
     arrays = [np.empty(shape) for _, shape in coming]
     requests = [
         ranks.comm.Irecv(array, source=rank)
@@ -678,7 +687,7 @@ def _exchange_blocks(
 
 
 def _name(group: Group) -> str:
-    """Return a name for everything that the blocks of a group depend on."""
+    """Return a digest of all data that determine the blocks of a group."""
     return f"{group.template.name} {hex_digest((group.touched.tobytes(),), 32)}"
 
 

@@ -1,11 +1,11 @@
-"""The dual of decomposed bodies, assembled in distributed form by all ranks.
+"""Distributed assembly of the dual of decomposed bodies.
 
 Each rank assembles the rows that it owns from its local subdomains
 (`problems.feti.subdomains`). Contact rows are linearised from the contact sides alone.
 
-Messages between ranks: the points of one subdomain of each class that may occur on
-several ranks, so that congruent subdomains have the same frame everywhere; the
-contributions to rows of q and RᵀBᵀ that other ranks own; and the parts of Rᵀf.
+Ranks exchange the points of one subdomain of each class that may occur on several
+ranks, so that congruent subdomains have the same frame on all of them; contributions to
+rows of q and RᵀBᵀ that other ranks own; and contributions to Rᵀf.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ from mortarbench.problems.feti.subdomains import (
 
 @dataclass(frozen=True, eq=False)
 class LocalDual:
-    """The rows of a dual that a rank owns; all ranks evaluate members together."""
+    """Rows of a dual that a rank owns; all ranks must evaluate members together."""
 
     subdomains: LocalSubdomains
 
@@ -92,7 +92,7 @@ class LocalDual:
         return _resultants(self.subdomains)
 
     def share(self) -> Share:
-        """Return the share of this rank in the dual QP; nothing is factorised yet."""
+        """Return the share of this rank in the dual QP, without factorising yet."""
         rows, domains, ranks = (
             self.subdomains.rows,
             self.subdomains.domains,
@@ -123,12 +123,12 @@ class LocalDual:
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
-        """Return bounds of the multipliers of owned rows, with friction bounds (k,).
+        """Return bounds of the multipliers of owned rows; `bound` (k,) is for friction.
 
         Raises
         ------
         InputError
-            For friction in space, whose multipliers are in discs.
+            For friction in space, where multipliers are constrained to discs.
 
         """
         if bound.size and self.subdomains.problem.contact.tangents > 1:
@@ -149,7 +149,7 @@ class LocalDual:
         return distributed(lower, ranks), distributed(upper, ranks)
 
     def with_bound(self, bound: Vector) -> LocalDual:
-        """Return a copy with another friction bound (k,); cached results are kept."""
+        """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         copy = LocalDual(self.subdomains.with_bound(bound))
         vars(copy).update({**vars(self), "subdomains": copy.subdomains})
         return copy
@@ -161,8 +161,8 @@ def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, or ranks have cut the bodies
-        differently.
+        If there are fewer subdomains than ranks, or if the ranks computed different
+        subdivisions.
 
     """
     return LocalDual(
@@ -176,23 +176,22 @@ def distributed_qp(
     first: LocalDual | None = None,
     others: int = 0,
 ) -> DistributedQP:
-    """Return the dual QP as distributed over ranks; called by all of them.
+    """Return the distributed dual QP; all ranks must call this function together.
 
-    If solutions of previous problems enter the QP, they depend on the number of ranks
-    by rounding. The digest is then that of the first of these problems, with their
-    number, so that it does not depend on the ranks.
+    If the QP depends on solutions of previous problems, its data differ by rounding
+    between numbers of ranks. Its digest is then computed from the first of these
+    problems and their number, so that it does not depend on the number of ranks.
 
     Parameters
     ----------
-    results : physical results of an answer; None if they need the undivided bodies
-    first, others : first of the previous problems, and their number
+    results : evaluates physical results; None if they require the undivided bodies
+    first : first of the previous problems; None if there are no previous problems
+    others : number of previous problems
 
     """
     local = dual.subdomains
     for part in ("explicit", "q", "G", "b"):
-        getattr(
-            dual, part
-        )  # computed here, so that it is not part of the time of `prepare`
+        getattr(dual, part)  # computed here to exclude it from the time of `prepare`
 
     def digest() -> str:
         names = others * [_digest(first.subdomains)] if first else [_digest(local)]
@@ -214,10 +213,10 @@ def distributed_qp(
 def _decomposition(
     local: LocalSubdomains, explicit: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """Return the quantities of `decomposition_quantities`, on all ranks.
+    """Return the quantities of `decomposition_quantities` for all ranks together.
 
-    explicit_mib: memory for blocks on all ranks together; a block of a class that
-    occurs on several ranks is stored on each of them.
+    `explicit_mib` is the sum over ranks: if a class occurs on several ranks, each of
+    them stores its blocks.
     """
     domains, rows, ranks = local.domains, local.rows, local.ranks
     sizes = np.array([part.size for part in touched_components(rows.B, domains)])
@@ -265,15 +264,15 @@ def _digest(local: LocalSubdomains) -> str:
 def _replicated_partition(
     problem: DecomposedProblem, ranks: Ranks
 ) -> NDArray[np.int64]:
-    """Return the rank of each subdomain (S,), the same on all ranks.
+    """Return the rank of each subdomain (S,), identical on all ranks.
 
-    Every rank partitions the graph with its own library, and different versions may
-    give different results.
+    Every rank partitions the graph with its own METIS library, and different versions
+    may compute different partitions.
 
     Raises
     ------
     InputError
-        If they do, or if there are fewer subdomains than ranks.
+        If the partitions differ, or if there are fewer subdomains than ranks.
 
     """
     ranks_of = subdomains_of(problem, ranks.size)

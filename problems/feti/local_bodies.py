@@ -34,14 +34,14 @@ from mortarbench.problems.feti.substructures import LocalProblems
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalSolution:
-    """Local part of a displacement, and the contact forces, replicated on all ranks.
+    """Local part of a displacement, with contact multipliers replicated on all ranks.
 
-    Its methods are called by all ranks together and return the same values on each.
+    All ranks must call its methods together; each rank receives the same values.
     """
 
     subdomains: LocalSubdomains
     bodies: LocalBodies
-    u: Vector  #: (n,) at `bodies.components`; equal on all ranks that share a component
+    u: Vector  #: (n,) at `bodies.components`; equal on ranks that share a component
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
@@ -72,9 +72,9 @@ Results = Callable[[LocalSolution], Mapping[str, Any]]
 def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
     """Recover the local displacement from the multipliers of the dual.
 
-    As in `problems.duality.feti_dual`, v = K⁺(f − Bᵀλ) − Rα is averaged over the copies
-    of each node on all ranks; α are the multipliers of RᵀBᵀλ = Rᵀf. Components that
-    supports eliminate are zero.
+    v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of RᵀBᵀλ = Rᵀf, is averaged over
+    the copies of each node on all ranks (see `problems.duality.feti_dual`). Components
+    that supports eliminate are zero.
     """
     bodies, multiplicity = _local_bodies(local.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_unit_motions]
@@ -107,8 +107,8 @@ def evaluation(
 
     Parameters
     ----------
-    decomposition : its quantities, see `decomposition_quantities`
-    reported : physical results of a solution; None if they need the undivided bodies
+    decomposition : result of `decomposition_quantities`
+    reported : evaluates physical results; None if they require the undivided bodies
 
     """
     problem = local.problem
@@ -130,7 +130,7 @@ def evaluation(
 def certifier(
     local: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
-    """Return a function that bounds the error of a displacement with multipliers.
+    """Return a function that bounds the error of a displacement and its multipliers.
 
     K : (n, n) stiffness matrix of the undivided bodies, stored on this one process
     """
@@ -139,14 +139,14 @@ def certifier(
 
 
 def local_bodies(local: LocalSubdomains) -> LocalBodies:
-    """Return the local data of certificates; supports are rows."""
+    """Return the local data of certificates, with supports as rows of B."""
     return _local_bodies(local.floating)[0]
 
 
 def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
     """Return the local data of certificates, and the multiplicities (n,).
 
-    local : subdomains that all float
+    local : floating subdomains, with supports as rows of B
     """
     problem, components, place = local.problem, local.components, local.place
     contact, active = problem.contact, _force_rows(problem)
@@ -173,13 +173,13 @@ def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
 
 
 def _force_rows(problem: DecomposedProblem) -> Nodes:
-    """Return the rows of contact, and of friction with a positive bound."""
+    """Return the indices of contact rows and of friction rows with positive bounds."""
     m, bound = problem.contact.rows.shape[0], problem.contact.bound
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
 def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """Return the numbers of the bodies with a rigid motion that the supports allow."""
+    """Return the indices of bodies with a rigid motion that the supports allow."""
     layout, d = problem.layout, problem.components
     node, axis = np.divmod(problem.fixed, d)
     body = layout.body[layout.holder(node)]
@@ -216,11 +216,14 @@ class _Extent(NamedTuple):
     centre: Vector  #: (dim,)
     radius: float  #: root mean square distance of the nodes from the centre
     size: float  #: √N
-    #: (k, k) combinations of the rotations that are orthonormal; None for at most one
+    #: (k, k) orthonormal combinations of the rotations; None for at most one rotation
     turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-        """Return the rigid motions at some points, orthonormal over all nodes."""
+        """Return the rigid motions at some points.
+
+        They are orthonormal over all nodes of the body.
+        """
         motions = _motions((points - self.centre) / self.radius, axis, d)
         if self.turn is not None:
             motions[:, d:] = motions[:, d:] @ self.turn
@@ -269,12 +272,12 @@ def _floating_bodies(local: LocalSubdomains) -> FloatingBodies:
 
 
 def _extent(local: LocalSubdomains, points: Points, share: Vector) -> _Extent:
-    """Return the extent of a body that is distributed over ranks; called by all.
+    """Return the extent of a distributed body; all ranks must call this together.
 
     Parameters
     ----------
-    points : (M, dim) of the local torn nodes
-    share : (M,) weights; those of all copies of a node of the body add up to one
+    points : (M, dim) points of the local torn nodes
+    share : (M,) weights, whose sum over all copies of a node of the body is one
 
     """
     total = local.ranks.total

@@ -1,4 +1,4 @@
-"""The dual operator of Total FETI as plain arrays, for files and other processes."""
+"""Serialisation of the dual operator of Total FETI as plain arrays."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from mortarbench.problems.feti.subdomain_classes import (
 
 NAME = "tfeti"  #: name in `problems.OPERATORS`, stored in files
 _PARTS = ("data", "indices", "indptr")
-_BY_CLASS = ("stiffness", "fixing", "boundary")  #: of lengths that depend on the class
+_BY_CLASS = ("stiffness", "fixing", "boundary")  #: arrays with class-dependent lengths
 
 
 @dataclass(frozen=True, eq=False)
 class StoredOperator(DualOperator):
-    """F restored from its arrays, which can be distributed over ranks."""
+    """Operator F restored from its arrays; it can be distributed over ranks."""
 
     @property
     def parts(self) -> int:
@@ -44,12 +44,12 @@ def dual_operator(
     equalities: int,
     clusters: Clusters | None = None,
 ) -> SerialisableOperator:
-    """Return F as a serialisable operator: B, and the data of every class once.
+    """Return F as a serialisable operator with B and one copy of each class.
 
     Parameters
     ----------
     equalities : number of equality rows of B, which come first
-    clusters : if given, F = B K̃⁺Bᵀ
+    clusters : if not None, F = B K̃⁺Bᵀ
 
     """
     classes = domains.classes

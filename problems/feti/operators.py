@@ -1,16 +1,16 @@
 """The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners.
 
-Only the components b with entries in B matter. With B_b the columns of B there, packed
-group by group, a product consists of a sparse, a dense and a sparse one:
+Only the components b with nonzero columns in B matter. With B_b these columns, packed
+group by group, a product with F is a sparse, a dense and another sparse product:
 
     F λ = B_b diag((K⁺)_bb) B_bᵀ λ
 
 A group is the set of subdomains that share a dense block. Their components form the
-columns of one matrix, so that each group takes one product of two dense matrices. For a
-single subdomain only one triangle of the block is stored, because the product is bound
-by memory bandwidth. The blocks (K⁺)_bb and S_bb are formed (*explicit*) as far as they
-fit into memory, which pays after about ten products; for all other classes a product
-solves with their factors.
+columns of one matrix, so that each group requires one product of two dense matrices.
+For a single subdomain only one triangle of the block is stored, because memory
+bandwidth limits the product. As many blocks (K⁺)_bb and S_bb as fit into memory are
+computed in advance (*explicit*), which pays off after about ten products. For all other
+classes, each product solves with their factors.
 
 Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel and Roux
 1994, Dirichlet; Rixen and Farhat 1999, scaling):
@@ -25,7 +25,7 @@ sense of Moore and Penrose, so that λ stays free of components in ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
 only where contact touches supports. There they would weight the equality rows for
-contact rows that are inactive in most faces: κ in the final face of
+contact rows that are mostly inactive: κ in the final face of
 beam-ring/Nr=8/Nh=5/steps=1/feti=8 is 58 with them and 3.7 without, the same value as if
 B contained only the rows of that face.
 """
@@ -79,24 +79,25 @@ STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
 CONTACT_SHIFT = 1e-8
 #: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
-#: least diagonal of B K̃⁺Bᵀ relative to that of B K⁺Bᵀ. Rounding 2⁻⁵³ of the terms then
-#: counts as a residual of 1e5·2⁻⁵³: far below any tolerance
+#: smallest diagonal entry of B K̃⁺Bᵀ relative to that of B K⁺Bᵀ. Residuals are scaled
+#: by 1/√diagonal, so that rounding errors 2⁻⁵³ of the terms amount to at most 1e5·2⁻⁵³,
+#: far below any tolerance
 LEAST_DIAGONAL = 1e-10
 #: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding
 COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """The subdomains of one class and the components of them that B touches."""
+    """Subdomains of one class, with the components that B touches in any of them."""
 
     template: SubdomainClass
-    explicit: bool  #: True if (K⁺)_bb is formed
+    explicit: bool  #: True if (K⁺)_bb is computed in advance
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within a subdomain, ascending
 
 
 def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
-    """Yield the position of each group with its blocks (K⁺)_bb and S_bb."""
+    """Yield the index of each group with its blocks (K⁺)_bb and S_bb."""
     return (
         (i, group.template.condense(group.touched)) for i, group in enumerate(groups)
     )
@@ -104,7 +105,7 @@ def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """Rows B on the components that they touch, numbered group by group.
+    """Rows of B on the components that they touch, numbered group by group.
 
     Within a group components come before subdomains, so that the packed vector of a
     group is a matrix (n_g, S_g) stored by rows.
@@ -119,7 +120,10 @@ class Packed:
         return Composition(CompressedRows(self.B), blocks, CompressedRows(self.BT))
 
     def block_diagonal(self, blocks: Sequence[Any]) -> BlockDiagonal:
-        """Return the map of packed components (M,) by the block of each group."""
+        """Return the block diagonal map of packed components (M,), a block per group.
+
+        blocks : block of each group, as for `BlockDiagonal`
+        """
         sizes = [group.touched.size for group in self.groups]
         return BlockDiagonal(blocks, sizes, [g.members.size for g in self.groups])
 
@@ -171,7 +175,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
 
 
 def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """Return, for each class, the components that B touches in any subdomain of it."""
+    """Return, for each class, the components that B touches in any of its members."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)
@@ -189,17 +193,17 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
 
 @dataclass(frozen=True, eq=False)
 class DualOperator:
-    """The operator F of decomposed bodies; x ↦ Fx takes (m,) and (m, k)."""
+    """The operator F of decomposed bodies, applied to arrays (m,) or (m, k)."""
 
     B: csr_array  #: (m, N)
     domains: Subdomains
-    explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
+    explicit: NDArray[np.bool_]  #: (kinds,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
     #: yields (K⁺)_bb and S_bb of explicit groups with their positions, in any order
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
-    clusters: Clusters | None = None  #: None if no subdomains are joined by averages
+    clusters: Clusters | None = None  #: None if averages join no subdomains
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
@@ -207,7 +211,7 @@ class DualOperator:
 
     @cached_property
     def linear_map(self) -> Composition:
-        """F, as compiled code applies it."""
+        """F as a linear map of compiled code."""
         return self.packed.congruence(self.inverse_map)
 
     def diagonal(self) -> Vector:
@@ -236,7 +240,7 @@ class DualOperator:
                 self.equalities,
                 gram_inverses(gram, self.equalities),
             )
-            # (B W Bᵀ)⁺ of equality rows is as sparse as B, that of contact rows is not
+            # (B W Bᵀ)⁺ is as sparse as B for equality rows, but dense for contact rows
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             solve = DirectSum(Identity(E), contact)
             self._preconditioners[kind, scaling] = Composition(
@@ -283,7 +287,7 @@ class DualOperator:
         return blocks, weights
 
     def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
-        """Return the map of packed components by D, or by (I − Π)D(I − Π)ᵀ.
+        """Return D, or (I − Π)D(I − Π)ᵀ with clusters, as a map on packed components.
 
         blocks, weights : from `weighted_blocks`
         """
@@ -294,7 +298,7 @@ class DualOperator:
 
     @cached_property
     def packed(self) -> Packed:
-        """The rows B on the components that they touch."""
+        """Rows of B restricted to the components they touch."""
         return pack(self.B, self.domains, self.explicit)
 
     @property
@@ -304,7 +308,7 @@ class DualOperator:
 
     @property
     def inverse_map(self) -> LinearMap:
-        """The map of packed components by (K⁺)_bb of each group, or by (K̃⁺)_bb."""
+        """diag((K⁺)_bb), or (K̃⁺)_bb with clusters, as a map on packed components."""
         return self._blocks.inverse_map
 
     @cached_property
@@ -312,8 +316,8 @@ class DualOperator:
         diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
         if joints is None:
             return diagonal
-        # C may determine a row of B, which F then maps to zero up to rounding of its
-        # terms; relative to a scale of zero, that rounding would be an error
+        # if C implies a row of B, its diagonal entry of F is zero up to rounding of the
+        # terms; residuals scaled by that entry would be errors of order one
         joined = diagonal + joints.diagonal(self.packed.B)
         return np.maximum(joined, LEAST_DIAGONAL * diagonal)
 
@@ -341,7 +345,7 @@ class _Blocks(NamedTuple):
     inverses: list[Any]  #: (K⁺)_bb
     schur: list[Any]  #: S_bb
     inverse_map: LinearMap  #: diag((K⁺)_bb), or (K̃⁺)_bb
-    joints: _Joints | None  #: the difference between them; None without clusters
+    joints: _Joints | None  #: (K̃⁺)_bb − diag((K⁺)_bb); None without clusters
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +365,7 @@ class _Joints:
 
     @property
     def linear_map(self) -> Composition:
-        """The map of packed components."""
+        """The term as a map on packed components."""
         members = [group.members.size for group in self.groups]
         sizes = [group.touched.size for group in self.groups]
         rows = [np.ascontiguousarray(block.T) for block in self.columns]
@@ -398,12 +402,13 @@ def average_free(
 ) -> Composition:
     """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
 
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding would let the
-    iterates of preconditioned conjugate gradients drift along these. B_DΠ maps to them,
-    and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 since C = LᵀB for some L: the preconditioner is the
-    same up to such multipliers, and its images are free of them.
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding errors would let the
+    iterates of preconditioned conjugate gradients drift along these multipliers. The
+    range of B_DΠ consists of them, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 because C = LᵀB for
+    some L. The factors I − Π hence change the preconditioner by such multipliers only,
+    and its images have no component along them.
 
-    weights : (M,) W, equal for all subdomains of a class
+    weights : (M,) diagonal of W, equal for all subdomains of a class
     """
     members = [group.members.size for group in packed.groups]
     modes, weighted, grams, end = [], [], [], 0
@@ -442,7 +447,7 @@ def _column_places(
 ) -> NDArray[np.int64]:
     """Return the places of the coordinates (Σq,) of `Clusters`, packed by groups.
 
-    sizes : number of columns of each group; its first ones are the coordinates
+    sizes : number of columns of each group; the coordinates come first in each group
     """
     first = clusters.coordinates
     place, end = np.empty(first[-1], dtype=np.int64), 0
@@ -455,7 +460,7 @@ def _column_places(
 
 
 def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
-    """Return the joints of clusters, from the blocks (K⁺)_bb of the groups."""
+    """Compute the joints of clusters from the blocks (K⁺)_bb of the groups."""
     columns, compliance, end = list[Dense](), list[Dense](), 0
     modes = clusters.domains.modes
     first_motion = np.cumsum(modes) - modes
@@ -522,7 +527,7 @@ class _Part(NamedTuple):
 
 
 def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
-    """Return the entries (i, j) of a block; an implicit one is evaluated in strips."""
+    """Return the entries (i, j) of a block; implicit blocks are evaluated in strips."""
     if not isinstance(block, _Part) and block.ndim == 1:  # a triangle
         i, j = np.minimum(i, j), np.maximum(i, j)
         return np.asarray(block[j * (j + 1) // 2 + i])
@@ -542,11 +547,11 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop from B W Bᵀ the coupling of contact with equality rows, and rounding."""
+    """Drop rounding, and the coupling of contact and equality rows, from B W Bᵀ."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])
-    # rounding would join the small blocks that `block_pseudoinverse` looks for
+    # rounding would join the small blocks that `block_pseudoinverse` separates
     kept = (np.abs(gram.data) > COUPLING_ROUNDING * size) & (
         (rows < equalities) == (columns < equalities)
     )
@@ -555,13 +560,13 @@ def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
 
 
 def gram_inverse(gram: csr_array, equalities: int) -> LinearMap:
-    """Return the map x ↦ (B W Bᵀ)⁺x for a result of `decouple_contact`."""
+    """Return x ↦ (B W Bᵀ)⁺x; `gram` is a result of `decouple_contact`."""
     inverse, contact = gram_inverses(gram, equalities)
     return DirectSum(CompressedRows(inverse), contact)
 
 
 def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMap]:
-    """Return (B W Bᵀ)⁺ of equality rows as a matrix, and that of contact rows."""
+    """Return (B W Bᵀ)⁺ of equality rows as a matrix, and of contact rows as a map."""
     inverse = block_pseudoinverse(gram[:equalities, :equalities])
     contact = csc_array(gram[equalities:, equalities:])
     contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
@@ -569,7 +574,7 @@ def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMa
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:
-    """Return M⁺ of a symmetric M with many small blocks, under any order of rows."""
+    """Return M⁺ of a symmetric M that is block diagonal up to a permutation."""
     if not M.nnz:
         return M
     _, block = connected_components(M, directed=False)
@@ -600,7 +605,7 @@ def block_pseudoinverse(M: csr_array) -> csr_array:
 
 
 def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
-    """Flag the classes with explicit blocks: the smallest, as many as fit."""
+    """Flag the classes with explicit blocks: the smallest that fit into memory."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     order = np.argsort(sizes, kind="stable")
     fits = np.zeros(sizes.size, dtype=bool)
@@ -611,6 +616,6 @@ def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
 
 
 def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
-    """Return the bytes that both blocks of each class take on b (sizes,) components."""
+    """Return the memory (bytes) of both blocks of each class on `sizes` components."""
     alone = np.array([members.size == 1 for members in domains.members])
     return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

@@ -23,7 +23,7 @@ from mortarbench.problems.fem.mesh import Nodes
 Labels = NDArray[np.int64]
 
 UNIT_WEIGHT = 100  #: weight of the facet between two squares, or two cubes
-MAX_WEIGHT = 10_000  #: of a facet; METIS sums weights as 32-bit integers
+MAX_WEIGHT = 10_000  #: largest weight of a facet; METIS sums in 32-bit integers
 #: imbalance allowed to METIS, in thousandths; smaller values leave more pieces that are
 #: disconnected from their part
 MAX_IMBALANCE = 300
@@ -34,14 +34,14 @@ def graph_partition(
 ) -> Labels:
     """Label the cells of bodies by parts, each connected and within one body.
 
-    The number of parts of a body is proportional to its number of cells, at least one.
+    The number of parts of a body is at least one, and proportional to its cells.
 
     Parameters
     ----------
-    points : (N, dim) of the nodes
-    cells : (E, c) corners; a triangle repeats its last one
+    points : (N, dim) points of the nodes
+    cells : (E, c) corners; a triangle repeats its last corner
     body : (E,) number of the body of each cell, from 0
-    parts : number of parts of all bodies together
+    parts : total number of parts
 
     Returns
     -------
@@ -81,9 +81,10 @@ def _parts_by_body(counts: Labels, parts: int) -> Labels:
 def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     """Return the graph of cells (E, E), with an integer weight for each shared facet.
 
-    The weight is `UNIT_WEIGHT` times √(L/d) for an edge of length L between cell
-    centres at the distance d, and times (L/d)^⅔ for a face of area L². Where the two
-    cells have the area (volume) 1, this is the length of the edge (area of the face).
+    With d the distance between the centres of both cells, the weight is `UNIT_WEIGHT`
+    times √(L/d) for an edge of length L, and times (L/d)^⅔ for a face of area L². If
+    both cells have unit area (volume), the factor is the length of the edge (area of
+    the face).
     """
     dim = points.shape[1]
     facets, names, cell = cell_facets(cells, dim)
@@ -123,7 +124,7 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
     from pymetis import CSRAdjacency, Options, part_graph  # late: few cases need it
 
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
-    # k-way partitions are better, but may leave parts empty if these have few cells
+    # k-way partitions are better, but may contain empty parts if parts have few cells
     for recursive in (False, True):
         options = Options(ufactor=MAX_IMBALANCE, contig=int(not recursive))
         _, found = part_graph(

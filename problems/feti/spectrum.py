@@ -1,19 +1,19 @@
 """Extreme eigenvalues of F on the null space of its equations, with error bounds.
 
-With P the orthogonal projector onto ker G ∩ range B, less ker F where averages join
-subdomains, these are the spectra of
+Let P be the orthogonal projector onto ker G ∩ range B, or onto the complement of ker F
+in this space if averages join subdomains. The spectra are those of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
 
-the latter with a preconditioner M ≈ F⁻¹, both on the range of P. Both operators are
-self-adjoint there, and one Lanczos process serves both (Parlett 1998, Chapter 13). Each
-vector is orthogonalised against the last two, as in the recurrence, then against all
-previous ones, which excludes spurious copies of eigenvalues. It is projected again in
-every step, because components in the kernel that stem from rounding grow.
+without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
+of P, so that the same Lanczos process applies (Parlett 1998, Chapter 13). Each vector
+is orthogonalised against the last two, as in the recurrence, then against all previous
+ones, which excludes spurious copies of eigenvalues. Each vector is also projected
+again, because components in the kernel that stem from rounding grow.
 
 The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue,
-and ‖r‖ follows from the last components of the eigenvectors of the tridiagonal matrix.
+and ‖r‖ follows from the last component of its eigenvector of the tridiagonal matrix.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Spectrum(NamedTuple):
 
     @property
     def condition_error(self) -> float:
-        """Bound of the error of κ, to first order in the errors of both eigenvalues."""
+        """First-order bound of the error of κ from the errors of both eigenvalues."""
         relative = self.smallest_error / self.smallest
         return self.condition * (relative + self.largest_error / self.largest)
 
@@ -85,9 +85,9 @@ def spectrum(
     F : symmetric, positive definite on the range of P
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
-    tol : error bound of both eigenvalues, relative
-    rows : components on this rank; None for all n of them
-    total : sums numbers (k,) over all ranks; returns the same sum on each of them
+    tol : relative error bound of both eigenvalues
+    rows : components on this rank; None for all n components
+    total : sums arrays (k,) over all ranks and returns the sum on each rank
 
     """
     local = np.arange(n) if rows is None else rows
@@ -98,7 +98,7 @@ def spectrum(
     #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # any start with a part of every eigenvector
+    v = P(np.sin(1.0 + local**2))  # arbitrary, with a component on each eigenvector
     V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
@@ -133,14 +133,15 @@ def spectra_over_ranks(
 ) -> list[Spectrum]:
     """Compute the spectra of F for the rows of supports and gluing.
 
-    Called by all ranks, which get the same; one process counts as one rank.
+    All ranks must call this function together; each receives the same spectra.
 
     Parameters
     ----------
-    F, G : of the dual of a problem without contact, whose supports hold every body
+    F, G : operator and equality rows RᵀBᵀ of the dual of a problem without contact,
+        whose supports exclude rigid motions of every body
     preconditioners : kind and scaling of each, see `problems.feti.operators`; None
-        stands for PFP itself
-    tol : error bound of both eigenvalues, relative
+        selects PFP without a preconditioner
+    tol : relative error bound of both eigenvalues
 
     """
     halo, ranks = F.halo, F.halo.ranks
@@ -166,13 +167,13 @@ def spectra_over_ranks(
 
 
 def projector(F: RankOperator, G: DistributedColumns) -> Product:
-    """Return the orthogonal projector onto ker G ∩ range B, less ker F.
+    """Return the orthogonal projector P of this module.
 
-    Called by all ranks.
+    All ranks must call this function together.
 
     Parameters
     ----------
-    F : operator with the rows B, which may depend on one another (redundant gluing)
+    F : operator with rows B, which may be linearly dependent (redundant gluing)
     G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
 
     """
@@ -191,10 +192,11 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
 
 
 def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:
-    """Bound the extreme Ritz values.
+    """Return the extreme Ritz values with error bounds.
 
-    alpha, beta, length : diagonal (k,) and off-diagonal (k − 1,) of the tridiagonal
-        matrix, and the length of the next vector
+    alpha : (k,) diagonal of the tridiagonal matrix
+    beta : (k − 1,) off-diagonal
+    length : norm of the next Lanczos vector before normalisation
     """
     last = alpha.size - 1
     (smallest, s), (largest, t) = (

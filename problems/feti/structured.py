@@ -1,9 +1,9 @@
 """Structured grids cut into blocks, numbered without a global mesh.
 
-All global numbers of torn nodes and of gluing rows follow from tables that are as long
-as the sides of the grids. With aᵢ = 2 for a column of nodes where two blocks meet and
-aᵢ = 1 elsewhere, and bⱼ likewise for rows, node (i, j) has aᵢbⱼ copies. The copies are
-numbered like their blocks, from left to right and from bottom to top.
+All global numbers of torn nodes and of gluing rows are computed from tables as long as
+the sides of the grids. Let aᵢ = 2 for a column of nodes where two blocks meet and
+aᵢ = 1 elsewhere, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ copies,
+numbered like their blocks from left to right and from bottom to top.
 
 The stiffest mode of an interface is a saw tooth along it, that is, alternating tension
 and compression, and it gets stiffer as the cells get thinner. Between half planes of
@@ -11,10 +11,11 @@ cells with sides hₜ along the interface and hₙ across, its stiffness is
 
     s(r) = √((C₆₆ + C₁₁r²) / (C₆₆ + C₁₁)),    r = hₙ/hₜ
 
-relative to squares. To see this, note that a saw tooth along a row of cells has 4C₁₁/hₜ
-times the mass matrix and hₜC₆₆/3 times the stiffness matrix of linear elements across
-the row; s is the Schur complement of their half line. With rows scaled by √s the least
-eigenvalue of the dual is the same as on squares (`shape_factors`).
+relative to square cells. Derivation: the energy of a saw tooth along a row of cells is
+a quadratic form across the row, with 4C₁₁/hₜ times the mass matrix plus hₜC₆₆/3 times
+the stiffness matrix of linear elements; s is its Schur complement on a half line. With
+rows scaled by √s, the smallest eigenvalue of the dual is the same as on squares
+(`shape_factors`).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Places(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Structured grids, numbered one after another and cut into blocks."""
+    """Structured grids, numbered consecutively and cut into blocks."""
 
     grids: tuple[StructuredGrid, ...]
     #: for each grid, the columns and rows of nodes where blocks begin and end
@@ -55,7 +56,7 @@ class Layout:
     ) -> Layout:
         """Cut grids into blocks of at most `most` cells per side.
 
-        most : one limit for both directions, or the limit for each direction
+        most : limit for both directions, or a pair of limits
         """
         sides = np.broadcast_to(most, 2)
 
@@ -71,7 +72,7 @@ class Layout:
 
     @cached_property
     def node_start(self) -> NDArray[np.int64]:
-        """First node of each grid, and the number of nodes: (grids + 1,)."""
+        """(grids + 1,) first node of each grid, then the total number of nodes."""
         return np.cumsum([0, *(grid.nodes for grid in self.grids)])
 
     @property
@@ -99,7 +100,7 @@ class Layout:
 
     @cached_property
     def block_start(self) -> NDArray[np.int64]:
-        """First block of each grid, and the number of blocks: (grids + 1,)."""
+        """(grids + 1,) first block of each grid, then the total number of blocks."""
         counts = [(x.size - 1) * (y.size - 1) for x, y in self.cuts]
         return np.cumsum([0, *counts])
 
@@ -110,7 +111,7 @@ class Layout:
 
     @cached_property
     def block(self) -> Places:
-        """Grid of each block (S,), and its column and row among the blocks."""
+        """Grid of each block (S,), with its column and row of blocks in the grid."""
         body = np.repeat(np.arange(len(self.grids)), np.diff(self.block_start))
         row, column = np.divmod(
             np.arange(self.count) - self.block_start[body], self._blocks_per_row[body]
@@ -119,7 +120,7 @@ class Layout:
 
     @property
     def positions(self) -> NDArray[np.int64]:
-        """Column and row of each block among those of its grid, (S, 2)."""
+        """Column and row of each block within its grid, (S, 2)."""
         return np.stack(self.block[1:], axis=1).astype(np.int64)
 
     @cached_property
@@ -136,7 +137,10 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return the first columns and rows of some blocks, and their numbers: (k,)."""
+        """Return the first column, first row, and numbers of columns and rows of nodes.
+
+        block : (k,) numbers of blocks; each result is (k,)
+        """
         at = Places(*(x[block] for x in self.block))
         first, last = (
             [
@@ -241,9 +245,9 @@ class Layout:
         )
 
     def lines(self, at: Places, *, ends: bool) -> NDArray[np.bool_]:
-        """Return (k, 2) True where the row, or the column, of a node separates blocks.
+        """Return a mask (k, 2) of nodes whose row, or column, separates blocks.
 
-        ends : True to count the sides of the grid as well, for rows of supports
+        ends : also mark the sides of the grid, as required for rows of supports
         """
         columns = []
         for lines, line in ((self._rows, at.row), (self._columns, at.column)):
@@ -257,10 +261,10 @@ class Layout:
     def shaping(
         self, share: Vector, block: Nodes
     ) -> Callable[[Nodes, Nodes, bool], Vector]:
-        """Return a function for the `shape_factors` at torn nodes of some blocks.
+        """Return a function that evaluates `shape_factors` at torn nodes of blocks.
 
-        Its arguments are places (k,) in the list of torn nodes, the global numbers of
-        these nodes, and True for rows of supports.
+        The arguments of this function are places (k,) in the list of torn nodes, the
+        global numbers of these nodes, and True for rows of supports.
 
         share : (grids,) C₁₁/(C₁₁ + C₆₆) of each grid
         """
@@ -305,7 +309,7 @@ class Layout:
 
     @cached_property
     def _counts(self) -> dict[int, tuple[NDArray[np.int64], int]]:
-        """For each m, the number of nodes with m copies before each row, and in all."""
+        """For each m, numbers of nodes with m copies: before each row, and in total."""
         columns, rows = self._columns, self._rows
         body = np.repeat(np.arange(len(self.grids)), np.diff(rows.start))
         of_columns = [
@@ -324,7 +328,10 @@ class Layout:
         }
 
     def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of blocks with a common side, and its number of nodes: (k,)."""
+        """Return pairs of adjacent blocks with their numbers of shared nodes, all (k,).
+
+        Only blocks with a common side count.
+        """
         body, column, row = self.block
         all_ = np.arange(self.count)
         _, _, columns, rows = self.corner(all_)
@@ -338,7 +345,7 @@ class Layout:
         )
 
     def glued(self) -> NDArray[np.int64]:
-        """Return the number of nodes with several copies in each block, (S,)."""
+        """Return, for each block (S,), the number of its nodes with several copies."""
         left, low, columns, rows = self.corner(np.arange(self.count))
         alone = []
         for lines, first, count in (
@@ -356,7 +363,7 @@ class Layout:
 def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return mean edge lengths (l·k, 2) at each node, along its row and its column.
 
-    points : (l, k, 2) of l rows and k columns of nodes
+    points : (l, k, 2) points of l rows and k columns of nodes
     """
     lengths = np.empty(points.shape)
     for component, axis in ((0, 1), (1, 0)):
@@ -372,12 +379,13 @@ def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def shape_factors(
     spacing: NDArray[np.float64], lines: NDArray[np.bool_], share: Vector | float
 ) -> Vector:
-    """Return s(r) of the interface at each node (k,); the mean if two interfaces meet.
+    """Return s(r) at each node (k,); the mean of s if two interfaces meet there.
 
     Parameters
     ----------
-    spacing, lines : (k, 2) from `spacings` and `Layout.lines`; 1 away from interfaces
-    share : C₁₁ / (C₁₁ + C₆₆) of the material, (k,) or one for all
+    spacing : (k, 2) result of `spacings`
+    lines : (k, 2) result of `Layout.lines`; the factor is 1 at nodes off all interfaces
+    share : C₁₁ / (C₁₁ + C₆₆) of the material, (k,) or a scalar
 
     """
     squares = (spacing[:, ::-1] / spacing) ** 2  # r² of the row, and of the column
@@ -388,14 +396,14 @@ def shape_factors(
 
 
 class _Lines(NamedTuple):
-    """Tables for the columns, or the rows, of all grids one after another."""
+    """Tables for the columns, or the rows, of all grids."""
 
     start: NDArray[
         np.int64
-    ]  #: (grids + 1,) first line of each grid, and their number k
+    ]  #: (grids + 1,) first line of each grid, then their number k
     multiplicity: NDArray[np.int64]  #: (k,) number of blocks that meet there, 1 or 2
     first: NDArray[np.int64]  #: (k,) first block that contains the line
-    #: (2, k) numbers of lines before it in its grid, with multiplicity 1 and 2
+    #: (2, k) numbers of preceding lines in its grid, of multiplicity 1 and 2
     before: NDArray[np.int64]
     cut: NDArray[np.int64]  #: (c,) lines where blocks begin and end
     cut_start: NDArray[np.int64]  #: (grids + 1,) first cut of each grid, and c

@@ -1,9 +1,9 @@
 """Subdivision of bodies into subdomains, replicated on every rank.
 
 Global numbers of torn nodes and of gluing rows follow from the subdomains that contain
-each node. For blocks of structured grids, tables as long as the sides of the grids are
-enough (`problems.feti.structured.Layout`). Otherwise the nodes that several subdomains
-share are listed (`ListedSubdivision`), and the list is as long as the interfaces.
+each node. For blocks of structured grids, tables as long as the sides of the grids
+suffice (`problems.feti.structured.Layout`). Otherwise the nodes shared by several
+subdomains, the nodes of the interfaces, are listed (`ListedSubdivision`).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ Points = NDArray[np.float64]
 
 
 class SubdomainNodes(NamedTuple):
-    """Nodes of some subdomains, one subdomain after another, ascending within each."""
+    """Nodes of some subdomains, subdomain by subdomain, ascending within each."""
 
     subdomain: Integers  #: (M,) place in the list of subdomains
     number: Nodes  #: (M,) global numbers
     multiplicity: Integers  #: (M,) number of copies in all subdomains
     copy: Integers  #: (M,) number of this copy, from 0
-    start: NDArray[np.int64]  #: (subdomains + 1,) first node of each, and M
+    start: NDArray[np.int64]  #: (subdomains + 1,) first node of each, then M
 
 
 class Subdivision(Protocol):
@@ -90,7 +90,7 @@ class Subdivision(Protocol):
         """Return the points of some nodes, (k, 2)."""
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Return, for each node, the number of nodes before it with as many copies."""
+        """Return, for each node, the number before it of equal multiplicity, (k,)."""
 
     @property
     def nodes_by_multiplicity(self) -> Mapping[int, int]:
@@ -114,9 +114,10 @@ class ListedSubdivision:
     body: Integers  #: (S,)
     sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
     node: Nodes  #: (k,) listed nodes, ascending
-    start: NDArray[np.int64]  #: (k + 1,) first holder of each, and l
+    start: NDArray[np.int64]  #: (k + 1,) first holder of each, then l
     holders: Nodes  #: (l,) subdomains of each node, ascending
-    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, 4) in them
+    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, 4) as indices
+    #: into these nodes
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
     labelling: Callable[[], NDArray[np.int64]]  #: computes `label`
@@ -141,7 +142,7 @@ class ListedSubdivision:
         subdomain = np.repeat(np.arange(sizes.size, dtype=np.int32), sizes)
         copy = np.zeros(number.size, dtype=np.int32)
         listed = np.flatnonzero(self.node[place] == number)
-        # holders ascend for each listed node, so that the pairs are sorted
+        # holders of each listed node are ascending, so that the pairs are sorted
         pairs = np.repeat(np.arange(self.node.size), np.diff(self.start))
         position = np.searchsorted(
             pairs * self.count + self.holders,
@@ -183,7 +184,7 @@ class ListedSubdivision:
         return np.asarray(self.holders[self.start[self._place(node)] + copy])
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Return the number of nodes before each listed one with as many copies."""
+        """Return, for listed nodes, the number before them of equal multiplicity."""
         return np.asarray(self._before[self._place(node)])
 
     @cached_property
@@ -221,9 +222,9 @@ class ListedSubdivision:
 def sort_holders(
     number: Nodes, subdomain: Nodes, subdomains: int
 ) -> tuple[Nodes, NDArray[np.int64], Nodes]:
-    """Sort pairs of a node and a subdomain that contains it; repeated pairs count once.
+    """Sort pairs of a node and a subdomain that contains it, dropping duplicates.
 
-    number, subdomain : (e,)
+    number, subdomain : (e,) node and subdomain of each pair
 
     Returns
     -------
@@ -238,9 +239,9 @@ def sort_holders(
 def half_discs_in_blocks(
     discs: Sequence[HalfDisc], blocks: Sequence[Sequence[Block]]
 ) -> ListedSubdivision:
-    """Return the subdivision of half discs into blocks; block perimeters are listed.
+    """Return the subdivision of half discs into blocks; nodes of perimeters are listed.
 
-    blocks : for each disc, the rings and angles of cells, in the order of subdomains
+    blocks : for each disc, the rings and sectors of cells of each block
     """
     first = np.cumsum([0, *(disc.nodes for disc in discs)])
     body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])
@@ -277,7 +278,7 @@ def half_discs_in_blocks(
 
 
 def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
-    """Return the block of each cell, one disc after another."""
+    """Return the block of each cell, disc by disc."""
     first = np.cumsum([0, *map(len, blocks)])
     return np.concatenate(
         [label_blocks(own) + begin for own, begin in zip(blocks, first, strict=False)]
@@ -292,7 +293,7 @@ def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
 
 
 def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
-    """Return the nodes on the sides of a block of cells, some of them twice."""
+    """Return the nodes on the sides of a block of cells; some are repeated."""
     a, r = disc.angles.size, disc.radii.size
     has_centre = rings.stop == r
     i = np.arange(angles.start, angles.stop + 1)
@@ -309,12 +310,12 @@ def mesh_in_subdomains(
     named: Nodes,
     positions: NDArray[np.int64] | None = None,
 ) -> ListedSubdivision:
-    """Return the subdivision of any mesh by labels of its cells; the mesh is stored.
+    """Return the subdivision of a mesh by labels of its cells; the mesh is stored.
 
     Parameters
     ----------
     label, body : (E,) subdomain and body of each cell
-    named : nodes to list although only one subdomain has them
+    named : nodes to list even if only one subdomain contains them
     positions : see `Subdivision`
 
     """

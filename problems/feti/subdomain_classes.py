@@ -1,4 +1,4 @@
-"""Classes of congruent subdomains, and bodies decomposed into them (Total FETI).
+"""Classes of congruent subdomains, and bodies decomposed into subdomains (Total FETI).
 
 In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
 subdomain floats; supports, gluing and contact are rows of one matrix B. So the kernel
@@ -11,9 +11,9 @@ they share one stiffness matrix, one factor and one explicit operator, and B con
 the rotations. A displacement u (n,) of the undivided bodies gives v = T u, with one d×d
 block per copy of a node.
 
-In hybrid FETI (Klawonn and Rheinbach 2010, Comput. Methods Appl. Mech. Eng. 199), equal
-averages over the common faces of subdomains join these to clusters (`Clusters`). A
-cluster has the rigid motions of a single body, and the coarse problem shrinks.
+In hybrid FETI (Klawonn and Rheinbach 2010, Comput. Methods Appl. Mech. Eng. 199),
+subdomains are joined into clusters by equal averages over common faces (`Clusters`). A
+cluster has the rigid motions of a single body, which reduces the coarse problem.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import BlockDiagonal
 
 Dense = NDArray[np.float64]
-_STRIP = 256  #: right-hand sides per solve, which bounds the memory for their images
+_STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,15 +45,15 @@ class SubdomainClass:
     """Data shared by all congruent subdomains of a class.
 
     K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
-    components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). All
-    subdomains of a class are solved for together, as columns of one right-hand side.
+    components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). A
+    single solve treats all subdomains of a class, as columns of one right-hand side.
     """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
     fixing: Nodes  #: components of a few nodes that exclude every motion of R
-    #: components of all nodes on the boundary of the subdomain, ascending, glued or
-    #: free: Dirichlet preconditioners condense onto these
+    #: ascending components of all nodes, glued or free, on the boundary of the
+    #: subdomain, onto which Dirichlet preconditioners condense
     boundary: Nodes
     stiffness: (
         Vector  #: (n_k,) mean modulus of the cells around each component, in units of K
@@ -61,7 +61,7 @@ class SubdomainClass:
 
     @cached_property
     def name(self) -> str:
-        """Digest of the numbers; equal on all ranks that assemble this class."""
+        """Digest of the data; equal on all ranks that assemble this class."""
         K = self.K
         return hex_digest(
             map(
@@ -72,7 +72,7 @@ class SubdomainClass:
         )
 
     def without_factor(self, name: str = "") -> SubdomainClass:
-        """Return a copy without cached factors, under this name or another one."""
+        """Return a copy without cached factors; an empty `name` keeps the name."""
         copy = replace(self)
         vars(copy)["name"] = name or self.name
         return copy
@@ -92,9 +92,9 @@ class SubdomainClass:
 
             (K⁺)_bb = (S_ρ⁻¹)_bb,    S_ρ = S_h + ρR*R*ᵀ,   S_h = K_hh − K_hi K_ii⁻¹K_ih
 
-        where h is the union of the boundary, b and the fixing components, and i are all
-        others. With h ordered last, the trailing block L of the Cholesky factor of K_ρ
-        satisfies S_ρ = LLᵀ.
+        where h is the union of the boundary, b and the fixing components, and i denotes
+        the other components. With h ordered last, the trailing block L of the Cholesky
+        factor of K_ρ satisfies S_ρ = LLᵀ.
         """
         return self.blocks(b, self.border_factor(b))
 
@@ -103,7 +103,7 @@ class SubdomainClass:
         return np.union1d(np.union1d(self.boundary, b), self.fixing)
 
     def border_factor(self, b: Nodes) -> Dense:
-        """Return L (h, h) with S_ρ = LLᵀ: the larger part of the work of `condense`."""
+        """Return L (h, h) with S_ρ = LLᵀ, the most expensive part of `condense`."""
         h = self.border(b)
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         if (
@@ -117,20 +117,20 @@ class SubdomainClass:
         return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def blocks(self, b: Nodes, L: Dense) -> Condensed:
-        """Return both blocks of `condense`, from the L of `border_factor`."""
+        """Return both blocks of `condense` from the factor L of `border_factor`."""
         g, h = np.union1d(self.boundary, b), self.border(b)
         places_b, places_fixing = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, places_b])[places_b]
         S = L @ L.T  # S_ρ; without ρR*R*ᵀ it is the Schur complement S_h of K itself
         S[np.ix_(places_fixing, places_fixing)] -= self._fixing_term
         S_bb, inner = S[np.ix_(places_b, places_b)], ~np.isin(h, g)
-        if inner.any():  # fixing components inside are not part of S_bb: eliminate them
+        if inner.any():  # S_bb excludes interior fixing components: eliminate them
             S_ib = S[inner][:, places_b]
             S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
         return Condensed(_symmetric(C), _symmetric(S_bb))
 
     def elimination(self, h: Nodes) -> Elimination:
-        """Eliminate all components but h; the result multiplies columns by S."""
+        """Eliminate all components except h; return S as an operator on columns."""
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         order = np.concatenate([h, i])
         K = csc_array(csc_array(self.K[:, order])[order])
@@ -162,7 +162,7 @@ class Condensed(NamedTuple):
     """Local blocks of one class on components b."""
 
     compliance: Dense  #: (K⁺)_bb
-    schur: Dense  #: S_bb of S condensed onto the boundary and b
+    schur: Dense  #: S_bb, where S is the Schur complement on the boundary and b
 
 
 class Elimination(NamedTuple):
@@ -170,7 +170,7 @@ class Elimination(NamedTuple):
 
     K_hh: csr_array
     K_ih: csr_array
-    factor: Factor | None  #: of K_ii; None when i is empty
+    factor: Factor | None  #: factor of K_ii; None if i is empty
 
     def __matmul__(self, X: Dense) -> Dense:
         SX = np.asarray(self.K_hh @ X)
@@ -183,14 +183,14 @@ class Elimination(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Subdomains:
-    """S subdomains before gluing, each of one of few classes."""
+    """S subdomains before gluing, grouped into classes."""
 
     classes: tuple[SubdomainClass, ...]
     class_of: NDArray[np.int64]  #: (S,) class of each subdomain
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
-        """Number of the first unknown of each subdomain, and their total: (S + 1,)."""
+        """(S + 1,) first torn unknown of each subdomain, then their total number."""
         sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
@@ -223,7 +223,7 @@ class Subdomains:
             yield self.start[members] + np.arange(template.R.shape[0])[:, None]
 
     def restrict(self, free: NDArray[np.bool_]) -> Subdomains:
-        """Return the subdomains restricted to the free torn unknowns, a mask (N,)."""
+        """Return the subdomains restricted to the torn unknowns in the mask (N,)."""
         classes, class_of = list[SubdomainClass](), np.empty_like(self.class_of)
         numbers = dict[tuple[int, bytes], int]()
         for s, k in enumerate(self.class_of):
@@ -243,8 +243,8 @@ class Subdomains:
         return v
 
 
-#: eigenvalues of C_cC_cᵀ below this share of the largest belong to dependent rows of C;
-#: averages over faces are orthonormal, so that others are far above it
+#: eigenvalues of C_cC_cᵀ below this share of the largest indicate dependent rows of C.
+#: The modes of faces are orthonormal, so that all other eigenvalues are much larger
 DEPENDENT_SHARE = 1e-10
 
 
@@ -262,24 +262,24 @@ class Clusters:
         v = K̃⁺b − RNβ,   K̃⁺ = K⁺ − V M⁺Vᵀ,   M = ⎡CK⁺Cᵀ  CR⎤
                                                   ⎣RᵀCᵀ    0⎦
 
-    with any β. N is an orthonormal basis of ker CR, the motions of clusters as rigid
-    bodies, and RN is the kernel. M⁺ is the pseudo-inverse of Moore and Penrose: it
-    allows for dependent rows of C, and K̃⁺ ≥ 0. M is block diagonal, with one block per
-    cluster.
+    with arbitrary β. The columns of N are an orthonormal basis of ker CR, the motions
+    of clusters as rigid bodies, and RN spans the kernel. The Moore-Penrose inverse M⁺
+    admits linearly dependent rows of C, and K̃⁺ ≥ 0. M is block diagonal, with one block
+    per cluster.
 
-    The modes of a face are its rigid motions, orthonormal over its nodes. A class has
-    the modes of all faces at which some member is joined: Φ_k for class k. C applies to
-    the coordinates Φ_kᵀv_s, which are numbered subdomain by subdomain.
+    The modes of a face are its rigid motions, orthonormal over its nodes. The columns
+    of Φ_k are the modes of all faces at which some member of class k is joined. C
+    applies to the coordinates Φ_kᵀv_s, which are numbered subdomain by subdomain.
     """
 
-    domains: Subdomains  #: all of them float
+    domains: Subdomains  #: floating subdomains
     cluster: NDArray[np.int64]  #: (S,) cluster of each subdomain, from 0
     faces: tuple[csr_array, ...]  #: Φ (n_k, q_k) for each class
     joints: csr_array  #: C in these coordinates (c, Σq), rows ordered by clusters
 
     @cached_property
     def coordinates(self) -> NDArray[np.int64]:
-        """First coordinate of each subdomain, and their total: (S + 1,)."""
+        """(S + 1,) first coordinate of each subdomain, then their total number."""
         sizes = np.array([modes.shape[1] for modes in self.faces])
         return np.concatenate([[0], np.cumsum(sizes[self.domains.class_of])])
 
@@ -297,7 +297,7 @@ class Clusters:
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """First row of C of each cluster, and their number: (clusters + 1,)."""
+        """(clusters + 1,) first row of C of each cluster, then their total number."""
         subdomain = np.searchsorted(
             self.coordinates, self.joints.indices[self.joints.indptr[:-1]], side="right"
         )
@@ -306,7 +306,7 @@ class Clusters:
 
     @cached_property
     def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
-        """Places (c + r,) of (μ_1, α_1, μ_2, α_2, …) in (μ, α), and their sizes."""
+        """Places (c + r,) of (μ_1, α_1, μ_2, α_2, …) in (μ, α); size per cluster."""
         start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
         parts = [
             np.concatenate(
@@ -334,7 +334,7 @@ class Clusters:
             gram += J @ (modes.T @ modes).toarray() @ J.T
             motions.append(J @ (modes.T @ domains.classes[k].R))
         CR = np.concatenate(motions, axis=1)
-        # all subdomains float and are joined by faces: a cluster moves as each of them
+        # floating subdomains joined by faces: a cluster has the motions of one of them
         last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
         N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
         size, modes = np.linalg.eigh(gram)
@@ -350,7 +350,7 @@ class Clusters:
 
     @property
     def independent(self) -> csr_array:
-        """Orthonormal combinations (c', c) of the rows of C that are independent."""
+        """Orthonormal combinations (c', c) that reduce C to independent rows."""
         return csr_array(
             block_diag([part.independent.T for part in self._joined], format="csr")
         )
@@ -397,10 +397,11 @@ class Clusters:
     def restrict(
         self, subdomains: Nodes, classes: Nodes, domains: Subdomains
     ) -> Clusters:
-        """Return whole clusters only.
+        """Return a selection of whole clusters.
 
-        subdomains, classes : ascending; the subdomains of some clusters, their classes
-        domains : these subdomains
+        subdomains : all subdomains of the selected clusters, ascending
+        classes : classes of these subdomains, ascending
+        domains : these subdomains as `Subdomains`
         """
         columns = np.concatenate(
             [np.arange(*self.coordinates[[s, s + 1]]) for s in subdomains]
@@ -417,28 +418,28 @@ class Clusters:
 class _Joined(NamedTuple):
     """Joints of one cluster, with c rows of C."""
 
-    parts: list[tuple[int, Dense]]  #: class and C (c, q_k), for each subdomain
+    parts: list[tuple[int, Dense]]  #: class and columns of C (c, q_k) of each subdomain
     CR: Dense  #: (c, r)
     N: Dense  #: (r, r̃) orthonormal basis of ker CR
     independent: Dense  #: (c, c') orthonormal basis of range C
     dependent: Dense  #: (c, c − c') orthonormal basis of ker Cᵀ
 
     def product(self, coordinates: Sequence[Dense]) -> Dense:
-        """Return CACᵀ (c, c), from ΦᵀAΦ of each class."""
+        """Return CACᵀ (c, c) from the blocks ΦᵀAΦ of all classes."""
         total = np.zeros((self.CR.shape[0],) * 2)
         for k, J in self.parts:
             total += J @ coordinates[k] @ J.T
         return total
 
     def gram_inverse(self, grams: Sequence[Dense]) -> Dense:
-        """Return (CWCᵀ)⁺ on the range of C, from ΦᵀWΦ of each class."""
+        """Return (CWCᵀ)⁺ on the range of C from the blocks ΦᵀWΦ of all classes."""
         U = self.independent
         return _symmetric(U @ np.linalg.inv(U.T @ self.product(grams) @ U) @ U.T)
 
     def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
-        """Return M⁺ of this cluster, from ΦᵀK⁺Φ of each class."""
+        """Return M⁺ of this cluster from the blocks ΦᵀK⁺Φ of all classes."""
         S, (c, r) = self.product(compliance), self.CR.shape
-        # in units in which CK⁺Cᵀ is of order one, as CR is
+        # scale CK⁺Cᵀ to order one, the order of CR
         unit = float(np.trace(S)) / c if c else 1.0
         M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
         Z = block_diagonal(self.dependent, self.N)  # ker M
@@ -455,9 +456,9 @@ class DecomposedBodies:
 
         min ½vᵀKv − fᵀv   subject to   B_E v = c_E,  B_I v ≤ c_I,   K = diag(K_1 … K_S)
 
-    Rows of B are those of supports and gluing (E), then of contact (normals, then
-    tangents). Contact rows are multiplied by `scale`: the multipliers of the unscaled
-    rows are scale·λ.
+    The rows of B are support and gluing rows (E), followed by normal and tangential
+    contact rows (I). Contact rows are multiplied by `scale`, so that the multipliers of
+    the unscaled rows are scale·λ.
     """
 
     classes: tuple[SubdomainClass, ...]
@@ -465,14 +466,14 @@ class DecomposedBodies:
     spread: csr_array  #: T (N, n)
     B: csr_array  #: (m, N), scaled
     c: Vector  #: (m,), scaled
-    scale: Vector  #: positive factors of the contact rows, which come last
-    f: Vector  #: (N,) Tᵀf is the load of the undivided bodies
+    scale: Vector  #: positive factors of the contact rows
+    f: Vector  #: (N,) torn load; Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first
-    clusters: Clusters | None = None  #: None if no subdomains are joined by averages
+    clusters: Clusters | None = None  #: None if averages join no subdomains
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """The floating units that B glues: clusters, or the subdomains themselves."""
+        """Floating units that B glues: clusters, or else subdomains."""
         return self.clusters or self.domains
 
     @property
@@ -482,7 +483,7 @@ class DecomposedBodies:
 
     @cached_property
     def domains(self) -> Subdomains:
-        """The subdomains without B; factors are cached here."""
+        """The subdomains before gluing, with cached factors."""
         return Subdomains(self.classes, self.class_of)
 
 
@@ -496,9 +497,9 @@ def _symmetric(M: Dense) -> Dense:
 
 
 def _restricted(kind: SubdomainClass, free: NDArray[np.bool_]) -> SubdomainClass:
-    """Return a class restricted to its free components, a mask (n_k,).
+    """Return a class restricted to the components in the mask `free` (n_k,).
 
-    The kernel keeps the motions of R that vanish at the fixed components.
+    The new kernel consists of the motions of R that vanish at the fixed components.
     """
     if free.all():
         return kind

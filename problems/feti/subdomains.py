@@ -1,27 +1,27 @@
 """The local subdomains of one rank, and their rows of B.
 
-Each rank builds only its local subdomains: their meshes, stiffness matrices, loads and
-the rows of B that touch them. A single process has all subdomains. Global numbers
+Each rank assembles its local subdomains only: meshes, stiffness matrices, loads and
+the rows of B that touch them. A single process assembles all subdomains. Global numbers
 follow from the subdivision (`problems.feti.subdivision`), which is replicated on all
 ranks: tables as long as the sides of structured grids, or a list of the nodes on
-interfaces. Beyond that, a rank stores a few numbers for each subdomain of the whole, as
-does a coarse problem.
+interfaces. In addition, a rank stores a few numbers per subdomain of all ranks; the
+coarse problem is of the same size.
 
-The rows of B are those of supports, of gluing and of contact, in this order (Total
-FETI, Dostál, Horák and Kučera 2006). Supports are rows for every copy of a node. The m
-copies of a free component are glued by one of
+B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
+and Kučera 2006). Every copy of a fixed component has a support row. The m copies of a
+free component are glued by one of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
 * ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
-Contact rows act on the average of the copies, which equals each of them once they are
-glued. So a contact row exists once, even at a node of several subdomains, and it is
+Contact rows act on the average of the copies, which are all equal at the solution.
+Therefore even a node of several subdomains has a single contact row, which is
 orthogonal to the gluing rows.
 
-Rows of supports and gluing are scaled by √E of their body. Contact rows are normalised,
-then scaled by √E of the softest body they touch. So F does not depend on E if each body
-is homogeneous. E may be multiplied by a factor for the shape of the cells
+Support and gluing rows are scaled by √E of their body. Contact rows are normalised,
+then scaled by √E of the softest body they touch. If each body is homogeneous, F is
+hence independent of E. A factor for the shape of the cells may multiply E
 (`problems.feti.structured`).
 """
 
@@ -80,19 +80,19 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: names of gluings → weights (rows, m) of the m copies of a component
+#: functions by name of the gluing; they return the weights (rows, m) of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
 
 
 class Contact(NamedTuple):
-    """Global rows of contact, then of friction; replicated on every rank."""
+    """Global contact rows followed by friction rows, replicated on every rank."""
 
     rows: csr_array  #: (m_I, n) in components of the undivided bodies
     c: Vector  #: (m_I,)
-    bound: Vector  #: (k,) friction bounds of the last rows
-    tangents: int = 1  #: number of friction rows of each tangential vector
+    bound: Vector  #: (k,) friction bounds of the last k rows
+    tangents: int = 1  #: number of friction rows per tangential vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -100,28 +100,29 @@ class DecomposedProblem:
     """A contact problem on decomposed bodies, nondimensional, before assembly."""
 
     layout: Subdivision  #: the S subdomains
-    components: int  #: per node: those of a displacement, or 1 for a height
+    components: int  #: number of components per node; 1 for a scalar field
     material: Integers  #: (S,) material of each subdomain
     assemble_class: Callable[
         [SubdomainMesh], SubdomainClass
-    ]  #: from a floating subdomain
+    ]  #: assembles the class of a floating subdomain
     E: Vector  #: (bodies,) moduli for the scaling of rows
-    names: tuple[str, ...]  #: of the bodies
-    #: returns, for some subdomains, the factor of E in rows at their torn nodes, see
-    #: `problems.feti.structured.Layout.shaping`; None stands for the factor 1
+    names: tuple[str, ...]  #: names of the bodies
+    #: returns the factors of E in rows at torn nodes of some subdomains, see
+    #: `problems.feti.structured.Layout.shaping`; None means the factor 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
-    load: Callable[[Nodes], Vector]  #: global components (k,) → forces (k,)
-    fixed: Nodes  #: global components that are zero, in row order
-    #: True if these are eliminated as in FETI-1 (Farhat and Roux 1991) instead of being
-    #: rows of B. Their subdomains do not float and keep the global axes
+    load: Callable[[Nodes], Vector]  #: maps global components (k,) to forces (k,)
+    fixed: Nodes  #: global components that are zero, in the order of their rows
+    #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
+    #: of adding rows to B. Subdomains with supports then do not float and keep the
+    #: global axes
     eliminated: bool = False
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
-    cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
+    cluster: int = 0  #: number of subdomains per side of a cluster; 0: no clusters
 
     @cached_property
     def clusters(self) -> NDArray[np.int64] | None:
-        """Cluster of each subdomain (S,), numbered from 0 body by body; or None.
+        """Cluster of each subdomain (S,), numbered body by body; None without clusters.
 
         Raises
         ------
@@ -151,17 +152,17 @@ class DecomposedProblem:
 
     @cached_property
     def contact_scale(self) -> Vector:
-        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches.
+        """√(E/‖B_i‖²) of each contact row (m,), with E of the softest body it touches.
 
-        That of the first row of a tangential vector applies to all of them: in exact
-        arithmetic they are equal.
+        All rows of a tangential vector have the factor of the first one, because their
+        factors are equal in exact arithmetic.
         """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
             return np.zeros(0)
         node = rows.indices // self.components
         E = self.E[of.body[of.holder(node)]]
-        # an entry b at a node of m copies becomes m entries b/m of B: m(b/m)² = b²/m
+        # an entry b at a node with m copies becomes m entries b/m of B: m(b/m)² = b²/m
         norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
         scale = np.sqrt(softest / norm2)
@@ -181,7 +182,7 @@ class Entries(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LocalSubdomains:
-    """The subdomains of one rank; most properties are computed on first use."""
+    """The subdomains of one rank; most properties are evaluated on first use."""
 
     problem: DecomposedProblem
     ranks: Ranks
@@ -198,7 +199,7 @@ class LocalSubdomains:
         return self.problem.layout.subdomain_nodes(self.number)
 
     def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Return the local torn nodes (k,) of given subdomains and global nodes."""
+        """Return the local torn nodes (k,) of pairs of subdomain and global node."""
         nodes, N = self.nodes, self.problem.layout.nodes
         keys = nodes.subdomain * np.int64(N) + nodes.number
         return np.searchsorted(
@@ -207,12 +208,12 @@ class LocalSubdomains:
 
     @property
     def component(self) -> Nodes:
-        """Global component of which each torn unknown is a copy, (N_p,)."""
+        """Global component of each torn unknown, (N_p,)."""
         return self._component[self.free]
 
     @property
     def _component(self) -> Nodes:
-        """The same, including eliminated components."""
+        """Global component of each torn unknown, including eliminated components."""
         return self._of_nodes(self.nodes.number)
 
     @cached_property
@@ -237,7 +238,10 @@ class LocalSubdomains:
 
     @cached_property
     def spread(self) -> csr_array:
-        """T (N_p, n_p): a block Qᵀ per torn node, into the axes of its subdomain."""
+        """T (N_p, n_p) with a block Qᵀ per torn node, which rotates to subdomain axes.
+
+        Eliminated components have no rows.
+        """
         d, place = self.problem.components, self._distinct[1]
         M, n = place.size, d * self._distinct[0].size
         if d == 1:
@@ -251,7 +255,7 @@ class LocalSubdomains:
 
     @property
     def multiplicity(self) -> NDArray[np.int64]:
-        """Number of copies of each torn unknown on all ranks together, (N_p,)."""
+        """Number of copies of each torn unknown on all ranks, (N_p,)."""
         multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
         return np.asarray(multiplicity[self.free])
 
@@ -264,7 +268,10 @@ class LocalSubdomains:
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
-        """Local subdomains by class, with one frame on all ranks, and rotations."""
+        """Local subdomains by class, and their rotations from the frame of the class.
+
+        All ranks use the same frame for a class.
+        """
         problem, of = self.problem, self.problem.layout
         material = problem.material[self.number].tolist()
         keys = list(zip(of.keys(self.number), material, strict=True))
@@ -292,7 +299,7 @@ class LocalSubdomains:
 
     @property
     def floating(self) -> LocalSubdomains:
-        """The same problem with supports as rows of B: all subdomains float."""
+        """The same problem with supports as rows of B, so that all subdomains float."""
         if not self.problem.eliminated:
             return self
         return self.with_problem(replace(self.problem, eliminated=False))
@@ -312,14 +319,15 @@ class LocalSubdomains:
     ) -> dict[int, tuple[int, Points]]:
         """Return the first subdomain of each class on all ranks, with its points.
 
-        Ranks exchange the points of one subdomain of each class that, by its key and
-        its spread, may also occur elsewhere.
+        Ranks exchange the points of one subdomain per class, unless its key and its
+        spread show that the class does not occur on other ranks.
 
         own : number, key and points of the first local subdomain of each class
 
         Returns
         -------
-        number of such a subdomain → number and points of the first one on all ranks
+        map from the number of the first local subdomain of a class to the number and
+        points of its first subdomain on all ranks
 
         """
         comm = self.ranks.comm
@@ -355,7 +363,7 @@ class LocalSubdomains:
 
     @cached_property
     def motions(self) -> NDArray[np.int64]:
-        """First rigid motion of each of all S subdomains, and the total: (S + 1,)."""
+        """(S + 1,) first rigid motion of each subdomain on any rank, then the total."""
         modes = np.array([kind.R.shape[1] for kind in self.domains.classes])
         counts = np.zeros(self.rank.size, dtype=np.int64)
         local = self.number, modes[self.domains.class_of]
@@ -370,7 +378,7 @@ class LocalSubdomains:
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """The local floating units: clusters, or the subdomains themselves."""
+        """Local floating units: clusters, or else subdomains."""
         return self.clusters or self.domains
 
     @property
@@ -378,14 +386,14 @@ class LocalSubdomains:
         """Global numbers of the rigid motions of the local units."""
         if (clusters := self.problem.clusters) is None:
             return self.local_motions
-        # all units float and have equally many motions
+        # all units float and have the same number of motions
         per_unit = self.unit_motions // (clusters.max() + 1)
         local = np.unique(clusters[self.number])
         return np.asarray((local[:, None] * per_unit + np.arange(per_unit)).ravel())
 
     @property
     def unit_motions(self) -> int:
-        """Number of rigid motions of all units, the size of the coarse problem."""
+        """Size of the coarse problem: the number of rigid motions of all units."""
         if (clusters := self.problem.clusters) is None:
             return self.coarse_size
         return (int(clusters.max()) + 1) * int(self.motions[1])
@@ -403,7 +411,7 @@ class LocalSubdomains:
 
     @cached_property
     def f(self) -> Vector:
-        """Local part of the load, (N_p,) in subdomain axes, split among copies."""
+        """Local load (N_p,) in subdomain axes; copies of a node share its load."""
         d = self.problem.components
         multiplicity = np.repeat(self.nodes.multiplicity, d)
         load = self.problem.load(self._component) / multiplicity
@@ -415,9 +423,10 @@ class LocalSubdomains:
         return np.asarray(load[self.free])
 
     def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return the resultants (k, r) of single forces along the motions of all units.
+        """Return the work (k, r) of single forces on the rigid motions of all units.
 
-        unknown, value : torn unknowns and the forces there, (k,)
+        unknown : (k,) torn unknowns
+        value : (k,) a force at each of these unknowns
         """
         domains = self.domains
         of = np.searchsorted(domains.start, unknown, side="right") - 1
@@ -445,7 +454,7 @@ class LocalSubdomains:
         return None if shaping is None else shaping(self.number)
 
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
-        """Return the stiffness by whose root rows at torn nodes (k,) are scaled.
+        """Return the stiffness at torn nodes (k,); its square root scales the rows.
 
         supports : True for rows of supports, False for rows of gluing
         """
@@ -462,7 +471,7 @@ class LocalSubdomains:
 
     @cached_property
     def decomposed(self) -> DecomposedBodies:
-        """The local subdomains with their rows of B and their components."""
+        """The local subdomains with their rows of B."""
         domains, rows = self.domains, self.rows
         return DecomposedBodies(
             classes=domains.classes,
@@ -477,7 +486,7 @@ class LocalSubdomains:
         )
 
     def with_bound(self, bound: Vector) -> LocalSubdomains:
-        """Return a copy with another friction bound (k,); cached results are kept."""
+        """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
         copy = replace(self, problem=replace(self.problem, contact=contact))
         # no cached property depends on the bound
@@ -485,9 +494,9 @@ class LocalSubdomains:
         return copy
 
     def with_problem(self, problem: DecomposedProblem) -> LocalSubdomains:
-        """Return the same bodies with another load, contact or supports as rows.
+        """Return the same bodies with another load, contact or treatment of supports.
 
-        The classes of subdomains, the expensive part, are kept.
+        The classes of subdomains, which are expensive, are kept.
         """
         copy = replace(self, problem=problem)
         same = ("number", "nodes", "_classified", "_distinct", "clusters")
@@ -542,17 +551,17 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
 def _local_clusters(local: LocalSubdomains) -> Clusters:
     """Return the local clusters, with averages over the faces inside them.
 
-    A face consists of all common nodes of two adjacent subdomains, clamped nodes
-    included. Its modes are the rigid motions of a subdomain there, orthonormalised. In
-    global axes those of both subdomains span the same space, Q_1Φ_1 = Q_2Φ_2Tᵀ, so that
-    Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0 equates the averages.
+    A face consists of all common nodes of two adjacent subdomains, including clamped
+    nodes. Its modes are the orthonormalised rigid motions of a subdomain, restricted to
+    these nodes. In global axes, the modes of both subdomains span the same space,
+    Q_1Φ_1 = Q_2Φ_2Tᵀ, so that Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0 equates the averages.
     """
     nodes, domains, d = local.nodes, local.domains, local.problem.components
     r = domains.classes[0].R.shape[1]
     faces = [dict[bytes, tuple[int, Dense]]() for _ in domains.classes]
 
     def side(s: int, node: Nodes) -> tuple[int, Dense]:
-        """Return the number of a face in its class, and its modes in global axes."""
+        """Return the index of a face in its class, and its modes in global axes."""
         k = domains.class_of[s]
         if (key := node.tobytes()) not in faces[k]:
             modes = np.linalg.qr(domains.classes[k].R[dofs_of(node, d)])[0]
@@ -604,7 +613,7 @@ def _local_clusters(local: LocalSubdomains) -> Clusters:
 
 
 def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_array:
-    """Return the modes of faces (n, q), named by the bytes of their nodes."""
+    """Return the modes (n, q) of faces, whose keys are the bytes of their nodes."""
     columns = [csr_array((n, 0))]
     for key, (_, modes) in faces.items():
         at = dofs_of(np.frombuffer(key, dtype=np.int64), d)
@@ -650,7 +659,7 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
 
 
 def _support_rows(local: LocalSubdomains) -> Entries:
-    """Return a row for each copy of a fixed component, the last copy first."""
+    """Return a support row for each copy of a fixed component, last copy first."""
     problem, d = local.problem, local.problem.components
     node, k = np.divmod(problem.fixed, d)
     multiplicity = problem.layout.multiplicity(node)
@@ -668,12 +677,12 @@ class _Copies(NamedTuple):
     node: NDArray[np.int64]  #: (k,) place in the list of nodes
     copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
     rank: NDArray[np.int64]  #: (k,) rank of the copy
-    local: NDArray[np.int64]  #: (l,) places of those on this rank
-    local_node: NDArray[np.int64]  #: (l,) their places among the local torn nodes
+    local: NDArray[np.int64]  #: (l,) places of the copies on this rank
+    local_node: NDArray[np.int64]  #: (l,) local torn node of each of these copies
 
 
 def _local_copies(local: LocalSubdomains, node: Nodes) -> _Copies:
-    """Return the copies of some nodes on all ranks, and those on this one."""
+    """Return the copies of some nodes on all ranks."""
     of = local.problem.layout
     multiplicity = of.multiplicity(node)
     place = np.repeat(np.arange(multiplicity.size), multiplicity)
@@ -729,7 +738,7 @@ def _gluing_rows(local: LocalSubdomains) -> Entries:
 
 
 def _contact_rows(local: LocalSubdomains) -> Entries:
-    """Return the rows of contact and friction, which act on averages of copies."""
+    """Return the contact and friction rows, which act on averages of copies."""
     problem, d = local.problem, local.problem.components
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
@@ -751,11 +760,17 @@ def _rotated(
     k: NDArray[np.int64],
     value: Vector,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
-    """Return entries in subdomain axes, from values at components k of nodes (j,)."""
+    """Rotate entries at global components k of torn nodes (j,) to subdomain axes.
+
+    Returns
+    -------
+    rows, columns (local torn unknowns) and values of the nonzero entries
+
+    """
     d = local.problem.components
     if d == 1:
         return row, node, value
-    # row k of Q, as u_k = Σ Q_kq v_q
+    # row k of Q, because u_k = Σ Q_kq v_q
     rotation = local.rotation[local.nodes.subdomain[node], k]
     nonzero = rotation != 0
     column = d * node[:, None] + np.arange(d)
@@ -775,6 +790,6 @@ def _equality_count(problem: DecomposedProblem) -> int:
 
 
 def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
-    """Return all subdomains on this process, as if it was the only rank."""
+    """Return all subdomains as local subdomains of this process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
     return LocalSubdomains(problem, single_process(), every)

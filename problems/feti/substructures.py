@@ -23,7 +23,7 @@ class LocalProblems:
     """
 
     torn: DecomposedBodies
-    components: int = 2  #: per node; torn unknowns are numbered node by node
+    components: int = 2  #: number per node; torn unknowns are numbered node by node
 
     @property
     def spread(self) -> csr_array:
@@ -45,7 +45,7 @@ class LocalProblems:
         return weight
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
-        """Return the diagonal of  TᵀK_T T  at components `at` (k,)."""
+        """Return the diagonal of TᵀKT at global components `at` (k,)."""
         d = self.components
         nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
         number = np.full(self.spread.shape[0] // d, -1)
@@ -81,7 +81,7 @@ class LocalProblems:
         return image
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P to b (N,), all subdomains of a class with one factor at once."""
+        """Apply PK⁺P to b (N,), with one solve for all subdomains of a class."""
         solution, domains = np.zeros_like(b), self.torn.domains
         acting = np.logical_or.reduceat(b != 0, domains.start[:-1])
         for (template, place), members in zip(
@@ -101,7 +101,7 @@ class LocalProblems:
 
 
 def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:
-    """Return the diagonal blocks of K, one per node, (n_k/d, d, d)."""
+    """Return the diagonal block of K for each node, (n_k/d, d, d)."""
     blocks = np.empty((template.K.shape[0] // d, d, d))
     for i, j in np.ndindex(d, d):
         blocks[:, i, j] = template.K.diagonal(j - i)[min(i, j) :: d]

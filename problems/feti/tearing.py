@@ -1,12 +1,12 @@
 """Partition of meshes into subdomains, and their classes up to rigid motions.
 
-A label of each cell names its subdomain: a block of a structured mesh, or a part found
-by graph partitioning. A node on the boundary of several subdomains has a copy in each
-of them (tearing).
+Each cell has the label of its subdomain: a block of a structured mesh, or a part from
+graph partitioning. A node on the boundary of several subdomains has a copy in each of
+them (tearing).
 
 Subdomains that are images of one another under a rigid motion form a class. They have
-equally numbered cells, equal materials and congruent points; the rotation of each is
-the best one in the sense of least squares (Kabsch 1976, Acta Cryst. A32).
+equally numbered cells, equal materials and congruent points. Rotations are fitted by
+least squares (Kabsch 1976, Acta Cryst. A32).
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def blocks(
 
     Parameters
     ----------
-    divisions : cells along each direction, in the order of numbering, fastest first
-    most : H/h, for all directions or for each
+    divisions : cells along each direction; the first direction varies fastest
+    most : H/h for all directions, or one value per direction
 
     Returns
     -------
-    (Π divisions,) block of each cell, numbered as cells are
+    (Π divisions,) block of each cell; blocks are numbered in the same order as cells
 
     """
     label = np.zeros(1, dtype=np.int64)
@@ -74,23 +74,23 @@ def grid_positions(
 
 
 Block = tuple[slice, slice]  #: rows and columns of cells
-#: sides of the cells of rows and columns, along columns and along rows: each as two
-#: factors, one of each row and one of each column
+#: lengths of cell sides, first along columns, then along rows; each length is the
+#: product of two factors, one for the row and one for the column of the cell
 Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
 
 
 def compact_blocks(sides: Sides, most: int) -> list[Block]:
     """Cut a graded structured mesh into blocks of cells with aspect ratios near one.
 
-    A block of more than most² cells is cut across its longer side, at the line nearest
-    to its middle; if two lines are equally near up to rounding, at the first one.
-    Blocks of equal numbers of cells, as from `blocks`, would have the aspect ratio of
-    the cells, and the bending modes of long subdomains dominate the condition number
-    of the dual.
+    A block of more than most² cells is cut across its longer side, at the grid line
+    nearest to its middle (the first one if two are equally near up to rounding).
+    Blocks with equal numbers of cells along both sides (`blocks`) would have the aspect
+    ratio of the cells, and the bending modes of long subdomains would dominate the
+    condition number of the dual.
 
     Parameters
     ----------
-    sides : of the cells in ny rows and nx columns
+    sides : side lengths of the cells in ny rows and nx columns
     most : H/h of a square block
 
     """
@@ -120,17 +120,17 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
 def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
     """Label the cells of a mesh numbered as a box by blocks of compact shape.
 
-    With the mean lengths hₐ of the edges in a block along each direction, it has at
-    most  most · min h / hₐ  cells along direction a, rounded, and at least one. Larger
-    blocks are cut across their longest side, after half of the equal parts that it
-    needs. Boxes of cubes are cut as by `blocks`; where cells are slender, equal numbers
-    of cells would make slender subdomains: κ of PFP is 439 with 4 × 4 × 4 cells of
-    1 : 1 : 4 in beam-ring/Nr=4/Nh=2/depth=4.
+    With hₐ the mean edge length of a block along direction a, the limit on its cells
+    along a is most · min h / hₐ, rounded, and at least 1. Larger blocks are cut across
+    their longest side, after half of the equal parts that the limit requires. Boxes of
+    cubes are cut as by `blocks`. For slender cells, equal numbers of cells would result
+    in slender subdomains: κ of PFP is 439 with 4 × 4 × 4 cells of 1 : 1 : 4 in
+    beam-ring/Nr=4/Nh=2/depth=4.
 
     Parameters
     ----------
-    points : (…, dim) of the nodes, an axis per direction, the fastest last
-    most : most cells along a side
+    points : (…, dim) points of the nodes, with one axis per direction, the fastest last
+    most : largest number of cells along a side
 
     Returns
     -------
@@ -152,7 +152,7 @@ def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
                 for a, edge in enumerate(edges)
             ]
         )
-        # ratios just below ½, by rounding, count as ½: congruent blocks are cut alike
+        # ratios just below ½ by rounding count as ½, to cut congruent blocks equally
         side = np.floor(most * h.min() / h + 0.5 + CONGRUENCE_TOL).clip(1, most)
         parts = np.ceil(count / side).astype(int)
         if (parts == 1).all():
@@ -173,11 +173,11 @@ def _first_cell(block: Sequence[slice]) -> list[int]:
     return [part.start for part in block]
 
 
-def label_blocks(found: Sequence[Block]) -> NDArray[np.int64]:
+def label_blocks(cut: Sequence[Block]) -> NDArray[np.int64]:
     """Return the block of each cell, row by row."""
-    shape = [max(block[k].stop for block in found) for k in (0, 1)]
+    shape = [max(block[k].stop for block in cut) for k in (0, 1)]
     label = np.empty(shape, dtype=np.int64)
-    for b, block in enumerate(found):
+    for b, block in enumerate(cut):
         label[block] = b
     return label.ravel()
 
@@ -185,12 +185,12 @@ def label_blocks(found: Sequence[Block]) -> NDArray[np.int64]:
 def classify(
     keys: Iterable[Hashable], points: Sequence[NDArray[np.float64]]
 ) -> tuple[list[int], NDArray[np.int64], NDArray[np.float64]]:
-    """Sort S subdomains into classes of images under rigid motions.
+    """Group S subdomains into classes of images under rigid motions.
 
     Parameters
     ----------
-    keys : cells and materials of each subdomain, equal within a class
-    points : (n_s, dim) of each; subdomains with equal keys have equally many
+    keys : key of the cells and materials of each subdomain, equal within a class
+    points : (n_s, dim) points of each subdomain; n_s is equal for equal keys
 
     Returns
     -------
@@ -231,7 +231,9 @@ def spread_of(points: NDArray[np.float64]) -> float:
 def congruent(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Find images of the first of g sets of points (g, n, dim), and their rotations.
+    """Identify images of the first of g point sets under rigid motions.
+
+    points : (g, n, dim)
 
     Returns
     -------

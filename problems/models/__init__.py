@@ -1,1 +1,1 @@
-"""Models of the families: meshes, materials, loads and exact solutions."""
+"""Models behind the families: meshes, materials, loads and exact solutions."""

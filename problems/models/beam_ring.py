@@ -5,14 +5,15 @@ A beam of 2 m × 0.25 m (Figure 1 of the paper), with its lower left corner at h
 It is supported by a half ring with radii 0.3 m and 0.49 m around (1 m, 0), clamped at
 both feet. The initial gap is 1 cm.
 
-Errata of the paper that matter here: its 313 nodes for Nr = 4, Nh = 3 imply a ring with
-Nh radial layers (``radial=3``), but its text and Table 1 imply 2·Nh (424 nodes). m_E is
-the number of prescribed displacement components, 2(Nr + 1) + 4(radial + 1), not of
-nodes. Plane strain and a force per unit thickness are implied, not stated.
+The paper is not consistent in some details. Its 313 nodes for Nr = 4, Nh = 3 imply a
+ring with Nh radial layers (``radial=3``), whereas its text and Table 1 imply 2·Nh (424
+nodes). m_E is the number of prescribed displacement components,
+2(Nr + 1) + 4(radial + 1), not of prescribed nodes. Plane strain and a force per unit
+thickness are implied, not stated.
 
 With depth > 0 the bodies are extruded to layers of hexahedra over a thickness of 1 m.
-Their end faces are free, or in plane strain (u_z = 0); the clamped sides do not move in
-any direction, and F₀ = 10⁸ N is spread over the loaded edge.
+Their end faces are free, or in plane strain (u_z = 0). Clamped sides are fixed in all
+directions, and F₀ = 10⁸ N is distributed over the loaded edge.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ from mortarbench.problems.fem.mesh import (
 
 LENGTH = 2.0  #: l, length of the beam, m
 LOAD = 1e8  #: F₀ = 0.1 GN per m of thickness
-THICKNESS = 1.0  #: of extruded bodies, m
+THICKNESS = 1.0  #: thickness of extruded bodies, m
 NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
@@ -86,7 +87,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of a Newton iteration of one load step at finite strain."""
+    """Return the case of one Newton iteration of a load step at finite strain."""
     p: Any = params
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     path = _newton_path(
@@ -112,7 +113,7 @@ def bodies(
     """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells.
 
     depth : number of layers across the thickness; 0 for plane bodies
-    sides : of the end faces in space, "free" or "plane-strain"
+    sides : condition on the end faces in space, "free" or "plane-strain"
     """
     grids = _grids(Nr, Nh, radial)
     shape: Shape = StructuredGrids(grids)
@@ -163,8 +164,8 @@ def _tip(shape: Shape) -> tuple[Nodes, Vector]:
 
     Returns
     -------
-    components (dim·k,) of the k nodes of the corner, in space an edge, and the share
-    (k,) of the load that acts on each
+    components (dim·k,) of the k nodes of the corner (an edge in space), and the share
+    (k,) of the load on each node
 
     """
     sides = shape.sides

@@ -1,22 +1,24 @@
 """A cantilever under an end load at finite strain, compared with the elastica.
 
 A beam of length L and thickness t = L/slenderness, clamped at its left end, carries the
-dead load P per width at its right end, spread evenly over the end face. If slender, it
-is an inextensible elastica with the bending stiffness of plane strain,
+dead load P per width at its right end, distributed uniformly over the end face. In the
+slender limit, it is an inextensible elastica with the bending stiffness of plane
+strain,
 
     EI θ″ = −P cos θ,    EI = E t³ / (12(1 − ν²)),    θ(0) = θ′(L) = 0,
 
 whose solution by elliptic integrals (Bisshopp and Drucker 1945, Quarterly of Applied
-Mathematics 3, 272-275) depends on the key `load`, PL²/EI, alone. The error of this
-model is of order (t/L)²: under small loads, shear adds 3/(5(1 − ν)) (t/L)² to the
-deflection, 0.2 % for L/t = 20 and ν = 0.3.
+Mathematics 3, 272-275) only depends on PL²/EI, the key `load`. The error of this model
+is of order (t/L)²: under small loads, shear increases the deflection by the fraction
+3/(5(1 − ν)) (t/L)², 0.2 % for L/t = 20 and ν = 0.3.
 
-Bilinear cells h_x × h_y cannot bend: in linear elasticity the beam is too stiff by
+Bilinear cells h_x × h_y cannot represent bending. In linear elasticity the beam is
+hence too stiff by the fractions
 
     (1 − ν)/2 (h_x/t)²  (parasitic shear)  +  ν²/(1 − 2ν) (h_y/t)²  (constant ε_y)
 
 which is 0.55 % and 0.35 % for square cells, ν = 0.3 and t = 8h. The default `nx`
-therefore makes cells half as long as thick. With mean dilatation
+therefore results in cells with h_x = h_y/2. With mean dilatation
 (`problems.fem.finite_strain`) the second term is −ν(h_y/t)².
 """
 
@@ -81,7 +83,7 @@ def elastica(load: float) -> Elastica:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the QP of one Newton iteration of a load step in the given form."""
+    """Return the case of one Newton iteration of a load step."""
     p: Any = params
     path = _path(
         p["slenderness"],

@@ -3,17 +3,17 @@
 ::
 
     mesh = "press.msh"         # beside this file; physical names as used below
-    length_unit = "m"          # of the mesh file's coordinates alone: "mm", "in", …
+    length_unit = "m"          # of coordinates in the mesh file only: "mm", "in", …
     plane = "strain"           # or "stress"
     contact = "nts"            # or "mortar"
-    basis = "dual"             # of mortar; or "standard"
+    basis = "dual"             # multiplier basis of mortar; or "standard"
     steps = 10                 # load steps
     relin = 1                  # linearisations of the contact per step
     kinematics = "linear"      # or "finite": finite strain, with Newton's method
-    material = "neo-hooke"     # of finite strain; or "svk", St. Venant-Kirchhoff
+    material = "neo-hooke"     # for finite strain; or "svk", St. Venant-Kirchhoff
     units = { length = 2.0, force = 1e8 }   # m, N/m: scales of the QP, see below
 
-    [[bodies]]                 # one for each physical surface
+    [[bodies]]                 # one entry per physical surface
     name = "beam"
     E = 200e9                  # Pa
     nu = 0.3
@@ -25,43 +25,45 @@
     [[loads]]
     boundary = "top"
     traction = [0.0, -1e6]     # Pa, that is N per m of boundary and m of thickness;
-                               # or force = [0, -1e6]: N per m of thickness in all,
-                               # spread evenly over the boundary. A point takes a force
+                               # or force = [0, -1e6]: total in N per m of thickness,
+                               # spread evenly over the boundary. Points require force
     [[contacts]]
-    slave = "arc"              # its nodes must not enter the master
+    slave = "arc"              # side whose nodes must not enter the master
     master = "bottom"
-    friction = "coulomb"       # or "tresca" with a bound in Pa; this pair's own law
+    friction = "coulomb"       # or "tresca" with a bound in Pa; law of this pair
     mu = 0.3
 
     [[contacts]]
-    slave = "foot"             # its nodes must not enter a rigid body, in m:
+    slave = "foot"             # side against a rigid body, whose lengths are in m:
     rigid = { shape = "plane", point = [0, -1], normal = [0, 1] }
     # or { shape = "cylinder", centre = [0, -1], radius = 0.5 }; in space also
     # { shape = "cylinder", centre = [0, 0, -1], axis = [0, 1, 0], radius = 0.5 } or
     # { shape = "sphere", centre = [0, 0, -1], radius = 0.5 }
 
-Whatever the length unit of the mesh is, this file and all results are in SI units: E
-and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
+This file and all results are in SI units, irrespective of the length unit of the mesh:
+E and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
 
-A rigid body does not move. The normal of a plane points towards the slave; normals and
-axes may have any length. The centre of a cylinder is any point of its axis. Nodes whose
-components are all fixed have no row. Contact with a rigid body has nodal rows also with
-``contact = "mortar"``.
+Rigid bodies do not move. The normal of a plane points towards the slave; normals and
+axes may have any length. The centre of a cylinder is any point on its axis. Nodes with
+all components fixed have no contact row. Contact with a rigid body has nodal rows even
+if ``contact = "mortar"``.
 
-In .inp and .med files, bodies are sets of elements and groups of cells, boundaries are
-surfaces, sets or groups of facets or of nodes, and points are sets of nodes.
+In .inp and .med files, bodies are sets of elements or groups of cells, boundaries are
+surfaces, or sets or groups of facets or nodes, and points are sets of nodes.
 
 If the mesh has physical volumes, these are the bodies, and boundaries are physical
 surfaces. Vectors then have three components, forces are in N, and a force on a boundary
-is spread evenly over its area; `point` is a physical point or curve, whose nodes share
-a force equally. Friction, finite strain and ``plane = "stress"`` are refused there.
+is distributed uniformly over its area; `point` is a physical point or curve, whose
+nodes share a force equally. Friction, finite strain and ``plane = "stress"`` are
+refused for volumes.
 
-The keys between mesh and units are optional, with the values above as defaults. Bodies
-that contact alone supports have no form dual-bounds and need, with linear kinematics,
-``steps = 1``. The default of units.length is the longer side of the bounding box of the
-mesh, that of units.force the sum of |load| over the nodes. A pair without a law of its
-own has the law of the top-level keys friction, bound and mu, by default none. The
-top-level key ``loading = "static"`` measures slip from the undeformed state.
+The keys between mesh and units are optional; the values above are their defaults.
+Bodies supported by contact alone have no form dual-bounds and, for linear kinematics,
+require ``steps = 1``. The default of units.length is the longer side of the bounding
+box of the mesh, and that of units.force is the sum of |load| over the nodes. A pair
+without a law of its own has the law of the top-level keys friction, bound and mu, whose
+default is no friction. The top-level key ``loading = "static"`` measures slip from the
+undeformed state.
 """
 
 from __future__ import annotations
@@ -115,7 +117,7 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
-#: keys of the shapes of rigid bodies, by dimension; those but radius are vectors
+#: keys of each shape of rigid bodies, by dimension; all except radius are vectors
 _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
     2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
     3: {
@@ -155,7 +157,7 @@ def read_description(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        When a key or value is wrong. The message names the file and the key.
+        If a key or value is invalid. The message states the file and the key.
 
     """
     table = read_toml(path)
@@ -187,8 +189,8 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     Raises
     ------
     InputError
-        When an entry is wrong. The message names the file, the entry, the wrong name or
-        value, and what would be right.
+        If an entry is invalid. The message states the file, the entry, the invalid name
+        or value, and the expected one.
 
     """
     table = read_description(path)
@@ -241,8 +243,8 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
 def remarks(path: Path) -> tuple[str, ...]:
     """Return remarks on valid entries that may be mistakes.
 
-    They concern moduli that may be in another unit, and contacts in two passes: of two
-    sides, each is the slave of the other, and the rows of both share the force.
+    They concern moduli that may be in another unit, and two-pass contact, in which each
+    of two sides is the slave of the other, so that two sets of rows share the force.
     """
     table = read_description(path)
     soft = (
@@ -265,7 +267,7 @@ def remarks(path: Path) -> tuple[str, ...]:
 def _each(
     table: Mapping[str, Any], key: str, read: Callable[[dict[str, Any]], Any]
 ) -> list[Any]:
-    """Read every entry of a list of tables; errors state the index of the entry."""
+    """Apply `read` to every table of a list; errors state the index of the entry."""
     values = []
     for i, entry in enumerate(checked.filled_list(key, table[key])):
         with located(f"{key}[{i}]"):
@@ -327,7 +329,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
 
 
 def _vector(key: str, value: object, dim: int) -> list[float]:
-    """Return a vector of physical values."""
+    """Return a vector of `dim` physical values from the entry `key`."""
     vector = checked.filled_list(key, value)
     if len(vector) != dim or not all(map(checked.is_number, vector)):
         count, form = {2: "two", 3: "three"}[dim], ", ".join(_AXES[:dim])
@@ -340,7 +342,7 @@ def _check_loads_act(
     loads: Sequence[NDArray[np.float64]],
     fixed: Nodes,
 ) -> None:
-    """Raise InputError for loads that act on prescribed displacements only."""
+    """Raise InputError for load components that only act on fixed components."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
         without_effect, dim = [], load.shape[1]
         for axis, name in enumerate(_AXES[:dim]):
@@ -357,7 +359,7 @@ def _check_loads_act(
 
 
 def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Raise InputError for values that the corresponding keys of cases do not allow."""
+    """Raise InputError for values that the key of the same name in a case forbids."""
     for key in keys:
         allowed = SETTINGS[key].values
         if key in entry and checked.text(key, entry[key]) not in allowed:
@@ -365,7 +367,7 @@ def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
 
 
 def _check_friction_values(entry: Mapping[str, Any]) -> None:
-    """Check the values of an entry's keys of friction."""
+    """Raise InputError for invalid values of the friction keys of an entry."""
     _check_choices(entry, ("friction", "loading"))
     for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
@@ -375,13 +377,13 @@ def _check_friction_values(entry: Mapping[str, Any]) -> None:
 def pair_laws(
     contacts: Sequence[Mapping[str, Any]], params: Mapping[str, Any]
 ) -> tuple[FrictionLaw, ...]:
-    """Return the law of each pair: that of its entry, or of the case's keys.
+    """Return the friction law of each pair, from its entry or the keys of the case.
 
     Raises
     ------
     InputError
-        When a parameter of a law is missing, or an entry has one that its law does not
-        use.
+        If a parameter of a law is missing, or an entry contains a parameter that its
+        law does not use.
 
     """
     return tuple(
@@ -407,7 +409,10 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
-    """Return the pair of an entry; held : prescribed components."""
+    """Return the pair of an entry.
+
+    held : prescribed components; nodes with all components prescribed are `clamped`
+    """
     checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
     if ("master" in entry) == ("rigid" in entry):
         raise InputError(f"expected either master, a {named.words.boundary}, or rigid")
@@ -432,7 +437,7 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
 
 
 def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
-    """Return the rigid body of an entry."""
+    """Return the rigid body that an entry describes."""
     shapes = _RIGID[dim]
     if "shape" not in entry:
         raise InputError(f"shape is missing; expected {' or '.join(sorted(shapes))}")
@@ -462,7 +467,7 @@ def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
 def _check_faces(
     points: NDArray[np.float64], slave: Nodes, name: str, rigid: RigidBody
 ) -> None:
-    """Raise InputError for a slave that looks away from a rigid body or is far away."""
+    """Raise InputError if a slave does not face a rigid body or is far from it."""
     side = current_surface(points, np.zeros(points.size), slave, "slave")
     gap, normal = rigid.gap(side.x[side.facets].mean(axis=1))
     if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
@@ -480,7 +485,10 @@ def _check_faces(
 
 
 def _sides(entries: list[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Return the names of slave and master of each contact; a rigid one as text."""
+    """Return the names of slave and master of each contact.
+
+    The name of a rigid master is the text of its description.
+    """
     return [(e["slave"], e.get("master") or f"{e['rigid']}") for e in entries]
 
 
@@ -527,7 +535,10 @@ def _units(
 def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
-    """Return the nodes of an entry's boundary or point, and the boundary's facets."""
+    """Return the nodes of the boundary or point of an entry, and its facets.
+
+    A point has no facets.
+    """
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, a name of the mesh")

@@ -1,4 +1,4 @@
-"""Bodies of a user, ``bodies:PATH.toml/key=value/…/FORM``.
+"""Bodies described by the user, ``bodies:PATH.toml/key=value/…/FORM``.
 
 `problems.models.description` documents the TOML file.
 """
@@ -36,13 +36,14 @@ from mortarbench.problems.models.description import (
 )
 from mortarbench.problems.ranges import check_plane_only
 
-#: largest angle between edges of a straight side, from rounded coordinates
+#: largest angle between edges of a straight side; allows for rounded coordinates
 MAX_STRAIGHT_ANGLE = 1e-6
-#: largest angle between the chords of an arc; larger ones are corners of the geometry
+#: largest angle between the chords of an arc; larger angles are corners of the geometry
 MAX_ARC_ANGLE = np.pi / 4
 
-#: Overlap of contact sides that a remark reports, relative to the smallest body. Chords
-#: of touching arcs overlap by up to 5R/n² with n edges around: 0.4 % of R for n = 36.
+#: smallest overlap of contact sides that a remark reports, relative to the smallest
+#: body. The chords of touching arcs overlap by up to 5R/n² with n edges per circle,
+#: 0.4 % of R for n = 36
 MAX_OVERLAP = 0.01
 
 
@@ -52,8 +53,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     Raises
     ------
     InputError
-        When the load of some body is not balanced, or bodies that neither supports nor
-        friction keep in place have more than one load step or linearisation.
+        If the load of a body cannot be balanced, or if bodies with a rigid motion that
+        neither supports nor friction prevent have several load steps or linearisations.
 
     """
     p: Any = params
@@ -63,8 +64,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return contact_problem
     whole = elastic.whole
     rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(whole.mesh.dofs))
-    # without friction the displacement along the contact is not unique, nor is the next
-    # linearisation
+    # displacements along frictionless contact are not unique, and hence neither is the
+    # next linearisation
     if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
             f"{p['path']}: supports and friction leave a rigid motion of some body, "
@@ -102,13 +103,13 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
         bodies=elastic,
         linearise=keyed_linearisation(p),
         stages=stages,
-        # first bound of Coulomb's law: large enough to support bodies by friction
+        # the first bound of Coulomb's law must suffice to support bodies by friction
         initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the QP of one Newton iteration of a load step at finite strain."""
+    """Return the case of one Newton iteration of a load step at finite strain."""
     p: Any = params
     source = (p["path"], p["sha256"], p["plane"], p["halvings"])
     with located(source[0]):
@@ -135,7 +136,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
-    """Raise InputError for bodies in space with keys that only plane bodies support."""
+    """Raise InputError for bodies in space with keys limited to plane bodies."""
     if elastic.shape.dim > 2:
         check_plane_only("bodies", params, "volumes")
 
@@ -161,19 +162,19 @@ def overlap_remark(params: Mapping[str, Value]) -> tuple[str, ...]:
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
-    """Return the law of friction of each pair, see `pair_laws`."""
+    """Return the friction law of each pair, see `pair_laws`."""
     return pair_laws(read_description(Path(str(params["path"])))["contacts"], params)
 
 
 @lru_cache(maxsize=4)
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
-    """Return the bodies of a description; the digest is part of the cache's key."""
+    """Return the bodies of a description; `sha256` is part of the cache key."""
     del sha256
     return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:
-    """Return True if a contact side is curved: edges meet below MAX_ARC_ANGLE."""
+    """Return True if edges of a contact side meet at angles like those of an arc."""
     p: Any = params
     elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
     for side in (chain for pair in elastic.pairs for chain in pair.sides):

@@ -6,9 +6,10 @@ left sides, and its right side is supported in x:
     σ_y = −5e7 Pa at y = 40 mm,  σ_x = −15e7 Pa at x = 0,  u_x = 0 at x = 40 mm
 
 with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end lifts off,
-the middle slips and the right end sticks. Published are the tangential displacements of
-five points of the contact side, ±5 %, and the normal force at 38.75 mm for 32 cells per
-side (GRECO working group on friction; collected in Code_Aster's document V6.04.128).
+the middle slips and the right end sticks. The published results are the tangential
+displacements of five points of the contact side, ±5 %, and the normal force at 38.75 mm
+for 32 cells per side (GRECO working group on friction; see document V6.04.128 of
+Code_Aster).
 
 In space (dim=3) the square is extruded along z in cubes. Its end faces have u_z = 0, so
 that the solution is that of plane strain in every layer of nodes.
@@ -48,25 +49,25 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 
-SIDE = 0.04  #: m
+SIDE = 0.04  #: side length of the square, m
 MATERIAL = Material(E=1.3e11, nu=0.2)
 TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
 FORCE = TOP * SIDE  #: F₀, N/m
 PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
-PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
+PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x at PLACES, m
 FORCE_AT = 38.75e-3  #: x of the published normal force, m
 
 
 class Plate(NamedTuple):
-    """The plate with its sides as nodes, and the areas of those under pressure."""
+    """Plate with the nodes of its sides, and nodal areas of the loaded sides."""
 
     shape: StructuredGrids | StructuredSolids
     ground: Nodes  #: side y = 0, without its nodes on x = 40 mm
-    top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and their shares, m; m² in space
-    left: tuple[Nodes, Vector]  #: the same of x = 0
+    top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
+    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths (areas)
     right: Nodes  #: nodes of x = 40 mm
-    corner: Nodes  #: those of y = 0 among them
-    ends: Nodes  #: nodes of the end faces, on which u_z = 0; none in the plane
+    corner: Nodes  #: nodes of x = 40 mm, y = 0
+    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in the plane
     thickness: float  #: 1 in the plane
 
 
@@ -111,7 +112,7 @@ def extruded_plate(n: int, depth: int) -> Plate:
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the plate with n × n cells, in space with `depth` layers along z."""
+    """Return the problem of the plate with n × n cells, or n × n × depth in space."""
     p: Any = params
     dim, n = p["dim"], p["n"]
     body = plate(n) if dim == 2 else extruded_plate(n, p["depth"])
@@ -177,12 +178,13 @@ def published_quantities(
     """Return the published quantities, interpolated linearly between nodes.
 
     In space, displacements are means over z, and forces are sums over z divided by the
-    thickness. displacement: u_x at `PLACES`, m. published_error: the largest relative
-    deviation from the published values. normal_force: nodal force at 38.75 mm, N/m.
-    tangential_sum: magnitude of the sum over all nodes, N/m.
+    thickness. The keys are `displacement`, u_x at `PLACES` in m; `published_error`, the
+    largest relative deviation from the published values; `normal_force`, the nodal
+    force at 38.75 mm in N/m; and `tangential_sum`, the magnitude of the total friction
+    force in N/m.
     """
     dim, corner = bodies.mesh.dim, _corner(bodies)
-    nodes = np.setdiff1d(bodies.pairs[0].slave_nodes, corner)  # those with rows
+    nodes = np.setdiff1d(bodies.pairs[0].slave_nodes, corner)  # nodes with rows
     x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
     u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
     normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness

@@ -1,24 +1,25 @@
-"""Contact of two half planes by the logarithmic kernel: no mesh, a dense F.
+"""Contact of two half planes with the logarithmic kernel: a dense F without a mesh.
 
-Forces per thickness on the surfaces of two half planes displace them, relative to each
-other, by (Johnson 1985, "Contact mechanics", Sections 2.2 and 2.3, 2/(πE*) of both)
+Tractions p on the surfaces of two half planes cause the relative displacement (Johnson
+1985, "Contact mechanics", Sections 2.2 and 2.3, with 2/(πE*) for both surfaces)
 
     u(x) = −2/(πE*) ∫ ln(|x − s|/a) p(s) ds + a constant
 
-along the normal for pressures, along the tangent for shear tractions; between bodies of
-the same material the two are decoupled. With a traction λ_j/h on each of n equal
-elements and u at their midpoints, u = Fλ, where F_ij depends on |i − j| only. F is
-positive definite on intervals shorter than 4a. As the total force is prescribed, the
-constant is free: it is the multiplier of the single equation Σλ = force. This is the
-form ``dual`` of bodies with one rigid motion.
+along the normal for pressures, and along the tangent for shear tractions. Normal and
+tangential displacements are decoupled because both bodies are of the same material.
+With a traction λ_j/h on each of n equal elements and u at their midpoints, u = Fλ,
+where F_ij only depends on |i − j|. F is positive definite on intervals shorter than 4a.
+Since the total force is prescribed, the constant is free: it is the multiplier of the
+single equation Σλ = force. This is the form ``dual`` of bodies with one rigid motion.
 
 * law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R; |x| ≤ 3a/2
 * law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
   exact p and, in unloading, the exact tractions λ* at the peak, otherwise 0; |x| ≤ a
 
-Forces are in units of F₀ = P (tangential ones of μP), displacements of l = 2F₀/(πE*).
-Then F is a matrix of logarithms, and Hertz's gap is (x/a)². Exact tractions are sums of
-semicircles, whose energies follow from, with lengths in a and s_c = 2/(πc)√(1 − x²/c²),
+Forces are in units of F₀, which is P for normal and μP for tangential forces, and
+displacements in units of l = 2F₀/(πE*). Then F is a matrix of logarithms, and Hertz's
+gap is (x/a)². Exact tractions are sums of semicircles s_c = 2/(πc)√(1 − x²/c²), with
+lengths in units of a. Their energies follow from
 
     −∫ ln|x − t| s_c(t) dt = ln(2/c) + ½ − x²/c²,  |x| ≤ c,      ∫x²s_c = c²/4
 """
@@ -53,12 +54,12 @@ LOAD = 10 * UNIT_LOAD  #: normal force P, N/m
 SIDE = "half plane on half plane"
 MESH_HALF_WIDTH = 1.5  #: half width of the potential contact of law=hertz, in a
 
-#: exact solution for two cylinders with the radius and material of the Hertz families
+#: exact solution for two cylinders of the radius and material of the Hertz families
 EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
 
 
 def half_plane_case(params: Mapping[str, Value]) -> Case:
-    """Return the QP of complete keys, in its only form, dual."""
+    """Return the case of complete keys, in its only form, dual."""
     p: Any = params
     if p["law"] == "hertz":
         return _hertz_case(p["n"])
@@ -67,7 +68,7 @@ def half_plane_case(params: Mapping[str, Value]) -> Case:
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """Division of [−width, width] into n equal elements; lengths in a."""
+    """Division of [−width, width] into n equal elements, with lengths in units of a."""
 
     n: int
     width: float
@@ -89,7 +90,7 @@ class Elements:
 
     @property
     def F(self) -> Matrix:
-        """Displacements (n, n) of the midpoints by unit forces on the elements.
+        """Displacements (n, n) of the midpoints under unit forces on the elements.
 
         F_ij = −1/h ∫ ln|x_i − s| ds over element j; an antiderivative is t ln|t| − t.
         """
@@ -106,9 +107,10 @@ def _hertz_case(n: int) -> Case:
     exact_energy = self_energy(((1.0, 1.0),)) - approach
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Hertz; errors are relative, that of p in l² of the midpoints.
+        """Compare with Hertz; errors are relative, and the error of p is in l².
 
-        energy: elastic energy − P·approach, with zero approach where u = 0.
+        `energy` is the elastic energy minus P·approach; the approach is zero where
+        u = 0.
         """
         force = s.x * EXACT.P
         p, hertz = force / width, EXACT.pressure(x)
@@ -169,9 +171,10 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     def quantities(s: Solution) -> dict[str, Any]:
         """Compare with Cattaneo and Mindlin; errors are relative, that of q in l².
 
-        energy: elastic energy − Q·displacement, J/m. dissipation: Σg|slip| of this
-        loading or unloading, J/m. stick_half_width: that of an exact traction with the
-        same ∫x²q. shear_centre: mean of the elements next to x = 0.
+        `energy` is the elastic energy minus Q·displacement in J/m; `dissipation` is
+        Σg|slip| of this loading or unloading in J/m; `stick_half_width` is that of the
+        exact traction with the same ∫x²q; `shear_centre` is the mean of q over the
+        elements next to x = 0.
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)
@@ -228,8 +231,8 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
 def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
     """Return the constant part of u, in l, under the tractions Σ w·s_c of pairs (w, c).
 
-    It is the displacement where bodies stick: there the parabolas −x²/c² of all
-    semicircles add up to zero, or to Hertz's gap.
+    In the stick zone, u is this constant, because the parabolas −x²/c² of all
+    semicircles sum to zero (or, for normal contact, to Hertz's gap).
     """
     return float(sum(w * (np.log(2 / c) + 0.5) for w, c in semicircles))
 
@@ -277,9 +280,9 @@ def _case(
 
 
 def _surface(x: Vector, side: ContactSide) -> Fields:
-    """Return tractions at the midpoints x (n,), m; half planes have no mesh to draw.
+    """Return tractions at the midpoints x (n,), m, as fields without a mesh.
 
-    They act on the upper surface, which Q pushes along +x.
+    The tractions act on the upper surface, which Q pushes along +x.
     """
     n = x.size
     return Fields(

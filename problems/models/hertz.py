@@ -9,27 +9,30 @@ Bodies are half discs under a uniform pressure on the flat side. The force is
 prescribed, since the theory does not determine the approach. Contact alone supports the
 upper body vertically, so that the form ``dual-bounds`` does not exist.
 
-More cells per a (`n`, `m`) refine the contact zone only: away from it, cells grow by
-the factor GROWTH whatever their number. Each of the `halvings` halves all cells.
+More cells per a (`n`, `m`) only refine the contact zone. Outside this zone, cells grow
+by the factor GROWTH, irrespective of their number. Each of the `halvings` halves all
+cells.
 
-R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark of the literature, which states no
-units; here they are mm, GPa and MN/m. Then a = 0.68078 mm and p₀ = 9.3514 GPa.
+R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark of the literature, where no units are
+stated. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.
 
-A tangential force Q on two cylinders of the same material acts on the flat sides, as
-shear tractions ±Q and normal ones that grow linearly along the side and balance their
-moment without supports. Both bodies are loaded and deformed alike: contact and friction
-alone support the upper one, and the supports of the lower one have no reactions. Exact
-tractions are those of `problems.models.line_contact`. The key `programme` is
+A tangential force Q on two cylinders of the same material acts on the flat sides. It
+consists of shear tractions with resultants ±Q, and of normal tractions, linear along
+the side, that balance the moment without supports. Loads and deformations of both
+bodies are symmetric: contact and friction alone support the upper body, and the
+supports of the lower body have no reactions. Exact tractions are those of
+`problems.models.line_contact`. The key `programme` is
 
 * normal-first: P without friction, then Q, then Q reduced from its peak, one step each;
-* proportional: both in steps with friction, P ∝ k² so that a grows evenly. With slip
-  measured in each step (quasi-static), the traction is (Q/P)p and nothing slips. With a
-  single static load, the tractions are as if Q had been applied last.
+* proportional: P and Q grow together in steps with friction, with P ∝ k² so that a
+  grows by equal increments. If slip is measured in each step (quasi-static), the
+  traction is (Q/P)p and nothing slips. For a single static load, the tractions are as
+  if Q had been applied last.
 
-Errors that no mesh removes: the bodies are finite (0.1 %), and a/R is not zero. Contact
-of two cylinders is linearised at the undeformed state, along normals that differ from
-the vertical by up to a/R; the difference from Hertz is of order a²/R² ∝ P, 1 % at
-P = 10. The default load of two cylinders is therefore smaller.
+Two errors do not vanish with the mesh size: the bodies are finite (0.1 %), and a/R is
+not zero. Contact of two cylinders is linearised at the undeformed state, along normals
+that differ from the vertical by up to a/R. The difference from Hertz is of order
+a²/R² ∝ P, 1 % at P = 10; the default load of two cylinders is therefore smaller.
 """
 
 from __future__ import annotations
@@ -84,7 +87,7 @@ GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
 
 GROWTH = 1.15  #: ratio of the sizes of neighbouring cells away from the contact
 UNIFORM_HALF_WIDTH = 1.5  #: half width of the uniformly meshed part of the arc, in a
-CURVE_POINTS = 601  #: points of the exact tractions in pictures, on the uniform part
+CURVE_POINTS = 601  #: number of points of plotted exact tractions, on the uniform part
 
 
 @cached_problem
@@ -110,7 +113,10 @@ def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return a Newton QP of a cylinder on a plane at finite strain; gaps are linear."""
+    """Return the case of one Newton iteration of a cylinder on a rigid plane.
+
+    At finite strain, gaps to a plane are still linear in the displacement.
+    """
     exact = _cylinder_on_plane(params)[1]
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     case = newton_case(
@@ -205,9 +211,10 @@ def _programme(
     """Return the stages of a tangential load: P without friction, then P and Q.
 
     In the first stage, supports on the axis fix the upper cylinder; under P they have
-    no reactions. Without friction, two cylinders roll on each other almost freely, as
-    only the polygonal shape of their arcs resists. Slip of the next stage would be
-    measured from that arbitrary state, and Q would do work on the rolling.
+    no reactions. Without these supports and without friction, the cylinders could roll
+    on each other almost freely, because only the polygonal shape of their arcs resists.
+    Slip in the next stage would then be measured from an arbitrary state, and Q would
+    do work on the rolling.
     """
     p: Any = params
     discs, sides = half_cylinders(p).discs, elastic.shape.sides
@@ -246,11 +253,12 @@ def _programme(
 
 
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
-    """Return the cylinders, with n cells per a on the upper one and m on the lower.
+    """Return the cylinders, with n cells per a on the upper one and m on the lower one.
 
-    The upper one has R = 8 mm and E = 200 GPa, the lower one `radius` and `ratio` times
-    these. Where Hertz's a exceeds a radius, for bodies too soft for the theory, cells
-    are those of a = radius: the uniform part of the arc must not exceed the half disc.
+    The upper cylinder has R = 8 mm and E = 200 GPa, the lower one R multiplied by
+    `radius` and E by `ratio`. If Hertz's a exceeds a radius, because the bodies are too
+    soft for the theory, the mesh is that for a = radius, so that the uniform part of
+    the arc does not exceed the half disc.
     """
     p: Any = params
     lower_material = Material(p["ratio"] * MATERIAL.E, MATERIAL.nu)
@@ -269,8 +277,8 @@ def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
 def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
     """Return the cylinders in contact under P alone, and Hertz's solution.
 
-    With a tangential force, the supports are those without reactions; otherwise they
-    also enforce the symmetry about the axis.
+    With a tangential force, the supports only exclude rigid motions and have no
+    reactions. Without it, they also enforce the symmetry about the axis.
     """
     p: Any = params
     halves = half_cylinders(params)
@@ -335,7 +343,7 @@ def _summed(forces: Sequence[Forces]) -> Forces:
 
 
 def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
-    """Return the shares of P and of μP that act in each step with friction."""
+    """Return the shares of P and of μP applied in each step with friction."""
     p: Any = params
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
@@ -346,15 +354,15 @@ def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
 
 
 def _slip_starts_at_rest(params: Mapping[str, Value]) -> bool:
-    """Return True if slip is measured from rest, not from the state under P alone."""
+    """Return True if slip is measured from rest instead of the state under P alone."""
     return params["loading"] == "static" or params["programme"] == "proportional"
 
 
 def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc:
     """Return the half disc around (0, 0) of a cylinder with centre (0, `centre`).
 
-    Cells have size h at (0, 0) and grow along the arc and inwards; then all are halved
-    `halvings` times.
+    Cells have size h at (0, 0) and grow along the arc and inwards. All cells are then
+    halved `halvings` times.
     """
     radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
     arc = (
@@ -371,26 +379,26 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
 def graded_points(h: float, uniform: float, total: float) -> Vector:
     """Divide [0, total] into cells of size h up to `uniform`, then growing by GROWTH.
 
-    If cells of size h reach the end, all cells have one size of at most h.
+    If `uniform` covers the interval, all cells have the same size of at most h.
     """
     equal = h * np.arange(np.ceil(uniform / h) + 1)
     if equal[-1] >= total:
         return np.linspace(0, total, int(np.ceil(total / h)) + 1)
     rest = total - equal[-1]
-    # the least count with  h Σ GROWTH^k ≥ rest;  the sizes are then scaled to fit
+    # the smallest count with  h Σ GROWTH^k ≥ rest;  the sizes are then scaled to fit
     count = np.ceil(np.log1p(rest * (GROWTH - 1) / (GROWTH * h)) / np.log(GROWTH))
     sizes = GROWTH ** np.arange(1, count + 1)
     return np.append(equal, equal[-1] + rest * np.cumsum(sizes) / sizes.sum())
 
 
 def insert_midpoints(x: Vector, times: int) -> Vector:
-    """Insert the midpoints of an increasing sequence, repeatedly."""
+    """Insert the midpoints of an increasing sequence, `times` times."""
     places = np.arange(x.size)
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
 def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
-    """Return the nodal forces of P, spread evenly over a flat side."""
+    """Return the nodal forces of P, distributed uniformly over a flat side."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
     return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())
@@ -401,9 +409,9 @@ def pressure_quantities(
 ) -> dict[str, Any]:
     """Compare the pressure on the slave side with Hertz's.
 
-    The nodal pressure is the vertical contact force over ∫N_j dx. Errors are relative.
-    The half width is √(4∫px² dx/P), which is exact for Hertz's pressure; the position
-    of the last active node would have an error of ±h.
+    The nodal pressure is the vertical contact force divided by ∫N_j dx. Errors are
+    relative. The half width is √(4∫px² dx/P), which is exact for Hertz's pressure,
+    whereas the position of the last active node would have an error of ±h.
     """
     slave = bodies.pairs[0].slave
     x = bodies.mesh.points[slave, 0]
@@ -435,11 +443,11 @@ def shear_quantities(
 ) -> dict[str, Any]:
     """Compare the shear traction on the slave side with the exact one.
 
-    The nodal traction is the horizontal friction force over ∫N_j dx. Errors are
-    relative, that of the force to its peak. shear_centre: traction at x = 0.
-    stick_half_width: that of an exact traction with the same ratio of ∫x²q to ∫x²p, in
-    which effects of the finite bodies on both cancel; absent with proportional steps,
-    in which nothing slips.
+    The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
+    relative; the error of the force is relative to its peak. `shear_centre` is the
+    traction at x = 0. `stick_half_width` is that of the exact traction with the same
+    ratio of ∫x²q to ∫x²p, in which effects of the finite bodies on both cancel. It is
+    absent for proportional steps, where nothing slips.
     """
     p: Any = params
     slave, upper = bodies.pairs[0].slave, p["slave"] == "upper"
@@ -475,7 +483,7 @@ def shear_quantities(
 
 
 def _without_slip(params: Mapping[str, Value]) -> bool:
-    """Return True if P and Q grow in proportion, so that the exact solution sticks."""
+    """Return True if P and Q grow in proportion, so that nothing slips."""
     together = params["programme"] == "proportional"
     return together and params["loading"] == "quasi-static"
 
@@ -483,7 +491,7 @@ def _without_slip(params: Mapping[str, Value]) -> bool:
 def _exact_shear(
     exact: LineContact, params: Mapping[str, Value]
 ) -> Callable[[Vector], Vector]:
-    """Return the exact shear traction on the lower cylinder, a map from x, m, to Pa."""
+    """Return the exact shear traction on the lower cylinder, Pa, for x in m."""
     p: Any = params
     if _without_slip(params):
         return lambda x: exact.pressure(x) * (p["Q"] * p["mu"])
@@ -495,16 +503,16 @@ def _curve(
 ) -> NDArray[np.float64]:
     """Return the exact tractions on the slave side, see `ContactProblem.exact`.
 
-    Shear is positive along the tangent (−n_y, n_x). On the upper cylinder this is +x
-    and the traction is −q; on the lower one it is −x and the traction is q. The shear
-    is −q in both cases.
+    Shear is positive along the tangent (−n_y, n_x). On the upper cylinder, this tangent
+    is +x and the traction is −q; on the lower one, the tangent is −x and the traction
+    is q. The shear is −q in both cases.
     """
     x = exact.a * np.linspace(-UNIFORM_HALF_WIDTH, UNIFORM_HALF_WIDTH, CURVE_POINTS)
     return np.column_stack([x, exact.pressure(x), -shear(x)])
 
 
 def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
-    """Return u_x of the middle of the arc and of the centre, zero by symmetry."""
+    """Return the components u_x of the middle of arc and flat side, 0 by symmetry."""
     chains = [sides[prefix + name] for name in ("arc", "flat")]
     return dofs_of(np.array([chain[chain.size // 2] for chain in chains]), 2, 0)
 

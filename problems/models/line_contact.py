@@ -6,15 +6,17 @@ P per thickness, with (Johnson 1985, "Contact mechanics", Section 4.2)
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
-If both are of the same material, p causes no relative tangential displacement, and a
-shear traction no relative normal one. Under a tangential force Q < μP applied after P,
-c ≤ |x| ≤ a slips while |x| < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2), with
+If both bodies are of the same material, p causes no relative tangential displacement,
+and a shear traction causes no relative normal displacement. Under a tangential force
+Q < μP applied after P, the zone c ≤ |x| ≤ a slips and the zone |x| < c sticks (Cattaneo
+1938; Mindlin 1949; Johnson, Section 7.2), with
 
     q(x) = μp₀√(1 − x²/a²) − μp₀(c/a)√(1 − x²/c²),    c/a = √(1 − Q/μP)
 
 where square roots of negative numbers count as zero. When Q decreases from Q* to Q,
-|Q| ≤ Q*, reverse slip spreads from the edge, and q = q* − 2q′ with the traction q′ of
-half the difference, c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
+|Q| ≤ Q*, reverse slip spreads from the edge. The traction is then q = q* − 2q′, where
+q′ is the traction under the force (Q* − Q)/2, with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin
+and Deresiewicz 1953).
 """
 
 from __future__ import annotations
@@ -55,7 +57,7 @@ class LineContact:
 
 @dataclass(frozen=True)
 class TangentialContact:
-    """Cattaneo and Mindlin's solution after loading to `peak`, and back to `Q`."""
+    """Cattaneo and Mindlin's solution after loading to `peak` and unloading to `Q`."""
 
     normal: LineContact
     mu: float
@@ -99,8 +101,7 @@ class TangentialContact:
         """Return c, m, of a traction with the moments ∫x²q dx and ∫x²p dx, N·m.
 
         In loading,  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  In unloading, the
-        traction of the loading is taken to be exact. A moment that no c yields gives
-        the nearest c.
+        traction at the peak is assumed to be exact. The result is clipped to [0, a].
         """
         # a semicircle of force w and half width c has the moment ∫x² = wc²/4
         *others, (w, c) = self.semicircles
@@ -109,7 +110,7 @@ class TangentialContact:
 
 
 def _root(s: Vector) -> Vector:
-    """Return √(1 − s²), zero beyond 1."""
+    """Return √(1 − s²), or zero for |s| > 1."""
     return np.asarray(np.sqrt(np.maximum(1 - s**2, 0)))
 
 

@@ -1,14 +1,14 @@
 """Two membranes in contact along an edge: a model problem of Total FETI.
 
 The problem is that of Dostál and Horák 2004, "Scalable FETI with optimal dual penalty
-for a variational inequality" (ref. [20] of the paper), which PERMON's developers use in
-benchmarks. Under unit tension,
+for a variational inequality" (ref. [20] of the paper), which the developers of PERMON
+use as a benchmark. Under unit tension,
 
     min Σ_b ∫ ½|∇u_b|² − f_b u_b,    u_1 = 0 on x = 0,   u_1 ≤ u_2 on x = 1
 
-on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 where y > ¾,
-f_2 = −1 where y < ¼, and both are zero elsewhere. Only the first membrane supports the
-second, which floats, so that the sum of the contact forces is its load, ¼.
+on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 for y > ¾,
+f_2 = −1 for y < ¼, and both are zero elsewhere. The second membrane floats and is
+supported by the first one alone, so that the sum of the contact forces is its load, ¼.
 
 Elements are bilinear. Each membrane is decomposed into S × S congruent squares of n × n
 cells.
@@ -60,7 +60,7 @@ LOADS = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and its interval of y
 
 
 def membranes(form: str, params: Mapping[str, Value]) -> Case:
-    """Return the QP in one form."""
+    """Return the case in one of the forms."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
@@ -134,7 +134,7 @@ class Membranes:
 
     @cached_property
     def qp(self) -> QP:
-        """Primal problem; unknowns are the heights u of the nodes."""
+        """Primal problem for the heights u of the nodes."""
         nodes, sides = len(self.mesh.points), self.mesh.boundaries
         K = grid_stiffness((self.side, self.side))
         one = csr_array(eye_array(nodes, format="csr"))
@@ -160,7 +160,7 @@ class Membranes:
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
     def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
-        """Return the decomposed problem, with gluing rows `rows`, one of `GLUE`."""
+        """Return the decomposed problem, with the gluing `rows`, a key of `GLUE`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
         G = _contact_rows(sides, layout.nodes)
@@ -232,7 +232,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
 def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
     """Assemble a floating subdomain of a grid under unit tension.
 
-    The constants are its kernel. Its nodes are numbered as by `grid_stiffness`.
+    The kernel consists of the constants. Nodes are numbered as in `grid_stiffness`.
 
     h : length of a cell
     """
@@ -253,7 +253,7 @@ def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
 
 def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
     """Return the rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
-    # both sides ascending by node, hence by y: the grids match
+    # nodes ascend with y on both sides, and the grids match
     pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
     ends = 2 * np.arange(len(pairs) + 1)
     data = np.tile([1.0, -1.0], len(pairs))
@@ -263,6 +263,6 @@ def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
 def hat_integrals(n: int, lower: float, upper: float) -> Vector:
     """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
     begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
-    # of each cell, ∫ of its rising and of its falling hat function
+    # integrals of the rising and the falling hat function over each cell
     rising = (end**2 - begin**2) / 2
     return np.asarray((np.append(end - begin - rising, 0) + np.append(0, rising)) / n)

@@ -7,22 +7,21 @@ distance r from the origin, the contact region is r ≤ 1, and for r ≥ 1
     string (dim = 1):    u = (r − 1)²               u″ = 2
     membrane (dim = 2):  u = r²/2 − ln r − ½        Δu = u″ + u′/r = 2
 
-both with u = u′ = 0 at r = 1. In the contact region the pressure of the obstacle is q;
-its total force is 2q and πq. (The membrane is a standard test of obstacle problems, for
-instance in Bartels and Carstensen 2004.)
+both with u = u′ = 0 at r = 1. The pressure of the obstacle in the contact region is q,
+and its total force is 2q for the string and πq for the membrane. (The membrane is a
+standard test of obstacle problems, for instance in Bartels and Carstensen 2004.)
 
-*Hemisphere.* Over Ω = (−2, 2)², without load, a membrane lies on the unit ball,
+*Hemisphere.* A membrane over Ω = (−2, 2)² without load lies on the unit ball,
 ψ = √(1 − r²) for r ≤ 0.9, continued by its tangent for r > 0.9 (tutorial 9 of PETSc's
 SNES; Bueler, "PETSc for partial differential equations", 2021, Chapter 12). The contact
-region is r ≤ a,
+region is r ≤ a, with
 
     a²(ln 2 − ln a) = 1 − a²,    u = A ln(2/r) for r ≥ a,   A = a²/√(1 − a²)
 
-so that u and u′ equal those of ψ at r = a, and u = 0 at r = 2. The force of the ball is
-2πA.
+so that u = ψ and u′ = ψ′ at r = a, and u = 0 at r = 2. The force of the ball is 2πA.
 
-Elements are linear or bilinear on a uniform grid; errors at nodes and of the energy are
-of second order. Lengths are in m, forces are divided by the tension.
+Elements are linear or bilinear on a uniform grid. Nodal errors and the error of the
+energy are of second order. Lengths are in m, and forces are divided by the tension.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ from mortarbench.problems.models.membranes import membrane_class
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
-TANGENT_RADIUS = 0.9  #: r beyond which ψ continues by its tangent, m
+TANGENT_RADIUS = 0.9  #: radius r beyond which ψ is continued by its tangent, m
 CONTACT_RADIUS = 0.697965148223374  #: a, root of a²(ln 2 − ln a) = 1 − a², m
 SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
 
@@ -191,7 +190,7 @@ def _rank_quantities(
 ) -> Mapping[str, Any]:
     """Return `obstacle_quantities` from the solutions of all ranks; collective.
 
-    The energy of the lift w is that of `Problem.energy` at v = 0, qᵀw − ½wᵀKw.
+    The constant of the energy is that of `Problem.energy`: qᵀw − ½wᵀKw with the lift w.
     """
     boundary = np.unique(np.concatenate([*grid.sides.values()]))
     n = grid.divisions[0]
@@ -224,8 +223,9 @@ def _grid(n: int, shape: str) -> StructuredGrid:
 def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
     """Return −q − Kw of `Problem` at some nodes (k,).
 
-    K of a square is K₁ ⊗ M₁ + M₁ ⊗ K₁ with stiffness K₁ and mass M₁ of a line of linear
-    elements. Kw is zero except at nodes on the boundary and next to it.
+    On a square, K = K₁ ⊗ M₁ + M₁ ⊗ K₁, with the stiffness K₁ and mass matrix M₁ of
+    linear elements on a line. Kw is zero except at nodes on the boundary and adjacent
+    to it.
     """
     n = grid.divisions[0]
     h, (i, j) = 2 * HALF[shape] / n, np.divmod(node, n + 1)
@@ -247,19 +247,19 @@ def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
 
 
 def _cells_at(line: Nodes, n: int) -> Vector:
-    """Return the number of cells (k,) adjacent to some of n + 1 points on a line."""
+    """Return the number of cells (k,) adjacent to points (k,) of a line of n cells."""
     return np.where((line == 0) | (line == n), 1.0, 2.0)
 
 
 def _hat_integrals(n: int, h: float, node: Nodes) -> Vector:
-    """Return ∫N_j of some nodes (k,) of a square of n × n cells."""
+    """Return ∫N_j of some nodes (k,) of a grid of n × n cells of side h."""
     i, j = np.divmod(node, n + 1)
     return np.asarray((h / 2) ** 2 * _cells_at(i, n) * _cells_at(j, n))
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Obstacle problem of v = u − w, with w = u at boundary nodes and 0 at the others.
+    """Obstacle problem for v = u − w, with w = u at boundary nodes and 0 at all others.
 
     ::
 
@@ -282,7 +282,7 @@ class Problem:
         return supported_inverse(self.qp.P, np.arange(N), np.full((N, 1), N**-0.5))
 
     def energy(self, v: Vector) -> float:
-        """Return ∫ ½|∇u|² + q u of u = v + w, over the tension."""
+        """Return ∫ ½|∇u|² + q u for u = v + w, divided by the tension."""
         w, qp = self.lift, self.qp
         constant = qp.q @ w - 0.5 * w @ (qp.P @ w)
         return qp.objective(v) + float(constant)
@@ -297,7 +297,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     if dim == 2:
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
-    # half a cell of tolerance against rounding of the coordinates
+    # the tolerance of half a cell allows for rounding of the coordinates
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
@@ -315,7 +315,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
 
 
 def bound_form(rows: QP) -> Transformed:
-    """Eliminate the prescribed components, and write −v ≤ −ψ as bounds v ≥ ψ."""
+    """Eliminate the prescribed components, and replace −v ≤ −ψ by bounds v ≥ ψ."""
     free = rows.G.indices
     n, m = rows.q.size, free.size
     K = csc_array(rows.P)
@@ -341,7 +341,7 @@ def bound_form(rows: QP) -> Transformed:
 
 
 def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
-    """Return the positions (N, dim) of the grid with n cells per side, m."""
+    """Return the positions (N, dim) of the nodes of a grid with n cells per side, m."""
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     grid = np.meshgrid(*[x] * dim, indexing="ij")
     return np.stack([axis.ravel() for axis in grid], axis=-1)
@@ -378,10 +378,10 @@ def exact_height(x: Vector, shape: str = "flat") -> Vector:
 
 
 def exact_energy(dim: int, shape: str = "flat") -> float:
-    """Return ∫ ½|∇u|² + q u of the exact solution: ⅓ for the string.
+    """Return ∫ ½|∇u|² + q u of the exact solution, which is ⅓ for the string.
 
-    For the membrane, integrate over r in closed form, and over φ numerically. With the
-    distance ρ of the boundary in the direction φ,
+    For the membrane, the integral over r is in closed form, and that over φ numerical.
+    With the distance ρ of the boundary in the direction φ, the energy is
 
         8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
 
@@ -403,8 +403,8 @@ def exact_energy(dim: int, shape: str = "flat") -> float:
 def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
     """Return counts, energy and force of the obstacle, with their errors.
 
-    energy and obstacle_force, Σλ, are divided by the tension. energy_error and
-    force_error are relative. max_error: largest error of u at a node, m.
+    `energy` and `obstacle_force`, Σλ, are divided by the tension; `energy_error` and
+    `force_error` are relative; `max_error` is the largest nodal error of u in m.
     """
     N, dim = problem.x.shape
     error = problem.lift + s.x - exact_height(problem.x, problem.shape)
@@ -423,6 +423,8 @@ def _quantities(
     """Return the dictionary of `obstacle_quantities`.
 
     sizes : dimension, and numbers of nodes, cells and boundary nodes
+    z : multipliers of the obstacle
+    error : largest nodal error of u, m
     """
     (dim, N, elements, boundary), force = sizes, float(z.sum())
     flat = LOAD["flat"] * (2.0 if dim == 1 else np.pi)

@@ -1,17 +1,18 @@
 """Contact patch test: transfer of a uniform pressure across a non-matching interface.
 
-Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both are on
-rollers at their left sides, the lower one also at its bottom; the pressure p acts on
-the top. The exact solution is linear in each block, so that bilinear elements contain
-it:
+Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both have
+rollers on their left sides, the lower one also on its bottom; the pressure p acts on
+the top. The exact solution is linear in each block, and bilinear elements represent it
+exactly:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
-A contact discretisation that reproduces it transfers constant pressures exactly (Taylor
-and Papadopoulos 1991). Mortar methods pass; one-pass node-to-segment contact fails: its
-error in σ_y is of order one and does not vanish with the mesh size. Friction changes
-nothing if the blocks are of the same material. Contact alone supports the upper block,
-so that the form ``dual-bounds`` does not exist.
+A contact discretisation passes the test if it reproduces this solution, that is, if it
+transfers constant pressures exactly (Taylor and Papadopoulos 1991). Mortar methods
+pass. One-pass node-to-segment contact fails: its error in σ_y is of order one and does
+not vanish with the mesh size. Friction has no effect if the blocks are of the same
+material. The upper block is supported by contact alone, so that the form
+``dual-bounds`` does not exist.
 
 In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
 −p. Linear fields are exact on distorted hexahedra too (`distort`).
@@ -88,7 +89,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     D = elasticity_matrices(elastic.materials, elastic.plane)
 
     def error(answer: ContactSolution) -> dict[str, Any]:
-        """Return the largest |σ_y + p|/p, in space |σ_z + p|/p, at Gauss points."""
+        """Return the largest |σ_y + p|/p (in space |σ_z + p|/p) at Gauss points."""
         largest = 0.0
         for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)
@@ -102,7 +103,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         linearise=keyed_linearisation(p),
         results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
-        # first bound of Coulomb's law: large enough to support blocks by friction
+        # the first bound of Coulomb's law must suffice to support blocks by friction
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )
 
@@ -145,7 +146,7 @@ def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
     Raises
     ------
     InputError
-        When a growing load cannot reach it, since the material softens before.
+        If a growing load cannot reach this stretch because the material softens.
 
     """
     softest = _softest(material)
@@ -173,7 +174,7 @@ def state_under_pressure(material: Hyperelastic, pressure: float) -> Homogeneous
 
 
 def _softest(material: Hyperelastic) -> float:
-    """Return the stretch of the largest pressure; 0 if the material never softens."""
+    """Return the stretch at the largest pressure; 0 if the material does not soften."""
     if homogeneous(material, MIN_STRETCH).stiffness > 0:
         return 0.0
     return float(
@@ -184,7 +185,7 @@ def _softest(material: Hyperelastic) -> float:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the QP of one Newton iteration at finite strain."""
+    """Return the case of one Newton iteration at finite strain."""
     p: Any = params
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     exact = _uniform(params)
@@ -220,8 +221,9 @@ def _uniform(params: Mapping[str, Any]) -> Homogeneous:
 def _mean_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     """Return mean stretches [λ₁, λ₂], stresses and the strain energy of the blocks.
 
-    nominal_stress: contact force over the undeformed length, Pa. cauchy_stress: mean of
-    σ_y over the cells, Pa. strain_energy: ∫W, J/m.
+    `nominal_stress` is the contact force divided by the undeformed length in Pa;
+    `cauchy_stress` is the mean of σ_y over the cells in Pa; `strain_energy` is ∫W in
+    J/m.
     """
     bodies, u = path.bodies, as_vectors(s.x * path.bodies.length, 2)
     sides = bodies.mesh.boundaries
@@ -240,7 +242,7 @@ def _mean_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
 
 
 def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]:
-    """Return the largest errors: relative, of σ_y in cells, and of x at nodes, m."""
+    """Return the largest relative error of σ_y in cells, and of positions in m."""
     bodies = path.bodies
     stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
     u = as_vectors(s.x * bodies.length, 2)
@@ -275,7 +277,7 @@ def bodies(params: Mapping[str, Value]) -> ElasticBodies:
 
 
 def _bodies_in_space(params: Mapping[str, Value]) -> ElasticBodies:
-    """Return blocks of 1 m × 1 m × ½ m, with rollers on x = 0, y = 0 and z = 0."""
+    """Return two blocks of 1 m × 1 m × ½ m with rollers on x = 0, y = 0 and z = 0."""
     p: Any = params
     divisions = [(p[name], p[name], -(-p[name] // 2)) for name in NAMES]
     meshes = [
@@ -331,5 +333,5 @@ def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
 
 
 def _divisions(n: int) -> tuple[int, int]:
-    """Return the numbers of cells along x and y; cells are about square."""
+    """Return the numbers of cells along x and y, such that cells are nearly square."""
     return n, -(-n // 2)

@@ -1,16 +1,16 @@
-"""An elastic plate in rectangular subdomains: a linear problem to study FETI.
+"""An elastic plate in rectangular subdomains: a linear problem for studies of FETI.
 
 A plate of `width` × `height` is clamped at its left edge and pulled down by 1 MN per m
 of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some of
-them, the modulus is larger by the factor `jump`: in every other one (``checkerboard``)
-or in those at the clamped edge (``column``). There is no contact, so that the dual has
-equations only. Its condition numbers measure the scalability of the method
-independently of load, stopping test and units.
+them, the modulus is multiplied by `jump`: in every other subdomain (``checkerboard``)
+or in the subdomains at the clamped edge (``column``). There is no contact, so that the
+dual has equality constraints only. Its condition numbers measure the scalability of the
+method independently of load, stopping test and units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
-Supports are rows of B as in all families (Total FETI), or ``eliminated``: subdomains at
+Supports are rows of B as in all families (Total FETI), or ``eliminated``. Subdomains at
 the clamped edge then do not float, as in FETI-1 (Farhat and Roux 1991).
 
 In space (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
@@ -87,7 +87,7 @@ from mortarbench.problems.feti.tearing import blocks, grid_positions
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load, N/m, in space N
 STEEL = Material(E=210e9, nu=0.3)
-#: preconditioner and scaling by the name of the spectrum; None: no preconditioner
+#: preconditioner and scaling for each spectrum; None means no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
     "none": None,
     "lumped": ("lumped", "multiplicity"),
@@ -97,7 +97,7 @@ PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
 
 
 def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
-    """Return the QP in one form."""
+    """Return the case in one of the forms."""
     plate = model(tuple(params.items()))
     mesh = plate.mesh
     new = plate.dual if form == "dual" else primal_form(plate.primal)
@@ -142,13 +142,13 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plate:
-    """Plate of one set of keys; K, f and moduli are non-dimensional, by l and F₀."""
+    """Plate for one set of keys; K, f and moduli are in the units l and F₀."""
 
-    volume: float  #: width × height, m²; in space also × Sz, m³
+    volume: float  #: width × height, m²; volume in space, m³
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
-    moduli: Vector  #: (k,) moduli of the materials, that of steel first
+    moduli: Vector  #: (k,) moduli of the materials, steel first
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
     parts: DecomposedProblem
@@ -170,7 +170,7 @@ class Plate:
 
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
-        """Spectra of F on the kernel of its equations, by preconditioner."""
+        """Spectra of F on the kernel of the equality rows, by preconditioner."""
         return _spectra(self.moduli, LocalDual(self.own))
 
     @property
@@ -185,10 +185,10 @@ class Plate:
 
 
 def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
-    """Compute the spectra by the names of `PRECONDITIONERS`; collective over ranks."""
+    """Compute the spectra named in `PRECONDITIONERS`; collective over ranks."""
     qp = dual.share().qp
     names = dict(PRECONDITIONERS)
-    uniform = moduli[0] == moduli[1]  # then both scalings are the same
+    uniform = moduli[0] == moduli[1]  # both scalings are then equal
     if uniform:
         del names["dirichlet_stiffness"]
     per_name = spectra_over_ranks(qp.P, qp.A, list(names.values()))
@@ -198,7 +198,7 @@ def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
 
 @lru_cache(maxsize=4)
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
-    """Mesh and assemble the plate of complete keys as one body."""
+    """Mesh and assemble the plate for complete keys, as one body."""
     p: Any = dict(params)
     parts, shape = in_subdomains(p), _shape(p)
     mesh, subdomain = shape.mesh, parts.layout.label
@@ -234,7 +234,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     p: Any = params
     shape, (moduli, D) = _shape(p), _stiffness(p)
     layout = _layout(shape, _side(p))
-    # no contact rows, but the interface of problems with contact
+    # a contact problem without contact rows
     none = np.zeros(0)
     return DecomposedProblem(
         layout=layout,
@@ -288,7 +288,7 @@ def _size(p: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def _side(p: Mapping[str, Any]) -> tuple[int, ...]:
-    """Return the numbers of cells along the sides of a subdomain."""
+    """Return the numbers of cells per subdomain along the axes."""
     return (p["n"], p["ny"] or p["n"], p["n"])[: p["dim"]]
 
 
@@ -309,7 +309,7 @@ def _shape(p: Mapping[str, Any]) -> StructuredGrids | StructuredSolids:
 def _layout(
     shape: StructuredGrids | StructuredSolids, side: tuple[int, ...]
 ) -> Subdivision:
-    """Cut the plate into subdomains with the same numbers of cells along each axis."""
+    """Cut the plate into subdomains of `side` cells along the axes."""
     if isinstance(shape, StructuredGrids):
         return Layout.of(shape.parts, side)
     named = np.unique(np.concatenate(list(shape.sides.values())))
@@ -344,7 +344,7 @@ def _clamped(sides: Mapping[str, Nodes], dim: int) -> Nodes:
 
 
 def _pull(layout: Subdivision, side: Nodes, kind: str) -> Forces:
-    """Return the load, distributed over a side as the key `load` requires."""
+    """Return the load, distributed over a side according to the key `load`."""
     nodes = nodes_of_side(side)
     points = layout.position(nodes)
     dim = points.shape[1]
@@ -367,7 +367,7 @@ def _tip(nodes: int, dim: int) -> Nodes:
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
     """Return counts, energy, J/m, and the displacement of the upper right corner, m.
 
-    In space, the energy is in J and the corner that of the largest x, y and z.
+    In space, the energy is in J, and the corner is that with the largest x, y and z.
     """
     mesh = plate.mesh
     tip = _tip(len(mesh.points), mesh.dim)
@@ -384,9 +384,10 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
 def dual_quantities(plate: Plate) -> dict[str, Any]:
     """Return the decomposition, ‖PFP‖, and condition numbers with error bounds.
 
-    norm_PFP: ‖PFP‖ for E = 1, as all rows are scaled by √E. kappa: κ(PFP).
-    kappa_lumped, kappa_dirichlet: with these preconditioners, scaled by multiplicity.
-    kappa_dirichlet_stiffness: scaled by stiffness. Each has an `…_error`.
+    `norm_PFP` is ‖PFP‖ for E = 1, because all rows are scaled by √E; `kappa` is κ(PFP);
+    `kappa_lumped` and `kappa_dirichlet` are κ with these preconditioners and scaling by
+    multiplicity, `kappa_dirichlet_stiffness` with scaling by stiffness. `…_error` is
+    the error bound of each κ.
     """
     return conditions(plate.spectra) | decomposition_quantities(
         plate.torn, plate.dual.qp

@@ -1,11 +1,11 @@
-"""Variational inequalities with bounds as only constraints, from test collections.
+"""Variational inequalities with bound constraints only, from test collections.
 
-Each is min ½vᵀPv + qᵀv, l ≤ v ≤ u with a sparse P; unknowns and energies have no units.
+Each problem is min ½vᵀPv + qᵀv, l ≤ v ≤ u with a sparse P; all data are dimensionless.
 
 * string: the first tutorial of PERMON, u″ = 30 on (0, 1) above a sine
 * journal bearing and torsion: Averick, Carter, Moré and Xue 1992, "The MINPACK-2 test
-  problem collection"; linear elements on the triangles that halve the cells of a
-  uniform grid, coefficients by their mean over the corners
+  problem collection". The elements are linear, on triangles that halve the cells of a
+  uniform grid; coefficients are averaged over the corners of a triangle
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HALF_WIDTH = 10.0  #: b of the journal bearing's rectangle (0, 2π) × (0, 2b)
 
 
 def string(n: int) -> Case:
-    """Return the problem of a string over the obstacle ½ sin(4πx − π/6) − 2, n points.
+    """Return the problem of a string of n points over ½ sin(4πx − π/6) − 2.
 
     The string spans [0, 1]. Decoupled rows of P fix its end points at 0.
     """
@@ -36,13 +36,13 @@ def string(n: int) -> Case:
 def journal_bearing(n: int, eccentricity: float) -> Case:
     """Return the problem of the pressure v ≥ 0 in a journal bearing, n² inner nodes.
 
-    v minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b), with v = 0
-    on the boundary. Node i + n·j is at the i-th ξ and the j-th height.
+    The pressure minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b),
+    with v = 0 on the boundary. Node i + n·j has the i-th ξ and the j-th height.
     """
     hx, hy = 2 * np.pi / (n + 1), 2 * HALF_WIDTH / (n + 1)
     xi = hx * np.arange(n + 2)
     film = (1 + eccentricity * np.cos(xi)) ** 3
-    along = (film[:-1] + film[1:]) / 2 * hy / hx  # of edges between ξ_i and ξ_i+1
+    along = (film[:-1] + film[1:]) / 2 * hy / hx  # for edges between ξ_i and ξ_i+1
     across = (film[:-2] + 4 * film[1:-1] + film[2:]) / 6 * hx / hy
     X = diags_array(
         [-along[1:-1], along[:-1] + along[1:], -along[1:-1]], offsets=[-1, 0, 1]
@@ -55,12 +55,12 @@ def journal_bearing(n: int, eccentricity: float) -> Case:
 def torsion(n: int, twist: float) -> Case:
     """Return the problem of the stress function v of a twisted bar, n² inner nodes.
 
-    v minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 on the boundary and |v|
-    bounded by the distance from the boundary; c is the twist per length. The bar is
-    plastic where |v| is at its bound.
+    The stress function minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 on the
+    boundary and |v| bounded by the distance from the boundary; c is the twist per
+    length. The bar is plastic where |v| attains its bound.
     """
     h = 1 / (n + 1)
-    # distance from the ends of an interval; of a square, the smaller of two
+    # distance from the ends of an interval; on a square, the smaller of two distances
     near = h * np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1))
     distance = np.minimum.outer(near, near).ravel()
     T, one = _second_difference(n), eye_array(n)

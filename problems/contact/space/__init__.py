@@ -1,1 +1,1 @@
-"""Contact in space between faces and nodes, and between faces."""
+"""Contact in space: node to face, and mortar contact between faces."""

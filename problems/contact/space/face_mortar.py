@@ -5,16 +5,16 @@ deformation solid mechanics", Comput. Methods Appl. Mech. Engrg. 193 (2004) 601-
 the auxiliary plane; Popp, Gitterle, Gee and Wall, Int. J. Numer. Meth. Engng 83 (2010)
 1428-1465, for the dual basis. In the plane see `problems.contact.mortar`.
 
-*Triangles.* A quadrilateral face is four triangles about the mean of its corners. Its
-shape functions N_k are linear on each of them, with the value ¼ at the centre. (With
+*Triangles.* A quadrilateral face is divided into four triangles about the mean of its
+corners. Its shape functions N_k are linear on each triangle and ¼ at the centre. (With
 two triangles, or with the bilinear functions, whose inverse map is not polynomial, a
 distorted face fails the patch test.)
 
 *Auxiliary plane.* On the slave face e with centre x_e and unit normal n_e, points of
-both sides are projected along n_e onto the plane through x_e. There each slave triangle
-is clipped by each master triangle (Sutherland and Hodgman 1974). On the overlap, a
-convex polygon with at most six corners, all integrands are polynomials of degree 2.
-Their integrals follow from the moments of the polygon, without quadrature.
+both sides are projected along n_e onto the plane through x_e. On this plane each slave
+triangle is clipped by each master triangle (Sutherland and Hodgman 1974). On the
+overlap, a convex polygon with at most six corners, all integrands are polynomials of
+degree 2. Their integrals follow from the moments of the polygon, without quadrature.
 
 *Rows.* With the gap g along n_e (positive: open) and the basis Φ_j of the multipliers,
 the weak condition ∫ Φ_j g ≥ 0 reads for every slave node j, linearised at u^k with
@@ -23,14 +23,14 @@ fixed planes and overlaps,
     Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + (the left-hand side at u^k),
     D_jk = Σ_e n_e ∫_e Φ_j N_k,   M_jl = Σ_e n_e ∫_e Φ_j N^m_l,   g̃_j = Σ_e ∫_e Φ_j g.
 
-*Balance.* At each point of an overlap a row pulls the slave by Φ_j n_e and the master
-by −Φ_j n_e on the same line along n_e: the forces of a row are in equilibrium and have
-no moment.
+*Balance.* At each point of an overlap, a row exerts the force Φ_j n_e on the slave and
+−Φ_j n_e on the master, on the same line along n_e. The forces of a row are hence in
+equilibrium and have no moment.
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is Φ = A N on each face with A = D_e M_e⁺,
 where M_e = ∫ N Nᵀ and D_e = diag ∫ N over the covered part of the face. Then ∫ Φ_j N_k
-is diagonal wherever M_e is regular, and Σ Φ_j = 1 always, since D_e 1 = M_e 1. M_e is
-singular where only one triangle of a quadrilateral is covered.
+is diagonal if M_e is regular, and always Σ Φ_j = 1, since D_e 1 = M_e 1. M_e is
+singular if only one triangle of a quadrilateral is covered.
 
 Each row is divided by ∫ N_j over the covered part, so that B is dimensionless, g̃ a
 length, and λ a nodal force.
@@ -53,25 +53,25 @@ from mortarbench.problems.contact.space.triangles import FaceTriangles, triangul
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
-#: overlaps below this share of the area of the slave face are rounding of the
-#: projection and are left out
+#: overlaps below this share of the area of the slave face are due to rounding of the
+#: projection and are dropped
 MIN_OVERLAP = 1e-12
 #: eigenvalues of M_e below this share of the largest count as zero
 SINGULAR = 1e-10
-#: distances from a line below this share of the size of a triangle are rounding
+#: distances from a line below this share of the size of a triangle count as zero
 ON_LINE = 1e-14
-#: pairs of triangles that are clipped together, which bounds memory to about 100 MB
+#: pairs of triangles clipped at a time; limits memory to about 100 MB
 CHUNK = 2**16
 #: distance from a master face at which the search along a ray ends, in units of the
-#: radii of both faces; smaller values cost steps, larger ones candidates
+#: radii of both faces; smaller values cost steps, larger values candidates
 CLOSE = 1.5
-#: steps of this search, each at least half the remaining distance from a side that is
-#: inclined by at most 60° (`Reach.cosine`)
+#: largest number of steps of this search. Each step covers at least half the remaining
+#: distance to a side that is inclined by at most 60° (`Reach.cosine`)
 MAX_STEPS = 64
-#: radius, in the same units, of a ball about the end of the search that contains the
-#: faces that the rays of a slave face meet: CLOSE / cos 60° ahead, and tan 60° aside
+#: radius, in the same units, of a ball about the end of the search that contains all
+#: faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60° across it
 MAX_SPREAD = 5.0
-#: corners of a triangle clipped by a triangle, at most
+#: largest number of corners of a triangle clipped by a triangle
 MAX_CORNERS = 6
 
 
@@ -106,16 +106,16 @@ def face_mortar(
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
     slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
-    basis, reach, tangential : as for `problems.contact.mortar.mortar`
+    basis, reach, tangential : see `problems.contact.mortar.mortar`
 
     Returns
     -------
-    rows of the covered slave nodes, which are numbered in ascending order
+    rows of the covered slave nodes, in ascending order of their numbers
 
     Raises
     ------
     InputError
-        When a position is not finite or a face has no area.
+        If a position is not finite or a face has no area.
 
     """
     s, m = (
@@ -171,10 +171,11 @@ def overlaps(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> Overl
 def _facing(
     slave: FaceTriangles, master: FaceTriangles, reach: Reach
 ) -> tuple[Nodes, Nodes]:
-    """Return pairs of faces (k,) that rays along a slave normal may connect.
+    """Return pairs of faces (k,) that a ray along a slave normal may connect.
 
-    From the centre of each slave face, both ways along its normal, a ball is moved by
-    its distance from the nearest master face until it is close to one.
+    From the centre of each slave face, in both directions along its normal, a point is
+    moved repeatedly by its distance from the nearest master face until it is close to
+    a face.
     """
     tree = KDTree(master.centre)
     near = slave.radius + master.radius.max()
@@ -192,7 +193,7 @@ def _facing(
             moves[moves] = (step > 0) & (t[moves] <= limit[moves])
             if not moves.any():
                 break
-        # where the first way ended at its start, both ways find the same faces
+        # if the first direction ended at its start, the second finds the same faces
         start = np.flatnonzero(~moves & (t <= limit) & ((sign > 0) | (t > 0)))
         found = tree.query_ball_point(at[start], MAX_SPREAD * near[start])
         e.append(np.repeat(start, np.array([len(k) for k in found], dtype=int)))
@@ -222,7 +223,7 @@ def _integrals(
     t_m, place = master.of_faces(m[pair])
     # all triangles of one face with all of the other
     t_s, pair = t_s[place], pair[place]
-    # coordinates on the auxiliary plane, and the height above it
+    # coordinates in the auxiliary plane, and height above it
     frame = np.concatenate(
         [tangents(slave.surface.normal[e]), slave.surface.normal[e][:, None]], 1
     )
@@ -283,8 +284,8 @@ def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
 
     Returns
     -------
-    corners (p, 6, 2) of the overlaps, anticlockwise, and their numbers (p,); 0 where
-    the triangles do not overlap
+    corners (p, 6, 2) of the overlaps, anticlockwise, and the numbers (p,) of corners; 0
+    if the triangles do not overlap
 
     """
     p = len(subject)
@@ -297,8 +298,8 @@ def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
         offset = polygon - A[:, None]
         # positive on the inner side, the left of AB
         d = edge[:, None, 0] * offset[..., 1] - edge[:, None, 1] * offset[..., 0]
-        # corners on the line up to rounding are inside: signs of rounding would make
-        # more than two crossings of a convex polygon
+        # corners on the line up to rounding count as inside: signs of rounding errors
+        # could cause more than two crossings of a convex polygon
         size = (
             np.abs(edge).max(axis=1)[:, None] * np.abs(offset).max(axis=(1, 2))[:, None]
         )
@@ -323,12 +324,14 @@ def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
 
 
 def moments(polygon: Points, count: Nodes) -> NDArray[np.float64]:
-    """Return ∫ww^T (p, 3, 3) of w = (1, x, y) over polygons, anticlockwise.
+    """Return ∫ww^T (p, 3, 3) for w = (1, x, y) over anticlockwise polygons.
 
-    Sums over the triangles between the first corner and each edge: on a triangle of
-    area A with the corners v_i and their sum s,  ∫ww^T = A (Σ v_i v_i^T + ss^T) / 12.
+    The integral is a sum over the triangles between the first corner and each edge. On
+    a triangle of area A with vertices v_i (as w) and their sum s,
+    ∫ww^T = A (Σ v_i v_i^T + ss^T) / 12.
 
-    polygon, count : (p, k, 2) corners, the first count (p,) of which are used
+    polygon : (p, k, 2) corners
+    count : (p,) number of corners in use, which come first
     """
     first = polygon[:, :1]
     total = np.zeros((len(polygon), 3, 3))
@@ -360,7 +363,7 @@ def _dual(at: Overlaps) -> NDArray[np.float64]:
 
 
 def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
-    """Add values (p, 4) at nodes (p, 4) into a vector (count,)."""
+    """Sum values (p, 4) at nodes (p, 4) into a vector (count,)."""
     return np.bincount(nodes.ravel(), values.ravel(), minlength=count).astype(float)
 
 

@@ -1,12 +1,13 @@
 """Node-to-face non-penetration in space, linearised at a given displacement.
 
-As in the plane (`problems.contact.node_to_segment`), each slave node stays on the outer
-side of the master: with its closest point x_c = Σ N_a x_a on the master faces and the
-outward normal n there, B u ≤ c with B = [−n at s, +N_a n at a] and c = g + B u^k.
+Each slave node stays on the outer side of the master, as in the plane
+(`problems.contact.node_to_segment`). With the closest point x_c = Σ N_a x_a on the
+master faces and the outward normal n at x_c, the condition is B u ≤ c with
+B = [−n at s, +N_a n at a] and c = g + B u^k.
 
-The closest point is sought on the triangles of the faces
-(`problems.contact.space.triangles`). n is the normal of the face; at an edge or a
-corner where several faces meet, it is their averaged normal.
+The closest point is determined on the triangles of the faces
+(`problems.contact.space.triangles`). The normal n is that of the face; at an edge or a
+corner where several faces meet, their normals are averaged.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from mortarbench.problems.contact.space.triangles import FaceTriangles, triangul
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
-#: distance between closest points on two faces, relative to the radius of a face, at
-#: which both are the same point of a common edge
+#: closest points on two faces coincide, on a common edge, if their distance relative to
+#: the radius of a face is below this value
 SAME_POINT = 1e-9
 
 
@@ -34,7 +35,7 @@ class ClosestPoints(NamedTuple):
 
     face: Nodes  #: (s,)
     N: NDArray[np.float64]  #: (s, 4) shape functions of the face at the closest point
-    normal: Points  #: (s, 3) outward unit normal of the master there
+    normal: Points  #: (s, 3) outward unit normal of the master at the closest point
 
 
 def node_to_face(
@@ -61,7 +62,7 @@ def node_to_face(
     Raises
     ------
     InputError
-        When a position is not finite or a face has no area.
+        If a position is not finite or a face has no area.
 
     """
     own, nodes = np.unique(slave), np.unique(master)
@@ -87,7 +88,7 @@ def node_to_face(
 def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     """Return the closest points of x (s, 3) on faces, with outward normals."""
     tree = KDTree(faces.centre)
-    # the centre of a face is one of its points, and none is farther than its radius
+    # a face contains its centre, and lies within its radius of the centre
     nearest, _ = tree.query(x)
     found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
     candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
@@ -125,7 +126,7 @@ def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
     offset = x[:, None] - triangle
     normal = np.cross(edges[:, 0], edges[:, 1])
     square = np.einsum("px,px->p", normal, normal)[:, None]
-    # the part of vertex k + 2 is the area over edge k
+    # the barycentric coordinate of vertex k + 2 is the area over edge k
     parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
     foot = np.roll(parts, 2, axis=1)
     length = np.einsum("pkx,pkx->pk", edges, edges)

@@ -1,9 +1,9 @@
 """Faces of contact sides in space, divided into triangles.
 
-A quadrilateral face is four triangles about the mean of its corners. Its shape
-functions are linear on each of them, with the value ¼ at the centre. Thus the surface
-is continuous, and integrals over overlaps of two sides are exact. On plane faces, the
-integrals ∫N_j equal those of the bilinear functions.
+A quadrilateral face is divided into four triangles about the mean of its corners. Its
+shape functions are linear on each triangle and ¼ at the centre. Thus the surface is
+continuous, and integrals over overlaps of two sides are exact. On plane faces, the
+integrals ∫N_j equal those of the bilinear shape functions.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _CORNERS = np.eye(4)
 _QUAD = np.array(
     [[_CORNERS[k], _CORNERS[(k + 1) % 4], np.full(4, 0.25)] for k in range(4)]
 )
-#: (3, 4) the same for a triangle, which repeats its last corner
+#: (3, 4) shape functions at the vertices of a triangle, which repeats its last corner
 _TRIANGLE = _CORNERS[:3]
 
 
 class FaceTriangles(NamedTuple):
-    """The triangles of the faces of a side in space."""
+    """Triangles of the faces of a contact side in space."""
 
     surface: Surface
     centre: Points  #: (f, 3) means of the corners of each face, m
@@ -38,7 +38,7 @@ class FaceTriangles(NamedTuple):
     vertices: Points  #: (t, 3, 3) m
 
     def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:
-        """Return the triangles (k,) of faces (p,), and their places (k,) in `faces`."""
+        """Return the triangles (k,) of faces (p,), and the place (k,) of their face."""
         count = self.number[faces]
         place = np.repeat(np.arange(len(faces)), count)
         offset = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)

@@ -1,22 +1,25 @@
 """Contact of two elastic half-spaces as QPs whose P is an operator, and their results.
 
-Two spheres of one material, approximated by paraboloids, are divided into n × n cells
-of side h; the radius a of Hertz's contact is a share of half the side. Unknowns are
-forces on cells, and F their influence (`influence`).
+Two spheres of the same material are approximated by paraboloids. The contact plane is
+divided into n × n cells of side h; the radius a of Hertz's contact is a share of half
+the width of this grid. The unknowns are forces on cells, and F is their influence
+matrix (`influence`).
 
-* law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, with the gap g = r²/2R − δ_n at the centres of
-  the cells before deformation, at Hertz's approach δ_n = a²/R. law=rough adds heights
+* law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, with the undeformed gap g = r²/2R − δ_n at the
+  centres of the cells, for Hertz's approach δ_n = a²/R. law=rough adds heights to g
 * law=mindlin: min ½λᵀFλ − δᵀλ over ‖λ_i‖ ≤ μp_i h² with Hertz's exact pressure p_i at
   the centres of the cells in contact, r < a, and the displacement δ along x of
-  Cattaneo and Mindlin's solution. Normal and tangential problem are decoupled, so that
-  one fixed-point step solves Coulomb's law
-* law=hertz with friction=coulomb: the same with the solution λ_n of the normal problem,
-  ‖λ_i‖ ≤ μλ_n,i; with friction=tresca, ‖λ_i‖ ≤ bound·h² in r < a
+  Cattaneo and Mindlin's solution. The normal and tangential problems are decoupled, so
+  that one fixed-point step solves Coulomb's law
+* law=hertz with friction=coulomb: the same objective over ‖λ_i‖ ≤ μλ_n,i with the
+  solution λ_n of the normal problem; with friction=tresca, over ‖λ_i‖ ≤ bound·h² in
+  r < a
 
-Lengths are in units of a, forces of F₀: P in the normal direction, μP or bound·πa² in
-the tangential one; displacements are in units of F₀/(πE*a) and F₀/(πGa). Hertz's gap is
-then 3π/4·(r²/2 − 1), and δ = 3π/8·(2 − ν)(1 − (c/a)²). A rigid disc that sticks under Q
-moves by π/4·(2 − ν)Q; this is the prescribed δ for Tresca's law.
+Lengths are in units of a, and forces in units of F₀: P in the normal direction, and μP
+or bound·πa² in the tangential direction. Displacements are in units of F₀/(πE*a)
+(normal) and F₀/(πGa) (tangential). Hertz's gap is then 3π/4·(r²/2 − 1), and
+δ = 3π/8·(2 − ν)(1 − (c/a)²). For Tresca's law, the prescribed δ is π/4·(2 − ν)Q, the
+displacement of a rigid disc that sticks under Q.
 """
 
 from __future__ import annotations
@@ -49,25 +52,25 @@ from mortarbench.problems.models.half_space.point_contact import (
 )
 from mortarbench.problems.models.half_space.rough_surface import rough_surface
 
-CONTACT_SHARE = 0.9  #: contact radius over half the side of the grid
-#: the same for rough spheres, which also touch beyond this radius; with 0.9 and the
-#: default roughness, contact reached the border for 6 of 8 seeds, with 0.6 for none of
-#: them
+CONTACT_SHARE = 0.9  #: contact radius over half the width of the grid
+#: contact radius over half the width of the grid for rough spheres, which also touch
+#: beyond this radius. With the default roughness, contact reached the border for 6 of 8
+#: seeds with 0.9, and for none of them with 0.6
 ROUGH_SHARE = 0.6
 SIDE = "sphere on sphere"
 YOUNG = 200e9  #: modulus of both spheres, Pa
-RADIUS = 8e-3  #: of each sphere, m
-LOAD = 100.0  #: P, N; then p₀ is 2.5 GPa for nu = 0.3, as in bearings of steel
-_CURVE_POINTS = 601  #: of the exact tractions in pictures
+RADIUS = 8e-3  #: radius of each sphere, m
+LOAD = 100.0  #: P, N; p₀ = 2.5 GPa for nu = 0.3, as in steel bearings
+_CURVE_POINTS = 601  #: number of points of plotted exact tractions
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Square cells of an n × n grid, or some of them; lengths in a."""
+    """Some or all of the square cells of an n × n grid, with lengths in units of a."""
 
     n: int
-    places: NDArray[np.int64]  #: (k, 2) integers along x and along y
-    share: float = CONTACT_SHARE  #: contact radius over half the side of the grid
+    places: NDArray[np.int64]  #: (k, 2) indices along x and along y
+    share: float = CONTACT_SHARE  #: contact radius over half the width of the grid
 
     @property
     def h(self) -> float:
@@ -94,7 +97,7 @@ class Cells:
 
 
 def half_space_case(params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the QP of complete keys, in its only form, dual."""
+    """Return the case for complete keys, in its only form, dual."""
     p: Any = params
     exact = PointContact(LOAD, RADIUS / 2, YOUNG / (2 * (1 - p["nu"] ** 2)))
     is_rough = p["law"] == "rough"
@@ -144,9 +147,9 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
     def quantities(s: Solution) -> dict[str, Any]:
         """Evaluate radius, force and pressure; compare smooth spheres with Hertz.
 
-        contact_radius: of a disc with the area of the cells in contact. energy: elastic
-        energy, J; exactly 2/5·P·approach. Errors are relative, that of p in the l²
-        norm.
+        `contact_radius` is that of a disc with the area of the cells in contact;
+        `energy` is the elastic energy in J, exactly 2/5·P·approach. Errors are
+        relative; that of p is in the l² norm.
         """
         p, hertz = s.x * exact.P / area, exact.pressure(exact.a * cells.r)
         active = int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum())
@@ -200,15 +203,15 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Loading:
-    """A tangential displacement under given bounds of friction, and its units."""
+    """Prescribed tangential displacement and friction bounds, with their units."""
 
     exact: PointContact
     nu: float
     normal: Vector  #: (k,) normal forces over P
-    bound: Vector  #: (k,) of friction, over F₀
+    bound: Vector  #: (k,) friction bounds over F₀
     delta: float  #: tangential displacement along x over F₀/(πGa)
     unit: float  #: F₀, N
-    sheared: ShearedPointContact | None = None  #: exact solution
+    sheared: ShearedPointContact | None = None  #: exact solution, if known
 
 
 def _coulomb(normal: Vector, exact: PointContact, p: Mapping[str, Any]) -> _Loading:
@@ -237,7 +240,7 @@ def _tresca(cells: Cells, exact: PointContact, p: Mapping[str, Any]) -> _Loading
 
 
 def _hertz_forces(cells: Cells, exact: PointContact) -> Vector:
-    """Return p h² (k,) over P, with Hertz's pressure at the centres."""
+    """Return the forces p h² (k,) over P, with Hertz's pressure p at the centres."""
     return exact.pressure(exact.a * cells.r) * (exact.a * cells.h) ** 2 / exact.P
 
 
@@ -264,10 +267,10 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
     def quantities(s: Solution) -> dict[str, Any]:
         """Evaluate stick area, resultant and energies; compare with the exact solution.
 
-        Radii are those of discs with the area of the cells; c_over_a is the stick
-        radius over the exact contact radius. energy: elastic energy, J. dissipation:
-        Σ bound·|slip|, J. Errors are relative, that of q in the l² norm over
-        the centres. The reference is exact only for nu = 0.
+        Radii are those of discs with the area of the cells. `c_over_a` is the stick
+        radius over the exact contact radius; `energy` is the elastic energy and
+        `dissipation` is Σ bound·|slip|, both in J. Errors are relative; that of q is in
+        the l² norm over the centres. The reference solution is exact only for nu = 0.
         """
         force, slip = s.x.reshape(k, 2), slipping(s)
         stick_radius = cells.radius_of(int((~slip).sum()))
@@ -328,16 +331,16 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
 def _curves(
     exact: PointContact, sheared: ShearedPointContact | None = None
 ) -> NDArray[np.float64]:
-    """Return exact tractions on a radius: r, m, pressure and shear, Pa."""
+    """Return exact tractions along a radius: columns r (m), pressure and shear (Pa)."""
     r = exact.a * np.linspace(0, 1 / CONTACT_SHARE, _CURVE_POINTS)
     shear = np.zeros(r.size) if sheared is None else sheared.traction(r)
     return np.column_stack([r, exact.pressure(r), shear])
 
 
 def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
-    """Return tractions at the centres of cells; half-spaces have no mesh to draw.
+    """Return tractions at the centres of cells, as fields without a mesh.
 
-    They act on the upper surface, which Q pushes along +x.
+    The tractions act on the upper surface, which Q pushes along +x.
     """
     k = len(cells.places)
     points = np.zeros((k, 3))

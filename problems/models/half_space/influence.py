@@ -1,9 +1,9 @@
-"""Surface displacements of half-spaces by forces on square cells: a Toeplitz operator.
+"""Surface displacements of half-spaces under forces on square cells, by FFT.
 
-A force on a cell of side h is a uniform traction. It displaces the surfaces of two
-half-spaces of one material, relative to each other, at the centre of a cell at the
-distance (x, y) by twice the displacement of one surface (Boussinesq and Cerruti;
-Johnson 1985, "Contact mechanics", Sections 3.2 and 3.6),
+A force on a cell of side h is a uniform traction. The relative displacement of the
+surfaces of two half-spaces of the same material, at the centre of a cell at distance
+(x, y), is twice the displacement of one surface (Boussinesq and Cerruti; Johnson 1985,
+"Contact mechanics", Sections 3.2 and 3.6),
 
     F_n = I₀/(πE*h²)
     F_t = 1/(πGh²) · [[(1 − ν)I₀ + νI_xx, νI_xy], [νI_xy, (1 − ν)I₀ + νI_yy]]
@@ -12,14 +12,15 @@ with E* = E/2(1 − ν²), G = E/2(1 + ν) and integrals over the cell,
 
     I₀ = ∫1/r = I_xx + I_yy,   I_xx = ∫x²/r³,   I_yy = ∫y²/r³,   I_xy = ∫xy/r³
 
-Since both are of one material, normal forces cause no relative tangential displacement,
-and tangential forces no normal one. The antiderivatives are Y ln(X + r) for I_xx,
-X ln(Y + r) for I_yy and −r for I_xy (Love 1929).
+Since both half-spaces are of the same material, normal forces cause no relative
+tangential displacement, and tangential forces cause no relative normal displacement.
+The antiderivatives are Y ln(X + r) for I_xx, X ln(Y + r) for I_yy and −r for I_xy (Love
+1929).
 
-Entries depend only on the distance of two cells. Therefore F is a principal submatrix
-of the circulant C of a periodic grid of more than twice the size, which FFTs
-diagonalise: Fx = RᵀCRx, where R extends x by zeros. Hence λ_min(F) ≥ λ_min(C); see
-docs/mathematics.md.
+An entry only depends on the distance between two cells. Therefore F is a principal
+submatrix of the circulant matrix C of a periodic grid of more than twice the size,
+which the FFT diagonalises: Fx = RᵀCRx, where R extends x by zeros. Hence
+λ_min(F) ≥ λ_min(C); see docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ from numpy.typing import NDArray
 from mortarbench.harness.operators import Arrays, Product, SerialisableOperator
 
 NAME = "half-space"  #: name in `problems.OPERATORS`, stored in files
-#: Error of computed eigenvalues of C, relative to the largest. The FFTs of M × M values
-#: have errors below 2⁻⁵³·log₂(M²)·‖C‖, 4e-15·‖C‖ for M = 8192; the margin is safe.
+#: bound of the error of computed eigenvalues of C, relative to the largest one. Errors
+#: of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, 4e-15·‖C‖ for M = 8192
 EIGENVALUE_ROUNDING = 1e-12
-_STRIP_BYTES = 2**19  #: of the transforms that are multiplied while they are in cache
+_STRIP_BYTES = 2**19  #: size of a strip of transforms, which should stay in cache
 
 Array = NDArray[np.float64]
 
@@ -45,8 +46,8 @@ Array = NDArray[np.float64]
 class CellIntegrals(NamedTuple):
     """Integrals over a unit cell, (m0, m1) for distances (i, j) of the centres.
 
-    The first distance is x, the second is y. For other quadrants, I_xy is odd in x and
-    in y, and the others are even.
+    The first distance is x and the second is y. I_xy is odd in x and in y; I_xx and
+    I_yy are even.
     """
 
     xx: Array  #: I_xx
@@ -57,8 +58,8 @@ class CellIntegrals(NamedTuple):
 def cell_integrals(m0: int, m1: int) -> CellIntegrals:
     """Integrate x²/r³, y²/r³ and xy/r³ over unit cells at distances 0 … m0−1, 0 … m1−1.
 
-    Differences of the antiderivatives at the four corners. They lose about log₁₀(m)
-    digits of large distances m to cancellation.
+    The integrals are differences of the antiderivatives at the four corners. At a large
+    distance m, cancellation loses about log₁₀(m) digits.
     """
     X: Array = (np.arange(m0 + 1, dtype=float) - 0.5)[:, None]
     Y: Array = np.arange(m1 + 1, dtype=float) - 0.5
@@ -80,12 +81,12 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
 
 
 class Influence:
-    """The product x ↦ Fx on cells of a grid, for πE* = 1 or πG = 1.
+    """The product x ↦ Fx on cells of a grid, for πE* = 1 (normal) or πG = 1 (shear).
 
-    cells : (k, 2) integers, place of each cell along x and along y
+    cells : (k, 2) indices of each cell along x and along y
     h : side of a cell
-    nu : Poisson's ratio for shear: two components per cell, consecutive in x;
-        None for normal forces, one component per cell
+    nu : Poisson's ratio for shear, with two consecutive components per cell; None for
+        normal forces, with one component per cell
     """
 
     def __init__(self, cells: NDArray[Any], h: float, nu: float | None) -> None:
@@ -93,8 +94,8 @@ class Influence:
         m0, m1 = int(i.max()) + 1, int(j.max()) + 1
         M0 = scipy.fft.next_fast_len(2 * m0 - 1, real=True)
         M1 = scipy.fft.next_fast_len(2 * m1 - 1)
-        # odd row length: at a distance that is a power of two, entries of a column
-        # compete for cache lines, and transforms along columns take 1.5 times as long
+        # odd row length: if rows are a power of two apart, entries of a column compete
+        # for cache lines, and transforms along columns take 1.5 times as long
         m1 |= 1
         self._period = M0, M1
         kernels = _kernels(cell_integrals(M0 // 2 + 1, M1 // 2 + 1), self._period, nu)
@@ -104,7 +105,7 @@ class Influence:
             [scipy.fft.rfft2(K, axes=(1, 0)).real / h for K in kernels]
         )
         self._shape = 1 if nu is None else 2, m0, m1
-        self._places = i * m1 + j  # in the grid of m0 × m1 cells around all cells
+        self._places = i * m1 + j  # in the bounding grid of m0 × m1 cells
 
     def __call__(self, x: Array) -> Array:
         """Multiply F by (n,) or (n, k)."""
@@ -115,8 +116,8 @@ class Influence:
         for c in range(components):
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
-        # along y in strips that stay in cache; half of each row is zero on input, and
-        # half of the output is not needed
+        # transform along y in strips that stay in cache; half of each row is zero on
+        # input, and half of the output is not required
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
@@ -151,7 +152,7 @@ class Influence:
 
     @property
     def least_eigenvalue(self) -> float:
-        """Lower bound of the eigenvalues of F: the least one of C, less rounding."""
+        """Lower bound of the eigenvalues of F: that of C, minus rounding errors."""
         least = greatest = self._symbol[0]
         if len(self._symbol) > 1:
             xx, yy, xy = self._symbol
@@ -163,7 +164,8 @@ class Influence:
 class NormalInfluence(Influence):
     """The product for normal forces, with a preconditioner.
 
-    Shear has no preconditioner: with discs, CG steps are few and M saves no products.
+    Shear has no preconditioner: with discs, few CG steps occur, and M saves no
+    products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
@@ -172,13 +174,13 @@ class NormalInfluence(Influence):
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ Mx = RᵀC⁻¹Rx, with the stiffness C⁻¹ of the periodic surface.
 
-        kind : "dirichlet", as M maps displacements of a surface to forces on it
-        scaling : not used, as each force acts on one cell only
+        kind : "dirichlet", because M maps displacements of a surface to forces on it
+        scaling : not used, because each force acts on one cell only
 
         Raises
         ------
         ValueError
-            For another kind.
+            For any other kind.
 
         """
         if kind != "dirichlet":
@@ -193,15 +195,15 @@ class NormalInfluence(Influence):
 def _kernels(
     integrals: CellIntegrals, period: tuple[int, int], nu: float | None
 ) -> list[Array]:
-    """Return periodic kernels (M0, M1): of F_n, or of the xx, yy and xy parts of F_t.
+    """Return periodic kernels (M0, M1) of F_n, or of the xx, yy and xy parts of F_t.
 
-    integrals : for distances up to half of the period
+    integrals : cell integrals for distances up to half the period
     """
     I_xx, I_yy, I_xy = integrals
     I_0 = I_xx + I_yy
     if nu is None:
         return [_extended(I_0, period)]
-    # half a period away an odd function jumps; no two cells are so far apart
+    # an odd function jumps at half a period, but no two cells are so far apart
     for axis, M in enumerate(period):
         if M % 2 == 0:
             np.moveaxis(I_xy, axis, 0)[M // 2] = 0
@@ -213,7 +215,7 @@ def _kernels(
 
 
 def _extended(quadrant: Array, period: tuple[int, int], *, odd: bool = False) -> Array:
-    """Extend a function from one quadrant; it is even, or odd in both x and y."""
+    """Extend a function from one quadrant to the period: even, or odd in x and in y."""
     lag_0, lag_1 = (np.arange(M) - M * (np.arange(M) > M // 2) for M in period)
     function: Array = quadrant[np.abs(lag_0)[:, None], np.abs(lag_1)]
     if odd:

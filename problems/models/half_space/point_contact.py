@@ -13,9 +13,9 @@ c ≤ r ≤ a slip while r < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2
     δ = 3μP(2 − ν)/(8Ga)·(1 − (c/a)²)
 
 where square roots of negative numbers count as zero, q acts along Q, and δ is the
-tangential displacement of distant points. This is exact for ν = 0. For ν > 0 slip is
-not quite parallel to q; the theory omits the small transverse tractions that would
-restore this.
+tangential displacement of distant points. The solution is exact for ν = 0. For ν > 0
+the slip is not exactly parallel to q; the theory neglects the small transverse
+tractions that would make it parallel.
 """
 
 from __future__ import annotations
@@ -87,5 +87,5 @@ class ShearedPointContact:
 
 
 def _root(s: Vector) -> Vector:
-    """Return √(1 − s²), zero beyond 1."""
+    """Return √(1 − s²), or zero for |s| > 1."""
     return np.asarray(np.sqrt(np.maximum(1 - s**2, 0)))

@@ -11,9 +11,9 @@ phases φ_k random; the surface does not depend on the grid at which it is evalu
 
 For a given seed, heights are identical on every machine and with every version of
 NumPy, with very rare exceptions. Phases are from `random.Random.random`, whose sequence
-for a seed Python guarantees. Sums of cosines may differ in their last bits, so heights
-are rounded to 2⁻²⁰ of their root mean square: of 10⁹ heights, about one is so close to
-the middle between two such values that it may be rounded the other way.
+for a seed Python guarantees. Sums of cosines may differ in their last bits. Heights are
+therefore rounded to multiples of 2⁻²⁰ of their root mean square. About one height in
+10⁹ is so close to the midpoint of two multiples that the rounding may still differ.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 
-#: Number of waves along L of the longest and the shortest component. On 64 × 64 cells
-#: the shortest wave spans two cells.
+#: numbers of waves along L of the longest and the shortest component; on 64 × 64 cells,
+#: the shortest wave spans two cells
 LONGEST, SHORTEST = 2, 32
 _DIGITS = 2.0**20  #: heights are multiples of rms/_DIGITS
 
 
 def rough_surface(x: Vector, hurst: float, seed: int) -> NDArray[np.float64]:
-    """Return heights (n, n) at the points (xᵢ, xⱼ), with a root mean square of one.
+    """Return heights (n, n) at the points (xᵢ, xⱼ).
 
-    The mean is over the whole square.
+    Their root mean square over the whole square is one.
 
-    x : (n,) coordinates in L
+    x : (n,) coordinates in units of L
     """
     k = np.arange(-SHORTEST, SHORTEST + 1)
-    # k and −k are the same wave: of each pair, the one first in this order is left out
+    # k and −k are the same wave: drop the first of each pair in this order
     i, j = (index.ravel() for index in np.meshgrid(k, k, indexing="ij"))
     squared = i**2 + j**2
     used = (squared >= LONGEST**2) & (squared <= SHORTEST**2)

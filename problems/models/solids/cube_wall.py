@@ -1,8 +1,8 @@
-"""A cube of hexahedra beside a rigid wall: PERMON's example of contact in space.
+"""A cube of hexahedra next to a rigid wall: PERMON's example of contact in space.
 
-The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and pressed down by 465
-Pa on its top. It bulges towards the wall, which requires u_x ≤ 1 mm on x = 1. Contact
-rows are simple bounds and need no linearisation. Clamped nodes have no row.
+The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and loaded by a pressure
+of 465 Pa on its top. It bulges towards the wall, which enforces u_x ≤ 1 mm on x = 1.
+Contact rows are simple bounds and require no linearisation. Clamped nodes have no row.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import box, dofs_of, nodal_areas
 
 MATERIAL = Material(E=2e4, nu=0.33)
-SIDE = 1.0  #: of the cube, m
-PRESSURE = 465.0  #: on the top, Pa
-GAP = 1e-3  #: between cube and wall, m
+SIDE = 1.0  #: side length of the cube, m
+PRESSURE = 465.0  #: pressure on the top, Pa
+GAP = 1e-3  #: gap between cube and wall, m
 FORCE = PRESSURE * SIDE**2  #: F₀, N
 WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 

@@ -1,22 +1,24 @@
 """Elastic spheres in contact, and Hertz's exact solution.
 
 A sphere is pressed onto a rigid plane, or onto an equal sphere. Each body is the part
-of a sphere around the contact, a quarter of a block of half width and height EXTENT·a
-with the sphere as its contact side. The planes x = 0 and y = 0 are planes of symmetry.
-The tractions on its other sides are those of a point force P at the origin of a
-half-space (Boussinesq; Johnson 1985, Section 3.2), from which those of Hertz's pressure
-differ by O((a/ρ)²), relatively. A whole sphere is not suitable: its overall
+of a sphere near the contact: a quarter of a block of half width and height EXTENT·a
+whose contact side is the sphere. The planes x = 0 and y = 0 are planes of symmetry. The
+tractions on the other sides are those of a point force P at the origin of a half-space
+(Boussinesq; Johnson 1985, Section 3.2); their relative difference from the tractions of
+Hertz's pressure is O((a/ρ)²). A whole sphere is not suitable, because its overall
 compression, which the theory neglects, is of order a/R, 6 % of the approach at 0.08.
 
 The upper body is supported by contact alone, so that the form ``dual-bounds`` does not
-exist. A support of the lower one along z has no reaction. The displacement far from the
-contact is that of the half-space minus the approach of distant points to the plane
-z = 0. It is measured at the side opposite the contact, and summed over the bodies.
+exist. A support of the lower body along z has no reaction. The displacement far from
+the contact is that of the half-space minus the approach of distant points to the plane
+z = 0. The approach is evaluated at the side opposite the contact and summed over the
+bodies.
 
-A force Q along x acts after P on two spheres of double width, of which only y = 0 is a
-plane of symmetry: Cattaneo and Mindlin's problem. Its tractions on the cut faces are
-those of a tangential point force (Cerruti; Johnson, Section 3.6). P acts first without
-friction, then Q with Coulomb's law; slip is measured from the end of the first.
+In Cattaneo and Mindlin's problem, a force Q along x acts after P on two blocks of
+double width, for which only y = 0 is a plane of symmetry. Its tractions on the cut
+faces are those of a tangential point force (Cerruti; Johnson, Section 3.6). P acts
+first, without friction, then Q with Coulomb's law; slip is measured from the state
+under P.
 
 The meshes of two spheres do not match: the lower one has n + 1 cells per a. Contact is
 linearised at the undeformed state, along normals that differ from the vertical by up to
@@ -73,7 +75,7 @@ from mortarbench.problems.models.half_space.point_contact import (
 )
 from mortarbench.problems.models.hertz import graded_points
 
-#: size of the block over a; 6 and 10 change a and p₀ by 0.1 %
+#: size of the block over a; values of 6 and 10 change a and p₀ by 0.1 %
 EXTENT = 4.0
 UNIFORM = 1.25  #: half width of the uniformly meshed part, in a
 #: largest a/R: the corner of the block is then at 0.71 R from the axis
@@ -87,16 +89,16 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 
 
 class _Block(NamedTuple):
-    """A body between its contact side and the rest of its half space."""
+    """A block cut from a half space around the contact."""
 
     mesh: Mesh
     cells: tuple[int, int, int]
     up: int  #: 1 above the plane z = 0, −1 below
-    copies: int  #: number of such blocks around the axis: 4, or 2 of double width
+    copies: int  #: number of blocks around the axis: 4, or 2 of double width
 
     @property
     def contact(self) -> Nodes:
-        """Faces of the sphere."""
+        """Faces on the sphere."""
         return self.mesh.boundaries["bottom" if self.up > 0 else "top"]
 
     @property
@@ -121,7 +123,7 @@ class _Block(NamedTuple):
 
     @property
     def axis(self) -> Nodes:
-        """Nodes on the axis, upwards."""
+        """Nodes on the axis, from bottom to top."""
         return np.flatnonzero((self.mesh.points[:, :2] == 0).all(axis=1))
 
 
@@ -132,7 +134,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     Raises
     ------
     InputError
-        When the contact is too large for the theory.
+        If the contact radius is too large for the theory.
 
     """
     p: Any = params
@@ -154,8 +156,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     pair = ContactPair(sides[0], sides[0][:0], GROUND)
     if len(blocks) == 2:
         pair = ContactPair(*sides)
-        # supports of the lower block without reactions: along z, and for a block of
-        # double width also along x and about y
+        # supports of the lower block without reactions: against motion along z, and for
+        # a block of double width also along x and about y
         axis = blocks[1].axis + first[1]
         fixed.append(dofs_of(axis[:1], 3, 2))
         if p["Q"]:
@@ -224,7 +226,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
 
 def _exact(params: Mapping[str, Value]) -> PointContact:
-    """Return Hertz's solution: 1/R and 1/E* are sums over the elastic bodies."""
+    """Return Hertz's solution, with 1/R and 1/E* summed over the elastic bodies."""
     p: Any = params
     bodies = len(NAMES[p["against"]])
     modulus = p["E"] / (1 - p["nu"] ** 2)
@@ -236,8 +238,9 @@ def _programme(
 ) -> tuple[Stage, ...]:
     """Return the stages of a tangential load: P without friction, then P and Q.
 
-    In the first stage, supports on the axis of the upper block keep it from sliding and
-    rolling; by symmetry they have no reactions. Slip is measured from its end.
+    In the first stage, supports on the axis of the upper block prevent sliding and
+    rolling; by symmetry they have no reactions. Slip is measured from the end of this
+    stage.
     """
     upright = dofs_of(axis[[0, -1]], 3, 0)
     return (
@@ -267,9 +270,9 @@ def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
 
 
 def _near(block: _Block, half_width: float) -> Nodes:
-    """Return the faces of the sphere that may touch, within a half width.
+    """Return the contact faces within a half width.
 
-    Those below the slave also contain the faces at the edge of this region.
+    On the lower body, the faces at the edge of this region are included.
     """
     reach = np.abs(block.mesh.points[block.contact][..., :2])
     within = reach <= half_width * (1 + 1e-9)
@@ -284,18 +287,19 @@ def _far_forces(
 ) -> Forces:
     """Return the nodal forces of the rest of the half space that balance a point force.
 
-    The point force on the block at the origin is 1 along z, away from the contact, or
-    along x, on the upper block towards −x. The forces on the far sides are the
-    tractions of its stress. They are scaled, and forces along z on the opposite side
-    are added, so that the resultant and the moment about y vanish also with quadrature
-    and with the curved side.
+    The point force on the block at the origin is a unit force along z, away from the
+    contact, or along x (towards −x on the upper block). The forces on the far sides
+    follow from the tractions of its stress. They are scaled, and forces along z on the
+    opposite side are added, so that the resultant and the moment about y vanish despite
+    quadrature errors and the curved side.
     """
     mesh, mirror = block.mesh, np.array([1, 1, block.up])
     forces, faces = np.zeros_like(mesh.points), block.far
     corners = mesh.points[faces]
     for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
         N, slopes = QUAD.shapes(xi), QUAD.gradients(xi)
-        normal = np.cross(*np.einsum("ar,fax->rfx", slopes, corners))  # times area
+        # normals times area
+        normal = np.cross(*np.einsum("ar,fax->rfx", slopes, corners))
         at = mirror * np.einsum("a,fax->fx", N, corners)
         traction = mirror * np.einsum("fij,fj->fi", stress(at), mirror * normal)
         np.add.at(forces, faces, weight * N[:, None] * traction[:, None])
@@ -326,7 +330,7 @@ def _approach(
 ) -> float:
     """Return the approach of distant points of a body to z = 0, m.
 
-    It is the mean over the side opposite the contact.
+    The approach is averaged over the side opposite the contact.
     """
     nodes, shares = nodal_areas(block.mesh.points, block.opposite)
     # displacement under a point force on a half space, relative to distant points
@@ -339,7 +343,7 @@ def _approach(
 def point_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
     """Return the stress (k, 3, 3) at x (k, 3) under a unit force along z at the origin.
 
-    The half space is z ≥ 0, and x are not on its surface's axis (Johnson, 3.19).
+    The half space is z ≥ 0, and no point x is on the z axis (Johnson, 3.19).
     """
     r, z, rho = np.hypot(x[:, 0], x[:, 1]), x[:, 2], np.linalg.norm(x, axis=1)
     radial = x * [1, 1, 0] / r[:, None]
@@ -385,9 +389,10 @@ def _settlement(x: NDArray[np.float64], material: Material) -> Vector:
 def _quantities(
     solution: ContactSolution, exact: PointContact, copies: int
 ) -> dict[str, Any]:
-    """Compare the pressure with Hertz's; forces and areas are of the full sphere.
+    """Compare the pressure with Hertz's; forces and areas are those of full spheres.
 
-    contact_radius: √(5∫pr²dA/2P), exact for Hertz's pressure, m. Errors are relative.
+    `contact_radius` is √(5∫pr²dA/2P) in m, which is exact for Hertz's pressure. Errors
+    are relative.
     """
     bodies, primal, s, _ = solution.sides
     (side,) = contact_sides(*solution.sides)
@@ -405,7 +410,7 @@ def _quantities(
         friction = copies * side.friction_force.sum(axis=0) * [1, 0, 1] + 0.0
         pair["friction_force"] = friction.tolist()
     return {
-        # the force on the master, on the slave if the master is rigid
+        # force on the master, or on the slave if the master is rigid
         "contact_force": list(forces.values())[-1],
         "multiplier_sum": float(copies * s.z[: primal.h.size].sum() * bodies.force),
         "contacts": {name: pair},
@@ -420,12 +425,12 @@ def _quantities(
 def _shear_quantities(
     solution: ContactSolution, exact: ShearedPointContact, copies: int
 ) -> dict[str, Any]:
-    """Compare stick and tangential force with Cattaneo and Mindlin's; full sphere.
+    """Compare stick zone and tangential force of full spheres with the exact solution.
 
-    tangential_force: along x on the lower sphere, N. stick_radius: of a disc with the
-    area of the sticking nodes, m; nodes stick as a whole. c_over_a: over the
-    exact contact radius. c_over_a_moment: from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), exact for
-    Cattaneo and Mindlin's q.
+    `tangential_force` is the force along x on the lower sphere in N; `stick_radius` is
+    that of a disc with the area of all sticking nodes in m; `c_over_a` is the stick
+    radius over the exact contact radius; `c_over_a_moment` follows from
+    ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which is exact for Cattaneo and Mindlin's q.
     """
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None

@@ -486,29 +486,29 @@ def small_bodies(K, f):
     )  # fmt: skip
 
 
-def test_what_rounding_leaves_is_that_of_forces_within_cells(equilibrium):
-    """2 eps |K||u| of the load; here |K||u| = (8, 8), of which the second is held."""
+def test_rounding_is_bounded_by_that_of_forces_within_cells(equilibrium):
+    """2 eps |K||u| relative to the load; here |K||u| = (8, 8), the second fixed."""
     K = np.array([[2.0, -2.0], [-2.0, 2.0]])
     bodies = small_bodies(K, [0.25, 7.0])
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
     rows = SimpleNamespace(B=csr_array((0, 2)), place=np.zeros(0, dtype=int))
     at = SimpleNamespace(u=np.array([1.0, -3.0]), rows=rows)
     posed = SimpleNamespace(tangent=bodies, load_factor=2.0)
-    found = path._rounding(at, np.zeros(0), posed)
-    assert found == pytest.approx(2 * np.finfo(float).eps * 8 / 0.5, rel=1e-12, abs=0)
+    bound = path._rounding(at, np.zeros(0), posed)
+    assert bound == pytest.approx(2 * np.finfo(float).eps * 8 / 0.5, rel=1e-12, abs=0)
 
 
 @pytest.mark.parametrize(
     ("load", "factor", "share"), [(1e-7, 0.5, 16 / 0.5e-7), (0.0, 0.5, 16)]
 )
-def test_rounding_is_told_as_its_share_of_the_load(load, factor, share, monkeypatch):
-    """Cells of size 2 and |K|·1 = (8, 8), of which the second is held."""
+def test_advice_states_rounding_relative_to_the_load(load, factor, share, monkeypatch):
+    """Cells of size 2 and |K|·1 = (8, 8), the second component fixed."""
     monkeypatch.setattr(newton, "TOLERANCE", 1e-16)
     bodies = small_bodies(np.array([[4.0, -4.0], [-4.0, 4.0]]), [load, 7.0])
     cells = SimpleNamespace(volumes=np.array([[3.0, 1.0], [2.0, 2.0]]))
     path = newton.NewtonPath(bodies=bodies, cells=cells, gaps=None, reference=None)
     left = 2 * np.finfo(float).eps * share
-    assert f"leaves {left:.0e} of the forces" in path._advice(factor)
+    assert f"rounding error of the forces is {left:.0e}" in path._advice(factor)
     monkeypatch.setattr(newton, "TOLERANCE", 1.01 * left)
     assert path._advice(factor).startswith("a smaller load")
 
@@ -632,7 +632,7 @@ def test_rotations_either_way_are_rotations(monkeypatch, sign):
     monkeypatch.setattr(newton, "null_space", turned)
     bodies = replace(bodies, B_D=rows)
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
-    with pytest.raises(InputError, match="supports leave body 'beam' to rotate"):
+    with pytest.raises(InputError, match="supports allow body 'beam' to rotate"):
         path.iterations(1)
 
 
@@ -728,7 +728,7 @@ def test_supports_that_leave_a_rotation_are_refused():
     one_node = np.unique(bodies.B_D.indices)[:2]
     rows = csr_array(eye_array(bodies.mesh.dofs, format="csr")[one_node])
 
-    with pytest.raises(InputError, match="supports leave body 'beam' to rotate"):
+    with pytest.raises(InputError, match="supports allow body 'beam' to rotate"):
         newton.free_translations(replace(bodies, B_D=rows))
 
 
