@@ -1,14 +1,13 @@
-"""Solution for given closed rows in extended precision, and the exchange of rows.
+"""Solution for given closed rows in extended precision, and exchange of closed rows.
 
 For a set A of closed rows, displacement and multipliers solve linear equations,
 
     K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,   λ_N prescribed elsewhere,
 
-refined with residuals in extended precision. A row is closed, or its multiplier is on
-the boundary of Λ: that of an open contact is zero; friction sticks, or slips with
-‖λ‖ = g. As in a primal-dual active set method, rows are exchanged
-whose multiplier leaves Λ, or whose motion contradicts its multiplier (a negative gap),
-until there are none.
+and are refined with residuals in extended precision. A row that is not closed has its
+multiplier on the boundary of Λ: an open contact has λ = 0, and slip has ‖λ‖ = g. As in
+a primal-dual active set method, rows are exchanged whose multiplier leaves Λ, or whose
+motion contradicts its multiplier (a negative gap), until no such row is left.
 """
 
 from __future__ import annotations
@@ -33,18 +32,18 @@ MAX_EXCHANGES = 60  #: largest number of exchanges of active sets
 REFINEMENTS = 6
 
 States = NDArray[np.int8]  #: (m,) state of each row
-#: multiplier at its lower bound, free, at its upper bound; that of a friction vector
-#: with several rows is UPPER anywhere on its circle
+#: States: multiplier at its lower bound, row closed (multiplier free), multiplier at
+#: its upper bound. A friction vector of several rows is UPPER anywhere on its circle.
 LOWER, CLOSED, UPPER = -1, 0, 1
 
 _EPS = Real(np.finfo(Real).eps)
 
 
 class ActiveSet(NamedTuple):
-    """States of the rows, and the multipliers of those that are not closed."""
+    """States of the rows, and the multipliers of rows that are not closed."""
 
     states: States
-    limits: Extended  #: (m,) on the boundary of Λ where a row is not closed
+    limits: Extended  #: (m,) on the boundary of Λ for rows that are not closed
 
     @property
     def closed(self) -> NDArray[np.bool_]:
@@ -57,10 +56,10 @@ class ActiveSet(NamedTuple):
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
-    """Solve  K u = force  with u = 0 on fixed components.
+    """Solve K u = force with u = 0 on fixed components.
 
-    Returns u in extended precision, without rigid motion, and the energy norm of its
-    error, √(rᵀK⁺r) with the residual r.
+    Returns u (n,) in extended precision, without rigid motion, and the energy norm
+    √(rᵀK⁺r) of its error, where r is the residual.
     """
     K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
@@ -71,14 +70,14 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
         step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
-    return u - step, left  # the u that the last residual belongs to
+    return u - step, left  # the u for which the last residual was computed
 
 
 def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
-    """Guess the states from the displacement without contact: violated rows close.
+    """Guess the states from the displacement without contact: violated rows are closed.
 
-    If only contact supports a body, all rows are guessed to be closed. Friction rows
-    are guessed to stick.
+    If only contact supports a body, all rows are assumed closed. Friction rows are
+    assumed to stick.
     """
     exact = mechanics.exact
     none = np.zeros(exact.c.size, dtype=Real)
@@ -90,10 +89,10 @@ def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
 
 
 def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
-    """Guess states from a pair: closed where λ + v/D is inside Λ, with v = Bu − c.
+    """Guess the states from a pair: rows with λ + v/D inside Λ are closed.
 
-    D is the compliance of the row; this is the prediction of a primal-dual active set
-    method.
+    v = Bu − c, and D is the compliance of the row. A primal-dual active set method
+    predicts its next active set by the same rule.
     """
     return predicted(exact.forces, multipliers, exact.compliance, exact.motion(u))
 
@@ -101,9 +100,9 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
 def predicted(
     forces: AdmissibleForces, multipliers: Any, softness: Any, v: Any
 ) -> ActiveSet:
-    """Return the states (m,) for λ + v/D: closed inside Λ, on its boundary beyond.
+    """Return the states (m,): closed if λ + v/D is inside Λ; its projection otherwise.
 
-    softness : (m,) D ≥ 0
+    softness : (m,) compliances D ≥ 0 of the rows
     """
     discs = forces.discs
     states = np.where(multipliers * softness <= -v, LOWER, CLOSED)
@@ -112,7 +111,7 @@ def predicted(
     push = multipliers[discs.index] * soft + v[discs.index]
     size = norms(push)[:, None]
     slips = size >= discs.radius[:, None] * soft
-    # without any push, the direction is that of λ
+    # if λ + v/D gives no direction, that of λ is used
     limits[discs.index] = np.where(
         size > 0,
         push / np.where(size > 0, size, 1) * discs.radius[:, None],
@@ -134,9 +133,9 @@ def exchanged(
 ) -> tuple[Extended, Extended, ActiveSet]:
     """Exchange rows, starting from a guess; return u (n,), multipliers (m,), the set.
 
-    Vectors that slip keep the direction of their limits. If a set recurs, or after
-    `rounds` sets, the last one is returned. It need not be optimal: a certificate
-    decides.
+    Friction vectors that slip keep their direction. If a set recurs, or after `rounds`
+    exchanges, the last set is returned. It need not be optimal; a certificate has to
+    bound its error.
     """
     exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):
@@ -152,7 +151,7 @@ def exchanged(
 def _next(
     exact: Exact, active: ActiveSet, u: Extended, lam: Extended
 ) -> ActiveSet | None:
-    """Exchange the rows of a solution that violate a condition; None without any."""
+    """Exchange the rows that violate a condition; return None if no row does."""
     v, discs = exact.motion(u), exact.forces.discs
     rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
     force = 1e4 * _EPS * np.abs(lam).max(initial=Real(0))
@@ -174,7 +173,7 @@ def _next(
 
 
 def _solved(mechanics: Mechanics, active: ActiveSet) -> tuple[Extended, Extended]:
-    """Solve with equality on the closed rows: u (n,) and multipliers (m,)."""
+    """Solve with equality on the closed rows; return u (n,) and multipliers (m,)."""
     exact, motions, closed = mechanics.exact, mechanics.motions, active.closed
     R = motions.felt
     close = closing(mechanics, closed)

@@ -1,7 +1,7 @@
-"""Admissible pairs near an answer: no penetration, and forces in balance.
+"""Admissible pairs near an answer: no penetration, and forces in equilibrium.
 
-It does not suffice to move slave nodes alone until nothing penetrates: end nodes of an
-arc may be prescribed, and a mortar row couples several nodes.
+Moving slave nodes alone cannot remove every penetration: end nodes of an arc may be
+prescribed, and a mortar row couples several nodes.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from mortarbench.harness.qp import Vector
 from mortarbench.harness.sets.blocks import norms
 
 MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
-#: number of rows up to which F_VV is formed; for more rows it is only applied
+#: Largest number of rows for which F_VV is assembled. For more rows, CG applies it.
 MAX_DENSE_ROWS = 2000
-#: Singular values of √W G below this fraction of the largest belong to floating
-#: motions.
+#: A combination of rigid motions counts as floating if its singular value in √W G is
+#: below this fraction of the largest one.
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of its absolute terms.
@@ -56,8 +56,9 @@ def admissible(
 ) -> Extended | None:
     """Return û near u with Bû ≤ c and equality on the rows `closed`, or None.
 
-    û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα is the nearest point in the
-    energy norm with equality on the rows V; V is extended until Bû ≤ c.
+    û is the point nearest to u in the energy norm that satisfies the rows V with
+    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Initially V holds
+    the rows `closed`. It is extended until Bû ≤ c.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
@@ -68,7 +69,7 @@ def admissible(
 
 
 class _Rows(NamedTuple):
-    """Rows  Bu ≤ c  of contact, and rows of friction, which do not constrain u."""
+    """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
 
     B: Any  #: (m, n), extended
     c: Extended  #: (m,)
@@ -79,7 +80,7 @@ class FeasiblePoint(NamedTuple):
     """A displacement that satisfies all contact rows."""
 
     u: Extended
-    theta: Any = Real(1)  #: factor of the whole displacement if it had to be scaled
+    theta: Any = Real(1)  #: factor θ ≤ 1 by which the displacement was scaled
 
 
 def _feasible_near(
@@ -90,19 +91,20 @@ def _feasible_near(
 ) -> FeasiblePoint | None:
     """Move u into the feasible set, with equality on the rows V.
 
-    V holds the closed rows, the violated ones, and those that corrections violate. The
-    target is inside by some units in the last place, so that no rounding of Bu hides a
-    violation. If the rounds do not end, θu with θ < 1 is feasible provided that c ≥ 0.
-    Rows of friction belong to V only if they are closed, that is, stick.
+    V starts with the closed and the violated rows; rows that a correction violates are
+    added. Corrections aim a few units in the last place inside the feasible set, so
+    that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds do not suffice,
+    θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction rows belong to V
+    only if they are closed, that is, if they stick.
 
-    nearest : returns, for rows V, the map from excesses t (v,) to a δ with B_V δ = −t
+    nearest : returns, for rows V, the map from violations t (v,) to δ with B_V δ = −t
     """
     B, c, contact = rows
     enforced = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(MAX_ROUNDS):
         gap = c - B @ moved
-        size = np.abs(moved).max(initial=Real(0))  # of the terms of the correction
+        size = np.abs(moved).max(initial=Real(0))  # bounds the terms of the correction
         reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
         margin = _EPS * (reach + 16 * np.abs(c))
         required = enforced | closed | (contact & (gap < 0))
@@ -124,14 +126,14 @@ def _feasible_near(
 
 
 def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
-    """Return θu with the largest θ ≤ 1 for which Bθu ≤ c holds in spite of rounding."""
+    """Return θu with the largest θ ≤ 1 such that Bθu ≤ c holds despite rounding."""
     B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
         return None
     reach = B @ u
     beyond = reach > c
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
-    for _ in range(8):  # the product may be rounded outwards
+    for _ in range(8):  # rounding may leave Bθu > c: reduce θ again
         if not (B @ (theta * u) > c).any():
             return FeasiblePoint(np.asarray(theta * u), theta)
         theta = theta * (1 - 8 * _EPS)
@@ -141,7 +143,7 @@ def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
 def _nearest(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
-    """Return the map from t (v,) to the δ with B_V δ = −t of least energy norm."""
+    """Return the map from t (v,) to the δ of least energy norm with B_V δ = −t."""
     B_V = mechanics.rows[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
     felt = mechanics.motions.felt.astype(np.float64)
@@ -160,18 +162,20 @@ def feasible_at_rows(
     u: Extended,
     closed: NDArray[np.bool_],
 ) -> FeasiblePoint | None:
-    """Find a feasible point as `_feasible_near`, moving only components of the rows.
+    """Find a feasible point, moving only components on which the rows depend.
+
+    The algorithm is that of `_feasible_near`.
 
     Parameters
     ----------
-    exact : exact data whose columns of B are the components (w,) that the rows touch
-    R : (w, p) rigid motions that contact feels, which cost no energy
+    exact : exact data whose columns of B are the w components in the rows
+    R : (w, p) rigid motions that change gaps; they cost no energy
     softness : (w,) 1/Kᵢᵢ, zero at prescribed components
     u : (w,)
 
     Returns
     -------
-    (w + p,) the displacement of these components, and the coefficients of R in it
+    (w + p,) displacement of these components, followed by the coefficients of R in it
 
     """
     none = csr_array((exact.c.size, R.shape[1]))
@@ -184,10 +188,10 @@ def feasible_at_rows(
 def _nearest_at_rows(
     B: csr_array, R: NDArray[np.float64], softness: Vector, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
-    """Return the map from t to (δ + Rα, α) with  B_V(δ + Rα) = −t  and least δ.
+    """Return the map from t to (δ + Rα, α) with B_V(δ + Rα) = −t and least δ.
 
-    The norm of δ is that of diag(1/softness), infinite at prescribed components; α is
-    not part of it.
+    The norm of δ is that of diag(1/softness), infinite at prescribed components. The
+    rigid motion Rα does not count.
     """
     B_V = csr_array(B[np.flatnonzero(rows)])
     moved = csr_array((B_V * softness).T)
@@ -209,16 +213,17 @@ def _nearest_at_rows(
 def closing(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector, Vector], tuple[Vector, Vector]]:
-    """Return the solve for multipliers μ and rigid motions α that close the rows V.
+    """Return the solver for multipliers μ and rigid motions α that close the rows V.
 
     ::
 
         F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
-    for excesses t (v,) and loads e (p,) along the motions R that contact feels; α = 0
-    for motions that the rows V do not feel. F_VV may be singular, since K⁺ is zero on
-    fixed components. It is therefore replaced by F_VV + ρUUᵀ, where U spans G_V. Rows
-    are scaled to similar compliance, since bodies may be of very different stiffness.
+    for violations t (v,) and loads e (p,) along the motions R that change gaps. α is
+    zero along motions that do not change the gaps of the rows V. F_VV may be singular,
+    since K⁺ is zero on fixed components; it is therefore replaced by F_VV + ρUUᵀ,
+    where U spans the range of G_V. Rows are scaled to similar compliance, since the
+    stiffness of bodies may differ by orders of magnitude.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
@@ -246,10 +251,10 @@ def closing(
 def _compliance(
     mechanics: Mechanics, B_V: Any, U: NDArray[np.float64]
 ) -> Callable[[Vector], Vector]:
-    """Return the solve with F_VV + ρUUᵀ: Cholesky, or CG for very many rows.
+    """Return the solver for F_VV + ρUUᵀ: Cholesky, or CG beyond MAX_DENSE_ROWS rows.
 
     The matrix may be singular up to rounding, so its diagonal is shifted in the last
-    digits; the next round of the caller corrects the resulting error. CG is
+    digits; the next round of `_feasible_near` corrects the resulting error. CG is
     preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
@@ -274,13 +279,13 @@ def _compliance(
 
 
 def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
-    """Return λ̂ near `multipliers` in balance with the load and û; see `Balance.near`.
+    """Return λ̂ near `multipliers` in equilibrium with the load; see `Balance.near`.
 
     Raises
     ------
     UncertifiableError
-        When there is a load along a motion that contact does not feel, or along one
-        that only tensile contact forces could balance.
+        When a rigid motion carries a load that contact cannot balance: the motion does
+        not change any gap, or only tensile contact forces could balance the load.
 
     """
     exact, motions = mechanics.exact, mechanics.motions
@@ -302,22 +307,23 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if the load along any motion that contact does not feel is nonzero.
+    """Return True if the load along a motion that leaves all gaps unchanged is nonzero.
+
+    Loads up to their rounding count as zero.
 
     Parameters
     ----------
     along, terms : (q,) load along each motion, and the sum of its absolute terms
-    most : (q,) the same sum, with every entry of the motion replaced by its largest
-        entry
+    most : (q,) sum of the absolute loads times the largest entry of each motion
 
     """
     return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
 
 
 def driven(pushed: Extended, names: Sequence[str]) -> str:
-    """Return the message for a load that nothing balances.
+    """Return the error message for a load that neither contact nor supports balance.
 
-    pushed : (r,) load along the rigid motions of the bodies, in turn
+    pushed : (r,) load along the rigid motions, body by body
     """
     most = int(np.abs(pushed).argmax()) if pushed.size else 0
     per_body = pushed.size // len(names) if names else 1
@@ -331,7 +337,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
 
 def relative(multipliers: Extended) -> Extended:
-    """Divide by the largest multiplier; return ones if none is positive."""
+    """Divide by the largest multiplier; return ones if no multiplier is positive."""
     largest = multipliers.max(initial=Real(0))
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
@@ -339,10 +345,11 @@ def relative(multipliers: Extended) -> Extended:
 def supported_and_floating(
     G: Extended, w: Extended
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split motions (p,) into those that rows of weights w ≤ 1 support, and the others.
+    """Split the space of rigid motions (p,) into supported and floating ones.
 
-    Returns orthonormal bases (p, h) and (p, p − h); in the second, ‖√w Gν‖ is at most
-    SUPPORT_THRESHOLD times its maximum.
+    A motion ν is supported if the rows with weights w ≤ 1 resist it. Returns
+    orthonormal bases (p, h) of supported and (p, p − h) of floating motions. On the
+    latter space, ‖√w Gν‖ is at most SUPPORT_THRESHOLD times its maximum.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
@@ -351,26 +358,26 @@ def supported_and_floating(
 
 
 class Balance(NamedTuple):
-    """The equations Gᵀλ = load − bent of balance, with the sizes of their terms.
+    """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    They are  Rᵀ(f − Bᵀλ − Ku) = 0  for the rigid motions R that contact feels.
+    They state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
     """
 
     G: Extended  #: (m, p)  BR
     G_terms: Extended  #: (m, p) sums of the absolute terms of G
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of its absolute terms
-    bent: Extended  #: (p,)  (KR)ᵀu
+    bent: Extended  #: (p,) (KR)ᵀu, nonzero only by rounding
     forces: AdmissibleForces  #: Λ
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
         λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
-        boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections must not act across
-        wide gaps or against slip, where they would do work. Along motions that λ does
-        not support (`supported_and_floating`), the load has to vanish up to its
-        rounding; otherwise all rows contribute, in the last attempt with equal weights.
+        boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections across wide gaps or
+        against slip would do work. Along motions that λ does not support
+        (`supported_and_floating`), the load must vanish up to rounding; otherwise all
+        rows receive corrections, with equal weights in the last attempt.
 
         Raises
         ------
@@ -394,9 +401,9 @@ class Balance(NamedTuple):
         )
 
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
-        """Solve with corrections of the rows with w > 0; None if that is impossible.
+        """Solve with corrections of the rows with w > 0; return None if that fails.
 
-        λ̂ is the projection of λ + WGν on Λ, where ν minimises a convex function with
+        λ̂ is the projection of λ + WGν onto Λ, where ν minimises a convex function with
         one variable per motion.
         """
         supported, floating = supported_and_floating(self.G, w)
@@ -420,7 +427,7 @@ class Balance(NamedTuple):
 
 
 def _whitening(M: Extended) -> NDArray[np.float64]:
-    """Return X (h, h) such that MX has orthonormal columns, for M of full rank."""
+    """Return X (h, h) such that MX has orthonormal columns; M has full column rank."""
     _, sizes, turn = np.linalg.svd(M.astype(np.float64), full_matrices=False)
     return np.asarray(turn.T / sizes)
 
@@ -433,10 +440,10 @@ def _newton(
     load: Extended,
     terms: Callable[[Extended], Extended],
 ) -> Extended | None:
-    """Solve the equations of `Balance` for GᵀWG = I; None if that is impossible.
+    """Solve the equilibrium equations, scaled to GᵀWG = I; return None on failure.
 
-    Damped Newton's method for the dual function of `Balance.near`. Rows with w = 0 keep
-    their multipliers.
+    This is damped Newton's method for the dual function of `Balance.near`. Rows with
+    w = 0 keep their multipliers.
     """
     on = w > 0
 
@@ -453,7 +460,7 @@ def _newton(
         if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
         hessian = _curvature(forces, free, w, G).astype(np.float64)
-        # it is singular where all rows of a motion are at their bounds; GᵀWG = I
+        # singular if all rows of a motion are at bounds; GᵀWG = I scales the shift
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):
@@ -468,9 +475,10 @@ def _newton(
 def _curvature(
     forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
 ) -> Extended:
-    """Return GᵀW Π'(λ) G (p, p) for the projection Π on Λ at free multipliers λ (m,).
+    """Return GᵀWΠ'(λ)G (p, p), with the projection Π onto Λ at the trial point λ (m,).
 
-    Π' is the identity inside, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc.
+    Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
+    radius g.
     """
     discs = forces.discs
     at, size = free[discs.index], norms(free[discs.index])

@@ -1,4 +1,4 @@
-"""Proven bound of the error of an answer, independent of its origin and claim.
+"""Proven bound of the error of an answer, whatever solver it comes from.
 
 Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the equilibrium
 under λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
@@ -13,44 +13,44 @@ solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
-Friction with a bound, Σ g‖v‖ with the slip v = Tu − s, has multipliers ‖λ̂_t‖ ≤ g and
-adds nonnegative terms to (1): Σ(g‖v*‖ − λ̂_tᵀv*) and Σ(g‖v̂‖ − λ_t*ᵀv̂) on the left, and
-on the right Σ(g‖v̂‖ − λ̂_tᵀv̂), the difference between the frictional work at the bound
-and that of λ̂_t. For Coulomb's law the bounds g are fixed: the certificate is for the
-last Tresca problem of the fixed point iteration.
+Friction with bounds g adds the work Σ g‖v‖ of the slip v = Tu − s to the energy. Its
+multipliers satisfy ‖λ̂_t‖ ≤ g. In (1) this adds the nonnegative terms Σ(g‖v*‖ −
+λ̂_tᵀv*) and Σ(g‖v̂‖ − λ_t*ᵀv̂) on the left. On the right it adds Σ(g‖v̂‖ − λ̂_tᵀv̂),
+the frictional work at the bound less that of λ̂_t. For Coulomb's law, g is fixed: the
+certificate holds for the last Tresca problem of the fixed point iteration.
 
-(g is not computed as J − D: they agree to as many digits as the answer has, and the
-difference would lose everything below 1e-8.) For any other point u, the midpoint M of û
-and u_λ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2), hence
+(g is not computed as J − D: the two agree to as many digits as the answer has, and
+their difference would be rounding below 1e-8.) For any other point u, the midpoint M of
+û and u_λ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2), hence
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
 where the right-hand side is at most √(2g) if u is û or u_λ.
 
-Errors are relative to ‖u*‖, for which (3) gives the lower bound ‖M‖ less the root. That
-differs from ‖û‖ only for answers whose error is as large as the solution.
+Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ less the root in (3).
+This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
 
-If contact alone supports a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
-its rigid motions R, or D(λ̂) = −∞. Then ‖·‖ is a seminorm, that of v − RRᵀv, and the
-rigid motion itself is not bounded. Motions that contact does not feel (BR = 0 up to
-rounding), or on which λ̂ does not act, are disregarded, and so is the rounding of K and
-f along them.
+If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
+rigid motions R; otherwise D(λ̂) = −∞. Then ‖·‖ is a seminorm, that of v − RRᵀv, and the
+error of the rigid motion itself is not bounded. Motions that do not change any gap
+(BR = 0 up to rounding), or that λ̂ does not support, are disregarded, and so is the
+rounding of K and f along them.
 
-The bounds are evaluated for the stored K = TᵀK_T T + E, with one subdomain or more, see
-`harness.verify.substructured`. With e = û − u* = e' + Rγ, ρ = Kû − f + Bᵀλ̂, any d, and
-u_λ = Tû − d, (1) becomes, (R2) of docs/certificates.md,
+The bounds are evaluated for the stored K = TᵀK_T T + E, with one or more subdomains;
+see `harness.verify.substructured`. With e = û − u* = e' + Rγ, ρ = Kû − f + Bᵀλ̂, any d,
+and u_λ = Tû − d, (1) becomes, by (R2) of docs/certificates.md,
 
     ‖Te‖² + ‖Te − d‖² + 2λ̂ᵀ(c − Bu*) + 2λ*ᵀ(c − Bû)
         = ‖d‖² + 2λ̂ᵀ(c − Bû) + 2eᵀ(ρ − TᵀK_T d) − 2eᵀEe                          (4)
 
-where the last two terms are rounding: (R3) bounds them by ‖e'‖ and γ, and (R4) bounds γ
-by the contact conditions.
+where the last two terms are rounding. Inequality (R3) bounds them by ‖e'‖ and γ, and
+(R4) bounds γ by the contact conditions.
 
-Without a stiffness behind P, such as on half-spaces, a proven lower bound μ > 0 of the
-eigenvalues of P replaces it. Let x̂ be in the product S of the sets, z normal to S at
-x̂, and r = Px̂ + q + z. The solution x* over S, without rows, satisfies
-(Px* + q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0. The sum of both inequalities is
-‖x̂ − x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
+If P does not stem from a stored stiffness, as on half-spaces, a proven lower bound μ >
+0 of its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at
+x̂, and r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies (Px* +
+q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. Their sum is ‖x̂ − x*‖²_P ≤
+rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
     ‖x̂ − x*‖_P ≤ ‖r‖/√μ                                                          (5)
 """
@@ -91,30 +91,30 @@ from mortarbench.harness.verify.substructured import (
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
-#: Largest residual of a combination of rows that has to equal a rigid motion.
+#: Largest residual of a combination of contact rows that has to equal a rigid motion.
 COMBINATION_RESIDUAL = 1e-9
 #: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: its error grows like the
 #: logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002, Theorem
 #: 24.2, with errors of the weights of 2⁻⁵³).
 PRODUCT_ROUNDING = 2.0**-46
-#: Factor by which an estimate of ‖P‖ by power iteration is at most too low.
+#: Factor by which power iteration may underestimate ‖P‖.
 POWER_ITERATION_FACTOR = 2.0
-#: A pair with less work than this times the distance squared counts as sharp: without
-#: any work, the bound √(d² + 2·work) would be 5 % smaller.
+#: A pair is sharp if its work is less than this times the squared distance: without
+#: work, the bound √(d² + 2·work) would decrease by only 5 %.
 SHARP_WORK = 0.05
-SHARP_BOUND = 1e-7  #: bound below which no other pair is tried
-#: Largest bound for which the closed rows are those of the answer: beyond, a solution
-#: for these rows would describe another point.
+SHARP_BOUND = 1e-7  #: bound below which no further pair is tried
+#: Largest bound for which the closed rows are taken from the answer. With a larger
+#: error, a solution for these rows may be far from the answer.
 MAX_EXCHANGE_BOUND = 1e-3
-#: rounds of exchanges that lead from the closed rows of the answer to a better pair
+#: Largest number of exchanges of closed rows in search of a better pair.
 EXCHANGE_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate:
-    """An admissible pair near an answer, and the bounds that it proves.
+    """An admissible pair (û, λ̂) near an answer, and the bounds that it proves.
 
-    All norms are ‖·‖_K, non-dimensional; see the module for the mathematics.
+    All norms are the non-dimensional ‖·‖_K. The module derives equations (1) to (5).
     """
 
     u: Extended  #: û (n,)
@@ -124,12 +124,12 @@ class Certificate:
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: the second term of `work`
-    rounding: float  #: charge in (4) for KR ≠ 0 and an inexact balance
+    rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
     stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, with the norm of K_T
     claimed: float  #: bound (3) of the answer itself
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if a body can move rigidly, which is not bounded
+    seminorm: bool  #: True if a body can move rigidly; that motion is not bounded
 
     @property
     def equilibrium(self) -> Extended:
@@ -216,13 +216,13 @@ class EigenvalueCertificate(NamedTuple):
 
 @np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
-    """Bound the error of x over convex sets by an eigenvalue of P, see (5).
+    """Bound the error of x over convex sets by an eigenvalue of P, with (5).
 
-    x̂ is a projected gradient step, Π(t) with t = x − (Px + q)/L, and z = L(t − x̂),
-    which is normal at x̂ for any L > 0: multipliers of the answer are not used. Where
-    rounding leaves ‖x̂_I‖ = (1 + δ)r, x̂ and z belong to a disc of that radius. This
-    moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ, which the rounding charged to r covers
-    (docs/certificates.md).
+    x̂ is a projected gradient step, Π(t) with t = x − (Px + q)/L, and z = L(t − x̂) is
+    normal at x̂ for any L > 0; multipliers of the answer are not used. If rounding
+    leaves ‖x̂_I‖ = (1 + δ)r on a disc I of radius r, then x̂ and z are exact for the
+    radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ, which the
+    bound covers as part of the rounding of the residual (docs/certificates.md).
 
     least : μ > 0, a proven lower bound of the eigenvalues of P
 
@@ -262,15 +262,15 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
-    The certificate with the least error of these pairs is returned:
+    Up to four pairs are tried, and the certificate with the smallest bound is returned:
 
-    1. the answer's own pair, changed as little as admissibility requires;
-    2. if most of g is work, as for an interior point, whose multipliers and gaps are
-       all positive: a pair with the complementarity that the answer suggests;
-    3. if contact alone supports a body: the solution for the rows that the answer
-       suggests are closed, provided that a pair above proves the answer to be near;
-    4. if none of these proves anything: the pair near zero, which does not depend on
-       the answer.
+    1. the pair of the answer, changed as little as admissibility requires;
+    2. if most of g is work, as for an interior point with positive multipliers and
+       gaps: a pair with the active rows that the answer suggests;
+    3. if only contact supports a body: the solution for the closed rows of the answer,
+       provided that a pair above proves the answer to be accurate;
+    4. if none of these proves a bound: the pair near zero, which does not depend on the
+       answer.
 
     Raises
     ------
@@ -299,13 +299,13 @@ def sharpest(
 
     Parameters
     ----------
-    tried : certificates of pairs near the answer, or the reasons why there are none
-    at_rest : evaluates the pair near zero; called if no other pair proves anything
+    tried : certificates of pairs near the answer, or reasons for missing certificates
+    at_rest : evaluates the pair near zero; called if no other pair proves a bound
 
     Raises
     ------
     UncertifiableError
-        When no pair proves anything; the message has the first reason.
+            When no pair proves a bound; the message contains the first reason.
 
     """
     outcomes = list(tried)
@@ -319,7 +319,7 @@ def sharpest(
 
 
 def _least_norm(split: Undivided) -> float:
-    """Bound ‖u*‖ from below by a pair that does not depend on an answer."""
+    """Return a lower bound of ‖u*‖ from a pair that does not depend on an answer."""
     mechanics = split.mechanics
     u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
@@ -329,7 +329,7 @@ def _least_norm(split: Undivided) -> float:
 
 
 def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
-    """Yield the certificates of pairs near the answer, until one is sharp."""
+    """Yield certificates of pairs near the answer, or reasons, until one is sharp."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0
@@ -353,7 +353,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
-    """Evaluate the proof for the pair near u = 0, λ = 0."""
+    """Return the certificate of the pair near u = 0, λ = 0, or the reason for none."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
@@ -368,7 +368,7 @@ def _proved(split: Undivided, *pair: Any) -> Certificate | str:
 
 
 def is_sharp(outcome: Certificate | str) -> bool:
-    """Return True if another pair could not improve a certificate much."""
+    """Return True if another pair could improve the certificate only slightly."""
     return isinstance(outcome, Certificate) and (
         outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
     )
@@ -381,12 +381,12 @@ def proof(
     multipliers: Extended,
     closed: Any,
 ) -> Certificate:
-    """Evaluate (4) and (3) for an admissible pair near u and λ.
+    """Evaluate the bounds (4) and (3) for an admissible pair near u and λ.
 
     Raises
     ------
     UncertifiableError
-        When there is no such pair.
+        When no admissible pair is obtained.
 
     """
     mechanics = split.mechanics
@@ -415,13 +415,13 @@ def proven(
     at_rows: Extended,
     multipliers: Extended,
 ) -> Certificate:
-    """Evaluate (4) and (3) for an admissible pair, on one process or on ranks.
+    """Evaluate (4) and (3) for an admissible pair, in one process or over ranks.
 
     Parameters
     ----------
-    exact : the rows, restricted to the components of `at_rows`
-    G : (m, p) change of the gaps by the rigid motions that contact feels
-    u, at_rows : û (n,), and its values at the components (w,) of the rows
+    exact : rows, restricted to the w components of `at_rows`
+    G : (m, p) derivative of the gaps with respect to the rigid motions that change them
+    u, at_rows : û (n,), and its values at the components (w,) in the rows
 
     Raises
     ------
@@ -446,7 +446,7 @@ def proven(
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    # a small û, even zero with θ = 0, says nothing about the θ of the error
+    # a small û, even zero with θ = 0, does not determine the θ of the error
     if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)
@@ -506,10 +506,10 @@ def _charge(
 ) -> float:
     """Bound the rounding terms (R3) of (4) by a fixed point iteration.
 
-    The terms depend on the errors, which depend on the terms. Each step is rounded up
-    by 1 %, so that the iteration ends above the fixed point.
+    The rounding terms depend on bounds of the errors, and conversely. Each step is
+    increased by 1 %, so that the iteration ends above the fixed point.
 
-    pull : (h,) sizes of Rᵀ(ρ − TᵀK_T d) along the supported motions
+    pull : (h,) magnitudes of Rᵀ(ρ − TᵀK_T d) along the supported motions
     square : 2g without these terms
     """
 
@@ -527,14 +527,14 @@ def _charge(
 
 
 class _Reach(NamedTuple):
-    """Bounds of the rigid motions of û − u*, as functions of the errors of the pair."""
+    """Bounds of the rigid part of û − u* as functions of the errors of the pair."""
 
     gaps: Vector  #: (h,) constant term
     error: Vector  #: (h,) factor of ‖û − u*‖
     square: Vector  #: (h,) factor of the sum of the squares of both errors
 
     def within(self, square: float) -> Vector:
-        """Bound the motions (h,) for a given sum of the squares of both errors."""
+        """Bound the motions (h,); `square` bounds the sum of the squared errors."""
         return np.asarray(
             self.gaps + self.error * np.sqrt(square) + self.square * square
         )
@@ -551,11 +551,11 @@ def _reach(
 ) -> _Reach:
     """Bound the rigid part γ of û − u* by the contact conditions (R4).
 
-    Any combination y ≥ 0 of the inequalities (R4) that equals ±γₖ is a bound. It is
-    chosen to be small at `square` with Bᵢdiag(K)⁻¹Bᵢᵀ for the compliance of a row; then
-    ‖Σ±yᵢBᵢ‖ is evaluated in the dual norm. Motions that λ̂ does not support are
-    disregarded like those that contact does not feel: the rounding of K along them is
-    not part of the problem.
+    Every combination y ≥ 0 of the inequalities (R4) that equals ±γₖ gives a bound. It
+    is chosen to be small for the error `square`, with the compliance of row i
+    approximated by Bᵢdiag(K)⁻¹Bᵢᵀ; then ‖Σ±yᵢBᵢ‖ is evaluated in the dual norm. Motions
+    that λ̂ does not support are disregarded, as are motions that do not change gaps:
+    the rounding of K along them is not part of the problem.
     """
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
@@ -571,7 +571,7 @@ def _reach(
     cost = opened + np.sqrt(square) * soft + square * pressed + tiny
     columns = (np.vstack([-motions[up], motions[down]]) / cost[:, None]).T
     size = np.abs(columns).max(initial=0.0)
-    if not size > 0:  # costs overflow, or are NaN: the answer is too far off
+    if not size > 0:  # the costs overflow or are NaN: the error of the answer is huge
         return _Reach(*np.full((3, supported.shape[1]), np.inf))
     bounds = np.zeros((3, supported.shape[1]))
     for k, motion in enumerate(supported.T):
@@ -591,11 +591,11 @@ def _reach(
 
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
-    """Return y ≥ 0 with  columns·y = target  (p,); inf if none is found."""
+    """Return y ≥ 0 with columns·y = target (p,); inf if no such y is found."""
     from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
     try:
         y, left = nnls(columns, target)
-    except RuntimeError:  # it has an iteration limit
+    except RuntimeError:  # nnls exceeded its iteration limit
         left = np.inf
     return y if left <= COMBINATION_RESIDUAL else np.full(columns.shape[1], np.inf)

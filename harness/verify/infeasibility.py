@@ -5,12 +5,12 @@ no x satisfies both the rows and lb ≤ x ≤ ub if
 
     V = bᵀy + hᵀz − Σ min(cⱼlbⱼ, cⱼubⱼ) < 0,
 
-since cᵀx ≤ bᵀy + hᵀz at every feasible x. In the convention of `harness.qp` the second
-sum is that of z_box = −c, and a multiplier on an absent bound, cⱼ > 0 without lbⱼ or
-cⱼ < 0 without ubⱼ, makes V infinite, however small it is, since xⱼ is unbounded. An
-approximate ray therefore proves nothing. It is corrected first, so that cⱼ = 0 holds
-exactly for these j: in rational arithmetic, or by an enclosure of an exact ray that is
-proven to exist. V is then evaluated in rational arithmetic from the doubles of the QP.
+since cᵀx ≤ bᵀy + hᵀz at every feasible x. In the convention of `harness.qp`, z_box =
+−c. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is infinite, however
+small cⱼ is. An approximate ray therefore proves nothing. It is first corrected such
+that cⱼ = 0 holds exactly for these j, either in rational arithmetic or by an enclosure
+of an exact ray, which is proven to exist. V is then evaluated in rational arithmetic
+from the doubles of the QP.
 
 Right-hand sides are rounded numbers. So −V has to exceed `MIN_MARGIN` times the sum of
 the absolute terms of V. That ratio, the margin, does not depend on the units of rows
@@ -40,23 +40,23 @@ from mortarbench.harness.verify.rational import (
     solutions,
 )
 
-#: Least margin of a proof. Redundant rows whose right-hand sides are rounded sums of
-#: thousands of terms contradict one another by less.
+#: Smallest margin of a proof. Redundant rows contradict one another by less if their
+#: right-hand sides are rounded sums of thousands of terms.
 MIN_MARGIN = 1e-12
-#: Fractions of the largest multiplier, in scaled rows, below which multipliers are
-#: dropped, tried in turn: iterative solvers return small multipliers for rows that do
-#: not contribute to the proof.
+#: Multipliers below these fractions of the largest one, in scaled rows, are dropped;
+#: the fractions are tried in turn. Iterative solvers return small multipliers for rows
+#: that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
-#: largest number of entries of A and G; nothing is proven for larger QPs
+#: Largest number of entries of A and G; for larger QPs no proof is attempted.
 MAX_ENTRIES = 10**6
-#: largest number of pivots of an elimination in rational arithmetic (about 1 s)
+#: Largest number of pivots of an elimination in rational arithmetic (about 1 s).
 MAX_PIVOTS = 40
-#: largest number of entries of a rational linear program, which takes seconds
+#: Largest number of entries of a rational linear program; it takes seconds.
 MAX_TABLEAU = 1500
 MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
-#: Bounds beyond this multiple of the largest right-hand side are left out of the first
-#: search: costs of such different sizes hide one another.
+#: Bounds larger than this multiple of the largest right-hand side are left out of the
+#: first search, since the linear program cannot resolve costs of so different size.
 MAX_BOUND_RATIO = 1e6
 LP_SECONDS = 20.0  #: time limit of the search for a ray
 EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
@@ -71,17 +71,17 @@ class Ray(NamedTuple):
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 
-#: Margins from `_searched`, None without a proof; they do not depend on the point.
+#: Margins from `_searched` (None without a proof), independent of the solver's point.
 _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 
 
-@np.errstate(all="ignore")  # entries of 1e±300 overflow in units of their rows
+@np.errstate(all="ignore")  # entries of 1e±300 overflow when rows are scaled
 def infeasibility_margin(qp: QP, s: Solution) -> float | None:
-    """Return the margin of a proof that `qp` has no feasible point; None without one.
+    """Return the margin of a proof that `qp` is infeasible; None without a proof.
 
-    The multipliers of `s`, which claims infeasibility, are tried first. If these prove
-    nothing, others are searched for, once per QP. Sets other than bounds are relaxed to
-    their smallest enclosing box, whose infeasibility implies theirs.
+    The multipliers of `s`, which claims infeasibility, are tried first. If they prove
+    nothing, a ray is searched for, once per QP. Sets other than bounds are relaxed to
+    their smallest enclosing box; an infeasible relaxation implies an infeasible QP.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | Non
     w[qp.b.size :] = np.maximum(w[qp.b.size :], 0)
     sizes = abs(M) @ diags_array(column)
     largest = np.asarray(sizes.max(axis=1).toarray()).ravel()
-    size = np.abs(w) * np.where(largest > 0, largest, 1.0)  # 0·x ≤ −1 has no entries
+    size = np.abs(w) * np.where(largest > 0, largest, 1.0)  # rows 0·x ≤ −1 are empty
     if not 0 < size.max() < np.inf:
         return None
     w = w * 2.0 ** -np.floor(np.log2(size.max()))
@@ -143,11 +143,11 @@ def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | Non
 def _corrected(
     qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector
 ) -> Iterator[Ray]:
-    """Yield rays near w with cⱼ = 0 exactly where required.
+    """Yield rays near w that satisfy cⱼ = 0 exactly where required.
 
-    It is required for variables without bounds, and for those with a single bound if cⱼ
-    is small and of the wrong sign. The ray itself comes first, then one with cⱼ = 0
-    wherever it is small, then one with cⱼ = 0 where required only.
+    It is required for variables without bounds, and for variables with a single bound
+    if cⱼ is small and has the wrong sign. Three rays are tried: w itself, a ray with
+    cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ = 0 only where required.
 
     M, w : entries and multipliers of the rows with a nonzero multiplier
     """
@@ -170,7 +170,7 @@ def _corrected(
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
         if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
-            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
+            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots are first
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
@@ -181,11 +181,11 @@ def _corrected(
 
 
 def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | None:
-    """Bound a change of w (k,) that makes Mᵀw = 0 exact; None if none is proven.
+    """Bound a change of w (k,) that makes Mᵀw = 0 exact; return None without a proof.
 
-    With columns scaled by their terms and rows by w, let X be an approximate right
-    inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ with its rounding. Then MᵀX is
-    regular, and δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, |δ| ≤ |X|·1·‖c‖∞/(1 − α).
+    Columns are scaled by their terms and rows by w. Let X be an approximate right
+    inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
+    regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δ| ≤ |X|·1·‖c‖∞/(1 − α).
 
     M : (k, n) columns of the variables with cⱼ = 0
     c : (n,) Mᵀw
@@ -210,7 +210,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
 
 
 def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
-    """Return the least margin of all rays of an enclosure; None below `MIN_MARGIN`."""
+    """Return the least margin over the rays of an enclosure; None below MIN_MARGIN."""
     m = qp.b.size
     if (ray.centre < ray.radius)[ray.rows >= m].any():
         return None
@@ -230,18 +230,18 @@ def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
             if np.isinf(bound):
                 return None
             products.append(-end * Fraction(bound))
-        value += max(products)  # convex in c, so that an end is the maximum
+        value += max(products)  # convex in c, so that the maximum is at an end
         terms += max(map(abs, products))
     return float(-value / terms) if -value > Fraction(MIN_MARGIN) * terms else None
 
 
 def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]:
-    """Yield multipliers w of the rows of M with the largest margin.
+    """Yield multipliers w of the rows of M that maximise the margin.
 
-    A linear program minimises V subject to a sum of absolute terms of at most one. The
-    first one omits large bounds, see `MAX_BOUND_RATIO`.
+    A linear program minimises V under the condition that the sum of its absolute terms
+    is at most one. The first program omits large bounds (`MAX_BOUND_RATIO`).
 
-    row, column : factors, see `_equilibrated`
+    row, column : scaling factors from `_equilibrated`
     """
     rhs = row * np.concatenate([qp.b, qp.h])
     lb, ub = qp.lb / column, qp.ub / column
@@ -262,10 +262,10 @@ def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]
 def _solved(
     M: csr_array, m: int, rhs: Vector, lb: Vector, ub: Vector, reach: float
 ) -> Vector | None:
-    """Solve the linear program of `_rays`; None if its minimum is not negative.
+    """Solve the linear program of `_rays`; return None if its minimum is not negative.
 
     M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
-    reach : largest bound that takes part
+    reach : bounds of larger absolute value are omitted
     """
     from scipy.optimize import linprog  # imported here because it loads slowly
 
@@ -303,11 +303,11 @@ def _solved(
 
 
 def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
-    """Return a ray whose margin exceeds `MIN_MARGIN`, in rational arithmetic, or None.
+    """Return a ray with a margin above `MIN_MARGIN` in rational arithmetic, or None.
 
-    For a small QP the search is complete: by Farkas' lemma a ray exists if and only if
-    no point remains feasible when all right-hand sides and bounds are relaxed by
-    `MIN_MARGIN` of their size.
+    For a small QP the search is complete: by Farkas' lemma, such a ray exists if and
+    only if the QP remains infeasible when all right-hand sides and bounds are relaxed
+    by `MIN_MARGIN` times their size.
     """
     m, k, n = qp.b.size, M.shape[0], M.shape[1]
     lower, upper = (np.flatnonzero(np.isfinite(v)) for v in (qp.lb, qp.ub))

@@ -1,11 +1,11 @@
 """Optimality of a primal-dual point, measured independently of the solver.
 
-Every residual is scale-free: multiplying the objective, a constraint row or the unit of
-a variable by a constant changes none of them, so that one threshold means the same for
-every problem. All four are zero exactly at a KKT point, which is a solution if P is
-positive semidefinite; positive semidefiniteness is not examined. docs/verdicts.md
-states what small residuals prove about the objective, and what they cannot prove; in
-these cases `harness.verify.optimum` compares with a proven optimum.
+Every residual is scale-free: it does not change when the objective, a row or the unit
+of a variable is multiplied by a constant, so that one threshold suits every problem.
+All four residuals vanish exactly at a KKT point. A KKT point is a solution if P is
+positive semidefinite, which is not examined here. docs/verdicts.md states what small
+residuals prove about the objective. Where they prove too little,
+`harness.verify.optimum` compares the point with a proven optimum.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from mortarbench.harness.sets.convex import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify import scales
 
-#: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow
-#: like √k·2⁻⁵³, so that this covers k = 256. A row of zero fails without it
-#: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
+#: Rounding of a sum, relative to the sum of its absolute terms: the error of k terms
+#: grows like √k·2⁻⁵³, and this value covers k = 256. Without it, the exact zero of a
+#: row fails (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
-#: Share of a scale that an answer of three digits leaves undetermined, and the largest
-#: share of it that may be attributed to rounding. `MAX_CANCELLATION` allows an error of
-#: 5e-4 of the objective at tol 1e-8; with this share added twice, for doubt and for
-#: rounding, the error stays below 1e-3. With 2e-3,
-#: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9, the
-#: rounded solutions of `test_what_is_left_when_terms_cancel_is_known_exactly`.
+#: Share of a scale that an answer of three digits leaves undetermined. At most this
+#: share is attributed to rounding. `MAX_CANCELLATION` allows an error of 5e-4 of the
+#: objective at tol 1e-8; adding this share twice, for the uncertainty of the optimum
+#: and for rounding, keeps the error below 1e-3. With 2e-3,
+#: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
+#: `test_what_is_left_when_terms_cancel_is_known_exactly` fails.
 NEGLIGIBLE = 2e-4
-#: Least scale of energy, relative to a natural energy. The energy of a solution is used
-#: if it exceeds this share; if the solution vanishes, errors are divided by this share
-#: of the natural energy. With 1e-3,
+#: Least scale of energy, relative to a natural energy. If the energy of a solution is
+#: below this share, as for a vanishing solution, errors are divided by this share of
+#: the natural energy. With 1e-3,
 #: `test_rounding_errors_about_a_zero_solution_are_small` fails.
 LEAST_ENERGY = 1e-2
-#: With the generous scale, a point whose energy is less than this times a natural
-#: energy is compared with the natural energy instead of its own. With 1,
-#: `test_the_code_of_your_own_solver` fails: answers with residuals of 1.2e-2 and 3.6e-2
-#: are then left to the proven optimum at tol 1e-3, and verified.
+#: With generous scales, a point whose energy is below this multiple of a natural energy
+#: is compared with the natural energy. With 1, `test_the_code_of_your_own_solver`
+#: fails: answers with residuals of 1.2e-2 and 3.6e-2 are then passed to the proven
+#: optimum at tol 1e-3, which verifies them.
 NO_ENERGY = 1e-6
-#: Rounding in a load, relative to the largest: 400 terms of 2⁻⁵² each. Without it,
+#: Rounding of a load, relative to the largest load: 400 terms of 2⁻⁵² each. Without it,
 #: loads of 1e-17 count (`test_a_right_point_is_verified_by_its_residuals`, case 11).
 LOAD_ROUNDING = 1e-13
-#: Passes over the rows that give a size to variables without curvature and cost, each
-#: to the neighbours of those before: a limit of time.
-#: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails with 3.
+#: Largest number of passes over the rows. Each pass gives a size to variables without
+#: curvature and cost that share a row with variables of known size. The limit bounds
+#: the time. `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails with 3.
 MAX_PASSES = 100
 #: Power iterations for the largest eigenvalue of P. The estimate is a few percent low,
 #: which changes the natural map by as much.
@@ -73,11 +73,11 @@ class Residuals(NamedTuple):
 
 
 class Normality(NamedTuple):
-    """Distances from optimality over discs and cones, NaN at a point with NaN.
+    """Distances from optimality over discs and cones; NaN at a point with NaN.
 
     The complementarity of a disc, r‖z‖ − zᵀx, is of second order in the angle between z
-    and x; these are of first order. They decide no verdict: verdicts bound the error of
-    the objective, which is of second order as well.
+    and x, whereas these distances are of first order. They do not affect verdicts,
+    which bound the error of the objective, also of second order.
     """
 
     natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖
@@ -93,7 +93,7 @@ class Scales(NamedTuple):
 
 
 class _Constraints(NamedTuple):
-    """Slacks of all constraints at a point: b − Ax, h − Gx, and of the sets."""
+    """Slacks of all constraints at a point: b − Ax, h − Gx, and limits of the sets."""
 
     equalities: Limits
     inequalities: Limits
@@ -103,7 +103,7 @@ class _Constraints(NamedTuple):
         """Yield inequality rows, if there are any, then the limits of the sets."""
         if self.inequalities.size.size:
             yield self.inequalities
-        for limits in self.sets:  # also where this rank holds no such component
+        for limits in self.sets:  # collective: also if this rank has no such component
             yield from limits
 
 
@@ -120,7 +120,7 @@ class _Terms:
     forces: Vector  #: Aᵀy + Gᵀz + z_box
     forces_size: Vector
     residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, less multipliers of absent bounds
-    excess: Vector  #: z_box less its admissible part, such as on absent bounds
+    excess: Vector  #: z_box minus its admissible part (absent bounds)
     energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + bounds
     energies_size: float
 
@@ -140,10 +140,10 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     * complementarity: max |zᵢ(h − Gx)ᵢ|/E over rows and bounds
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
-    Dᵢ is the larger of |xᵢ| and the step |rᵢ|/Pᵢᵢ to the minimum along i (Xᵢ for a
-    variable without curvature and cost), but no longer than the distance to the bound
-    in that direction. Rounding, `ROUNDING` times the sum of its absolute terms but at
-    most `NEGLIGIBLE` of its scale, is first subtracted from each residual.
+    Dᵢ is the larger of |xᵢ| and |rᵢ|/Pᵢᵢ, the step to the minimum along i (Xᵢ for a
+    variable without curvature and cost), but at most the distance to the bound in that
+    direction. Before a residual is divided by its scale, `ROUNDING` times the sum of
+    its absolute terms, but at most `NEGLIGIBLE` of the scale, is subtracted.
 
     generous : use the largest scale of energy that can be justified, and subtract all
         rounding from energies
@@ -182,9 +182,9 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
 def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
     """Measure a point over discs and cones; None if the QP has bounds only.
 
-    * The natural map at g = Px + q + Aᵀy + Gᵀz, with the projection Π on all sets and
-      an estimate L of the largest eigenvalue of P. It does not depend on z_box. Without
-      q, it is relative to the largest of ‖Px‖ and ‖Aᵀy + Gᵀz‖.
+    * The natural map at g = Px + q + Aᵀy + Gᵀz, with the projection Π onto all sets and
+      an estimate L of the largest eigenvalue of P. It does not depend on z_box. If
+      q = 0, it is relative to the largest of ‖Px‖ and ‖Aᵀy + Gᵀz‖.
     * The largest Euclidean distance of z_box on a disc or cone to the normal cone of
       the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and ‖Aᵀy + Gᵀz + z_box‖∞.
 
@@ -278,7 +278,7 @@ def _terms(qp: QP, s: Solution) -> _Terms:
 
 
 def _combined(M: Matrix, z: Vector) -> Vector | float:
-    """Return Mᵀz (n,); 0 without rows."""
+    """Return Mᵀz (n,); 0 if M has no rows."""
     return M.T @ z if M.shape[0] else 0.0
 
 
@@ -296,10 +296,10 @@ def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constrai
 
 
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
-    """Measure the worst violation of a row or bound as in `kkt_residuals`.
+    """Return the worst relative violation of a row or bound, as in `kkt_residuals`.
 
-    X : (n,) sizes of the variables that follow from the scale of energy
-    own : (n,) sizes of the variables themselves (`own_sizes`)
+    X : (n,) sizes of the variables from the scale of energy
+    own : (n,) sizes of the variables from their values (`own_sizes`)
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
 
@@ -325,8 +325,8 @@ def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
 def own_sizes(qp: QP, x: Vector) -> Vector:
     """Return sizes (n,) of the variables at x (n,) that do not depend on energies.
 
-    The size is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, the shift of the
-    minimum along j that the other variables cause.
+    The size is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other
+    variables shift the minimum along j.
     """
     shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
     sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
@@ -340,14 +340,14 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     size = t.Px_size + np.abs(qp.q) + t.forces_size
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
-    # the minimum along a variable without curvature and cost is undetermined: Xᵢ
+    # the minimum along a variable without curvature and cost is undetermined: use Xᵢ
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    # an operator without diagonal: x gives one curvature of it, unless x is zero
+    # an operator without diagonal: use its Rayleigh quotient at x, unless x is zero
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
     lower, upper = hull(qp.sets, qp.q.size)
     room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # downhill
-    signed = (s.z >= 0).all()  # False where z holds NaN
+    signed = (s.z >= 0).all()  # False if z contains NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
@@ -386,13 +386,14 @@ def energy_at(qp: QP, s: Solution, *, generous: bool = False) -> float:
 def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     """Return the scale of energy E at a point.
 
-    The largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + bounds|: sums, since multipliers that
-    cancel could make their parts arbitrarily large; but at most `MAX_CANCELLATION`
-    times the objective (`energy_scale` in scales.h). At least `LEAST_ENERGY` times the
-    smallest natural energy of a variable (`_natural_energies`).
+    E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + bounds|. Sums are used because
+    multipliers that cancel could make single terms arbitrarily large. E is at most
+    `MAX_CANCELLATION` times the objective (`energy_scale` in scales.h), and at least
+    `LEAST_ENERGY` times the smallest natural energy of a variable
+    (`_natural_energies`).
 
-    generous : ignore cancellation, and use the median of the natural energies, in full
-        where the point has no energy of its own
+    generous : ignore cancellation, and use the median of the natural energies; do not
+        multiply it by `LEAST_ENERGY` if the energy of the point is negligible
     """
     terms = _sup(t.energies)
     if np.isnan(terms):
@@ -406,7 +407,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         qp, t.curvature, bounds, by_length=by_length or not qp.q.any()
     )
     natural = pick(energies)
-    if E < LEAST_ENERGY * natural:  # rare; tightening bounds is expensive
+    if E < LEAST_ENERGY * natural:  # rarely true; tightening bounds is expensive
         energies = _natural_energies(qp, t.curvature, tightened(qp), by_length=True)
         natural = pick(energies)
     if not natural < np.inf:
@@ -416,7 +417,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
 
 
 def _least(values: Vector) -> float:
-    """Return the least value, over all ranks of a distributed vector; inf if empty."""
+    """Return the least value over all ranks of a distributed vector; inf if empty."""
     return float(values.min(initial=np.inf))
 
 
@@ -428,16 +429,16 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """List the energy that each variable alone can gain, where this is determined.
+    """Return the energy that each variable alone can gain, where it is determined.
 
-    This is the energy |½Pᵢᵢxᵢ² + qᵢxᵢ| of the variable at its minimum within the
-    bounds. If the minimum is at xᵢ = 0, it is qᵢ²/Pᵢᵢ or, if that is less, |qᵢ|wᵢ with
-    the feasible width wᵢ.
+    This is |½Pᵢᵢxᵢ² + qᵢxᵢ| at the minimum of the variable within its bounds. If the
+    minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ is
+    the width of the feasible interval.
 
-    bounds : lower and upper (n,) each, tightened by rows or not
-    by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² where q is
-        rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 if there
-        is no length
+    bounds : lower and upper bounds (n,), possibly tightened by rows
+    by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² if qᵢ is
+        rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 without
+        such a length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)
@@ -461,7 +462,7 @@ def _natural_energies(
 
 
 def _lengths(qp: QP) -> Vector:
-    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| of each variable, or inf."""
+    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| per variable (n,), or inf."""
     least = np.full(qp.q.size, np.inf)
     for bound in hull(qp.sets, qp.q.size):
         has_length = np.isfinite(bound) & (bound != 0)
@@ -503,10 +504,10 @@ def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
 def scales_at(qp: QP, x: Vector, E: float) -> Scales:
     """Return the sizes of the variables that follow from a scale of energy.
 
-    The energy changes by E over the length lⱼ, the least of √(E/Pⱼⱼ) and E/|qⱼ|: Xⱼ is
-    the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ: along a direction that
-    costs nothing, an answer could make x arbitrarily long. The size of a variable
-    without curvature and cost follows from its active rows.
+    Over the length lⱼ, the lesser of √(E/Pⱼⱼ) and E/|qⱼ|, the energy changes by E. Xⱼ
+    is the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ, since x could be
+    arbitrarily long along a direction without cost. The size of a variable without
+    curvature and cost follows from its active rows.
     """
     d, has_diagonal = _curvature(qp)
     return _scales(qp, x, E, d, has_diagonal=has_diagonal)
@@ -527,10 +528,10 @@ def _scales(qp: QP, x: Vector, E: float, d: Vector, *, has_diagonal: bool) -> Sc
 def _sizes_from_rows(
     qp: QP, x: Vector, X: Vector, has_size: NDArray[np.bool_]
 ) -> Vector:
-    """Complete the sizes of variables without curvature and cost by active rows.
+    """Derive the sizes of variables without curvature and cost from active rows.
 
-    A row of G is active where its slack is negligible. Others are left out: a far one
-    would excuse the violation of another row
+    A row of G is active if its slack is negligible. Inactive rows are left out, since a
+    distant row would excuse the violation of another one
     (`test_a_row_that_is_far_away_excuses_no_violation`).
     """
     size, has_size = np.abs(x), has_size.copy()
@@ -569,16 +570,16 @@ def verdict(
     error: float | None = None,
     infeasible: bool = False,
 ) -> Verdict:
-    """Judge a point by its residuals; the claim decides only the name of a failure.
+    """Judge a point by its residuals; the claim only determines the kind of failure.
 
-    Verified: every residual ≤ factor·tol, whatever was claimed; an error against a
-    proven optimum replaces all four residuals. A refuted claim of success is
-    `inaccurate` if the point has at least half of the requested digits (worst residual
-    ≤ √(factor·tol)), and `wrong` otherwise. With a residual above 0.1, no point is
-    verified at any tolerance.
+    A point is verified if every residual is at most factor·tol, whatever was claimed.
+    An error against a proven optimum replaces all four residuals. A refuted claim of
+    success is `inaccurate` if the point has at least half of the requested digits
+    (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
+    above 0.1 is not verified at any tolerance.
 
     infeasible : the QP is proven to have no feasible point, which verifies a claim of
-        infeasibility whatever point comes with it
+        infeasibility regardless of the point
     """
     most = allowed(tol, factor)
     worst = residuals.worst if error is None else error
@@ -601,10 +602,10 @@ def verdict(
 def rejudged(record: Record, factor: float) -> Verdict:
     """Judge a stored measurement again, at factor·tol instead of 10·tol.
 
-    Claim and residuals decide, or the error against a proven optimum if that decided
-    before (`Record.decided_by`). A stored verdict that does not follow from them (a
-    limit, a crash, a sequence that had ended before, a proof of infeasibility, which
-    has no tolerance) is returned unchanged.
+    Claim and residuals decide the verdict, or the error against a proven optimum if
+    that decided it before (`Record.decided_by`). Verdicts that do not follow from these
+    numbers are returned unchanged: a limit, a crash, a sequence that had ended before,
+    and a proof of infeasibility, which has no tolerance.
     """
     if record.claimed is None:
         return record.verdict
@@ -618,7 +619,7 @@ def rejudged(record: Record, factor: float) -> Verdict:
 
 
 def _curvature(qp: QP) -> tuple[Vector, bool]:
-    """Return Pᵢᵢ and True; zeros and False for an operator without diagonal."""
+    """Return the diagonal Pᵢᵢ (n,) and True; zeros and False if it is unavailable."""
     diagonal = qp.diagonal()
     if diagonal is None:
         return np.zeros(qp.q.size), False
@@ -638,7 +639,7 @@ def _abs(M: Matrix) -> Matrix:
 
 
 def _over(a: Vector | float, b: Vector) -> Vector:
-    """Divide, by zero to infinity."""
+    """Return a/b, with infinity for division by zero."""
     return np.where(b > 0, a / np.where(b > 0, b, 1), np.inf)
 
 

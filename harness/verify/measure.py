@@ -29,11 +29,11 @@ from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: least duration of a sample, nearly; see `measure`
+SAMPLE_SECONDS = 0.005  #: approximate least duration of a sample; see `measure`
 MAX_INNER_LOOPS = 100  #: largest number of repetitions within a sample
-#: rows of the largest operator P that is assembled for a solver
+#: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
-MAX_COUNT = 2**53  #: beyond, integers are not exact in other programs
+MAX_COUNT = 2**53  #: larger integers are not exact in programs that store doubles
 MAX_MESSAGE = 1900  #: largest length of a solver's message, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
@@ -65,18 +65,18 @@ def measure(
 
     Errors of the solver do not raise: an exception, a missing library or a malformed
     answer becomes the status and message of a solution without a point. The call of
-    `declines` counts as preparation. An operator P that the solver cannot use as such
-    (`harness.needs_matrices`) is assembled if it has at most MAX_ASSEMBLED_ROWS rows,
-    which counts as preparation as well.
+    `declines` counts as preparation. If the solver cannot use an operator P
+    (`harness.needs_matrices`) with at most MAX_ASSEMBLED_ROWS rows, P is assembled,
+    which also counts as preparation.
 
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
         `harness.plugin.Chained`
-    sample_seconds : a faster solve is repeated, including its preparation, until the
-        repetitions together take this time. The answer is that of the first repetition;
-        the times are means of the others, since the first one runs with cold caches.
-        Every repetition gets a QP of new objects, so that a solver cannot recognise it
-        by identity
-    starts, ends : called just before the clock starts, and after it has stopped
+    sample_seconds : a solve that takes less time is repeated, including its
+        preparation, until the repetitions together take this time. The answer is that
+        of the first repetition; the times are means of the others, since the first one
+        runs with cold caches. Every repetition gets a QP of new objects, so that a
+        solver cannot recognise it by identity
+    starts, ends : called just before the clock starts and just after it stops
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
@@ -137,14 +137,14 @@ class _Preparation:
 
 
 class ReasonError(Exception):
-    """Error for a solver whose `accepts` or `declines` has a wrong type."""
+    """Error of a solver whose `accepts` or `declines` has a wrong type."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     """Return the reason why `solver` does not accept `qp`, or None if it does.
 
-    A set whose class is not in `accepts` is a reason. Without that declaration, a
-    solver accepts bounds only.
+    A set of a class that is not in `accepts` is a reason. A solver without `accepts`
+    accepts bounds only.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
 
 
 def _explicit(qp: QP) -> QP:
-    """Return the QP with its operator P as a matrix, or decline if P is large."""
+    """Return the QP with its operator P as a matrix; decline if P is too large."""
     n = qp.q.size
     if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
         raise _DeclinedError(
@@ -189,7 +189,11 @@ class _DeclinedError(Exception):
 def _timed(
     prepare: Prepare, qp: QP, *, peaks: bool = True
 ) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
-    """Prepare and solve once; return the answer, seconds and peaks (MiB) of both."""
+    """Prepare and solve once.
+
+    Returns the answer, then the seconds of preparation and solve, then the memory peaks
+    (MiB) of both.
+    """
     reset = peaks and reset_peak()
     start = perf_counter()
     solve = prepare(qp)
@@ -227,7 +231,7 @@ def _fresh_copy(qp: QP) -> QP:
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
     """Copy a dataclass, with `other` applied to each attribute."""
-    new = copy(whole)  # without the checks of __init__, which can exceed a small solve
+    new = copy(whole)  # without __init__, whose checks may outlast a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
@@ -276,9 +280,9 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    File and line are those of the last call in the file of the solver's class, as in
-    ``KeyError: 'rho' (mine.py:24)``. They are omitted if this file is not in the
-    traceback.
+    File name and line are those of the last call in the file of the solver's class, as
+    in ``KeyError: 'rho' (mine.py:24)``. They are omitted if the traceback does not
+    contain this file.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))
@@ -291,10 +295,10 @@ def failure(solver: Solver, e: BaseException) -> str:
 
 
 def _file_of(kind: type) -> str:
-    """Return the file that defines the methods of a class, or "".
+    """Return the file that defines the methods of a class, or "" if there is none.
 
-    The module of the class does not help: after a copy by cloudpickle, it may exist in
-    another process only.
+    The module of the class is not used: after a copy by cloudpickle, it may exist only
+    in another process.
     """
     for one in kind.__mro__:
         for part in vars(one).values():

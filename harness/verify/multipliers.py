@@ -7,16 +7,17 @@ At x, with g = Px + q, the multipliers minimise
 where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
 and 1/wᵢ that of the stationarity residual; z_box has the sign of its bound. The second
 sum is the complementarity residual. It replaces a threshold between active and inactive
-rows: a nearly active row may have a multiplier as large as its slack permits.
+rows: the slack of a nearly active row limits its multiplier.
 
-A convex set of another kind contributes z = (v − Π(v))/τ with v = x + τf for a force f.
-This is normal to the set at Π(v). As τ grows, the rest of f becomes smaller and the
+Another convex set contributes z = (v − Π(v))/τ with v = x + τf for a force f. This z is
+normal to the set at Π(v). As τ grows, the rest f − z becomes smaller and the
 complementarity residual larger. The multipliers of rows are first fitted as if such
-sets could balance any force, then by Newton's method for f − z, with the derivative of
-Π.
+sets could balance any force. Newton's method for f − z, with the derivative of Π, then
+corrects them.
 
-Multipliers with small residuals prove a point, regardless of their origin. So several
-weightings are tried, and those with the smallest `kkt_residuals` are returned.
+Multipliers with small residuals prove that a point is optimal, regardless of their
+origin. Several weightings are therefore tried, and the multipliers with the smallest
+`kkt_residuals` are returned.
 """
 
 from __future__ import annotations
@@ -37,30 +38,32 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 from mortarbench.harness.verify.optimum import EPS
 
-#: A row takes part if a multiplier that moves the stationarity residual by tol moves
-#: complementarity by at most this many tol: multipliers of farther rows cannot help.
+#: A multiplier that changes the stationarity residual by tol must not change the
+#: complementarity residual by more than this many tol. Rows with a larger slack are
+#: left out, since their multipliers cannot reduce both residuals.
 MAX_COMPLEMENTARITY_RATIO = 100.0
-#: Number of Newton steps, careful ones (`_Bearing`) in the first half. With 8, the
-#: residual is 6e-7 for rows that act on balls alone
+#: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
+#: 8, the residual is 6e-7 for rows that act on balls alone
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
 STEP = 2.0**-26  #: step of difference quotients of Π
-#: Rest of a dependent column after elimination, relative to the largest column.
+#: Largest norm, relative to the largest column, of a column that counts as linearly
+#: dependent after elimination.
 RANK_TOLERANCE = 1e-12
 #: largest number of entries of the dense least-squares matrix: 256 MiB
 MAX_ENTRIES = 2**25
 
 
 class _Scales(NamedTuple):
-    """Weights of the two sums."""
+    """Weights of the two sums in the module docstring."""
 
     w: Vector  #: (n,) 1 over the scale of stationarity; 0 at fixed variables
-    E: float  #: scale of complementarity
+    E: float  #: scale E of energy, which divides the complementarity residual
 
     def reach(self) -> float:
-        """Return the parameter τ = E/S² of the natural map, with the largest force S.
+        """Return the parameter τ = E/S² of the natural map; S is the largest force.
 
-        If τf bridges the distance of x from a limit, the natural map divides the error
+        If τf spans the distance of x from a limit, the natural map divides the error
         equally between stationarity and complementarity.
         """
         return float(self.E * self.w.min(initial=np.inf) ** 2)
@@ -104,17 +107,17 @@ def with_multipliers(
     steps = NEWTON_STEPS if others and unknown & {"y", "z"} else 1
     for _ in range(2):  # relative to the largest force, then to those of each component
         scales = _Scales(1 / size, E)
-        bearing = _Bearing(qp.sets[1:], block, x, scales.reach())
+        linearised = _Linearisation(qp.sets[1:], block, x, scales.reach())
         for k in range(steps):
-            found.append(_fitted(qp, s, g, scales, unknown, bearing))
+            found.append(_fitted(qp, s, g, scales, unknown, linearised))
             rows = qp.A.T @ (found[-1].y - s.y) + qp.G.T @ (found[-1].z - s.z)
-            force, last = -g - rows, bearing.force
-            bearing = replace(bearing, force=force, is_careful=2 * k < steps)
+            force, last = -g - rows, linearised.force
+            linearised = replace(linearised, force=force, is_careful=2 * k < steps)
             if last is not None and np.abs(force - last).max() <= EPS * scale:
                 break
         if others:
-            bearing = replace(bearing, is_shared=True)
-            found.append(_fitted(qp, s, g, scales, unknown, bearing))
+            linearised = replace(linearised, is_shared=True)
+            found.append(_fitted(qp, s, g, scales, unknown, linearised))
         forces = qp.A.T @ found[-1].y + qp.G.T @ found[-1].z + found[-1].z_box
         own = np.maximum.reduce([np.abs(Px), np.abs(qp.q), np.abs(forces)])
         size = np.where(own > 0, own, size)
@@ -127,27 +130,28 @@ def _worst(qp: QP, s: Solution) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Bearing:
-    """Sets other than bounds at x, linearised at a force."""
+class _Linearisation:
+    """Sets other than bounds, linearised at x and at a force."""
 
     sets: Sequence[ConvexSet]
     block: NDArray[
         np.bool_
-    ]  #: (n,) mask of their variables; none if their force is known
+    ]  #: (n,) mask of their variables; all False if their multipliers are prescribed
     x: Vector  #: (n,)
     tau: float  #: step τ of the natural map
     force: Vector | None = None  #: (n,); None if the sets can balance any force
     #: apply the derivative to the residual as well: this converges more slowly than
-    #: Newton's method, but from farther away
+    #: Newton's method, but from a larger neighbourhood
     is_careful: bool = True
-    #: leave the part of a force that the natural map leaves, instead of none of it
+    #: leave the part of the force that the natural map does not assign to the sets
     is_shared: bool = False
 
-    def borne(self, force: Vector, *, shared: bool = True) -> Vector:
+    def normal_part(self, force: Vector, *, shared: bool = True) -> Vector:
         """Return the part (n,) of a force that is normal to the sets near x.
 
-        shared : project by the natural map, which leaves a part of the force if x is
-            off a limit; otherwise, take all that is normal at some point
+        shared : use the natural map, which leaves a part of the force if x is not on
+        the
+            boundary; otherwise, return all of the force that is normal at some point
         """
         total = np.zeros(self.x.size)
         if self.block.any():
@@ -161,21 +165,21 @@ class _Bearing:
         """Return the part of g (n,) that the linearised sets do not balance."""
         if not self.block.any() or self.force is None:
             return np.where(self.block, 0.0, g)
-        borne = self.borne(self.force)
+        balanced = self.normal_part(self.force)
         if self.is_careful:
-            return np.asarray(self.derivative((g + borne)[:, None]).ravel())
+            return np.asarray(self.derivative((g + balanced)[:, None]).ravel())
         change = self.derivative((self.force + g)[:, None]).ravel()
-        return np.where(self.block, borne - self.force + change, g)
+        return np.where(self.block, balanced - self.force + change, g)
 
     def derivative(self, forces: Any) -> Any:
-        """Apply the derivative of force − z at `force` to forces (n, k)."""
+        """Apply the derivative of f − z at f = `force` to `forces` (n, k)."""
         if self.force is None:
             return np.where(self.block[:, None], 0.0, forces)
         left, at = forces.copy(), self.x + self.tau * self.force
         for j, along in enumerate(forces.T):
             size = np.abs(along[self.block]).max(initial=0.0)
             if size > 0:
-                # at the common apex of all cones there is no length
+                # at the common apex of all cones the length is zero
                 h = STEP * (float(np.abs(at[self.block]).max()) or 1.0) / size
                 for one in self.sets:
                     ends = one.project(at + h * along), one.project(at - h * along)
@@ -189,9 +193,9 @@ def _fitted(
     g: Vector,
     scales: _Scales,
     unknown: set[str],
-    bearing: _Bearing,
+    linearised: _Linearisation,
 ) -> Solution:
-    """Minimise the two sums over the unknown multipliers; `s` has the others.
+    """Minimise the two sums over the unknown multipliers, with the others from `s`.
 
     g : (n,) Px + q and the forces of the multipliers of `s`
     """
@@ -218,9 +222,9 @@ def _fitted(
         columns[above, rows.size + below.size + np.arange(above.size)] = 1
         slack = np.concatenate([(qp.h - qp.G @ s.x)[rows], lower[below], upper[above]])
         free = _dense(qp.A.T) if "y" in unknown else np.zeros((n, 0))
-        if bearing.block.any():
-            free, columns = bearing.derivative(free), bearing.derivative(columns)
-        found, pull = _least_squares(free, columns, slack, bearing.rest(g), scales)
+        if linearised.block.any():
+            free, columns = linearised.derivative(free), linearised.derivative(columns)
+        found, pull = _least_squares(free, columns, slack, linearised.rest(g), scales)
         if "y" in unknown:
             y = found
         if "z" in unknown:
@@ -229,10 +233,10 @@ def _fitted(
     r = g + qp.A.T @ (y - s.y) + qp.G.T @ (z - s.z)
     z_box = s.z_box
     if "z_box" in unknown:  # each component by itself
-        borne = _share(np.maximum(r, 0), lower, scales)
-        z_box = _share(np.maximum(-r, 0), upper, scales) - borne
+        balanced = _share(np.maximum(r, 0), lower, scales)
+        z_box = _share(np.maximum(-r, 0), upper, scales) - balanced
         z_box[is_fixed] = -r[is_fixed]
-        z_box += bearing.borne(-r, shared=bearing.is_shared)
+        z_box += linearised.normal_part(-r, shared=linearised.is_shared)
     return Solution(status=s.status, x=s.x, y=y, z=z, z_box=z_box)
 
 
@@ -241,8 +245,8 @@ def _least_squares(
 ) -> tuple[Vector, Vector]:
     """Minimise ‖w(g + free·y + columns·ζ)‖² + ‖slack·ζ/E‖² over y and ζ ≥ 0.
 
-    y is eliminated by an orthonormal basis of the range of w·free, which may have
-    dependent columns; these get no multiplier.
+    y is eliminated by an orthonormal basis of the range of w·free. Linearly dependent
+    columns get the multiplier zero.
     """
     from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
@@ -260,7 +264,7 @@ def _least_squares(
     zeta = np.zeros(slack.size)
     if slack.size:  # without columns, scipy's nnls (1.17.1) would crash Python
         reduced = C - Q @ (Q.T @ C)
-        reduced -= Q @ (Q.T @ reduced)  # once more, or rounding of Q remains
+        reduced -= Q @ (Q.T @ reduced)  # repeated to remove rounding in the range of Q
         stacked = np.vstack([reduced, np.diag(price)])
         rhs = np.concatenate([target - Q @ (Q.T @ target), np.zeros(slack.size)])
         try:
@@ -288,7 +292,7 @@ def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
 
 
 def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:
-    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ, component by component."""
+    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ, componentwise."""
     price = np.divide(
         slack, scales.E * scales.w, out=np.zeros(slack.size), where=slack != 0
     )

@@ -1,21 +1,21 @@
 """Proof of the optimal value of a small QP, for points that residuals cannot decide.
 
-Residuals bound the error of the objective only through two quantities that they do not
-contain: the distance of the solution, and the size of the true multipliers. A reference
-solve, independent of the solvers under test, returns a point x̂ with multipliers λ̂ ≥ 0,
-which is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian L,
+Residuals bound the error of the objective only through two unknown quantities: the
+distance of the solution, and the size of the true multipliers. A reference solve,
+independent of the solvers under test, returns a point x̂ with multipliers λ̂ ≥ 0, which
+is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian L,
 convexity implies for the solution x*
 
     f(x*) ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
 
 evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for a point
-x̃ that satisfies the active rows exactly and differs from x̂ by rounding; L(x̃, λ̂) −
-L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) and a square of rounding. So L(x̂, λ̂) is f* up to the sum above.
-Two assumptions are not proven: the bound of |x*ᵢ − x̂ᵢ| (`MAX_DISTANCE`), and that x̃ is
-as close as that.
+x̃ that satisfies the active rows exactly and differs from x̂ by rounding. The
+difference L(x̃, λ̂) − L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) plus a square of rounding, so that
+L(x̂, λ̂) equals f* up to the sum above. Two assumptions are not proven: the bound
+`MAX_DISTANCE` of |x*ᵢ − x̂ᵢ|, and the same bound for x̃.
 
-Where the objective cancels, so that the sum determines too little of f*, the KKT
-equations of the rows with a multiplier are solved in rational arithmetic. If that point
+If the terms of the objective cancel, so that the sum leaves f* too uncertain, the KKT
+equations of the rows with a multiplier are solved in rational arithmetic. If the result
 satisfies all KKT conditions exactly, its value is f*, without any assumption.
 """
 
@@ -52,33 +52,32 @@ from mortarbench.harness.verify.kkt import (
 from mortarbench.harness.verify.rational import rational, solutions
 from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
-#: Largest number of coupled variables and rows of a QP that is solved once more; the
-#: dense reference solve takes a few times as long as the solve of a solver.
+#: Largest number of coupled variables and rows of a QP that the reference solves; its
+#: dense solve takes a few times as long as that of a solver.
 MAX_COUPLED = 400
-#: Largest number of variables of such a QP; those that are not coupled cost one
-#: division each.
+#: Largest number of variables of such a QP; an uncoupled variable costs one division.
 MAX_VARIABLES = 4000
 #: Largest number of variables and rows of a QP whose operator P is assembled, by one
 #: product per variable.
 MAX_ASSEMBLED = 800
-#: Largest number of unknowns of equations that are solved in rational arithmetic, whose
+#: Largest number of unknowns of equations that are solved in rational arithmetic; the
 #: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
 #: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
-#: energy changes by E. The quadratic term alone gains E over √2 lengths from its
+#: energy changes by E. The quadratic term alone gains E over √2 such lengths from its
 #: minimum. `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails
-#: with 0, and with no limit.
+#: with 0, and without a limit.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
 #: Largest KKT residual of a reference point, beyond rounding, and the assumed distance
-#: of x̃ from x̂. The reference solve does not refine further. With 1e-8,
+#: of x̃ from x̂: the reference solve does not reach smaller residuals. With 1e-8,
 #: `test_residuals_refute_no_point_between_nearly_parallel_rows` fails.
 MAX_RESIDUAL = 1e-14
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Optimum:
-    """Optimal value of a QP, and the scales by which errors are divided."""
+    """Optimal value of a QP, and the scales of errors relative to it."""
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
@@ -98,17 +97,18 @@ def decided(
     tol: float,
     prove: Proves,
 ) -> float | None:
-    """Measure a point against the proven optimum; None where residuals decide.
+    """Measure a point against the proven optimum; return None if residuals decide.
 
     Residuals decide if they exceed 10·tol even with the most generous scales, if the QP
-    is large, or if nothing could be proven.
+    is large, or if no optimum could be proven.
 
     prove : returns the optimum, see `proves`
 
     Returns
     -------
-    the larger of the error |f(x) − f*| and of the violation, relative to the scales of
-    the optimum: for the error, 10 times the smaller of the terms of f* and 500·|f*|
+    the larger of the error |f(x) − f*| and the violation, both relative to the scales
+    of the optimum; the scale of the error is 10 times the smaller of the sum of the
+    absolute terms of f* and 500·|f*|
 
     """
     if not is_small(qp):
@@ -129,7 +129,7 @@ def decided(
 
 
 def is_small(qp: QP) -> bool:
-    """Return True if solving a QP once more, or assembling its P, is cheap."""
+    """Return True if a reference solve of `qp`, or assembling its P, is cheap."""
     n, rows = qp.q.size, qp.b.size + qp.h.size
     if not qp.is_explicit:
         return n + rows <= MAX_ASSEMBLED
@@ -139,7 +139,7 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Mark the variables (n,) that P, a matrix, a row or a set couples to others."""
+    """Return a mask (n,) of variables that P, a row or a set couples to others."""
     is_coupled = np.zeros(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         is_coupled[one.block] = True
@@ -154,7 +154,7 @@ def coupled(qp: QP) -> NDArray[np.bool_]:
 
 @np.errstate(all="ignore")
 def error_at(s: Solution, optimum: Optimum) -> float:
-    """Compare a point with the optimum; see `decided`."""
+    """Return the error of a point relative to an optimum; see `decided`."""
     qp, x = optimum.qp, s.x.astype(np.longdouble)
     off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
     return max(
@@ -164,16 +164,16 @@ def error_at(s: Solution, optimum: Optimum) -> float:
 
 
 def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
-    """Solve a QP by the reference, and prove its optimal value; None if that fails.
+    """Solve a QP by the reference and prove its optimal value; return None on failure.
 
-    An operator P is assembled first; returns None if the QP is then not small.
+    An operator P is assembled first; the result is None if the QP is not small.
     """
     if not qp.is_explicit:
         qp = replace(qp, P=assembled(qp.P))
     return _proven(qp, solve) if is_small(qp) else None
 
 
-@np.errstate(all="ignore")  # a reference may overflow: it proves nothing then
+@np.errstate(all="ignore")  # a reference that overflows proves nothing
 def _proven(qp: QP, solve: Reference) -> Optimum | None:
     s = _reference_point(qp, solve)
     if s is None:
@@ -206,14 +206,14 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
     work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
     least = energy_at(qp, s)
     if abs(value) > ROUNDING * max(work, least) + doubt:
-        # off by 100·tol of this, f has half of the error that `kkt_residuals` allows
+        # a share of 100·tol of this scale is half of the error `kkt_residuals` allows
         scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
     elif work > NEGLIGIBLE * least:  # f* vanishes
         scale = magnitude = work
     else:  # x* vanishes
         scale = magnitude = generous
     rounding = min(ROUNDING * size, NEGLIGIBLE * magnitude)
-    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # no scale where all are zero
+    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # zero if all terms vanish
         return None
     return Optimum(
         qp=qp,
@@ -226,7 +226,7 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve by the reference; None if that is not an optimum to the last digits."""
+    """Solve by the reference; return None unless the point is optimal to rounding."""
     try:
         point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -249,14 +249,15 @@ class ExactOptimum(NamedTuple):
 
 
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
-    """Compute an optimum in rational arithmetic; None where none is proven.
+    """Compute an optimum in rational arithmetic; return None without a proof.
 
-    Other sets than bounds have no linear equations: their optima are rarely rational.
+    Sets other than bounds are not treated, since their optima are rarely rational.
 
-    The rows with a multiplier in `s` become equations. Unknowns that these leave
-    undetermined are set to zero; if that is not an optimum, multipliers close to the
-    least ones (`_least_multipliers`) are tried, and then all values of `s`. The
-    solution of the equations has to satisfy the KKT conditions of all rows exactly.
+    The rows with a multiplier in `s` become equations. Unknowns that these equations
+    leave undetermined are set to zero. If the result is not optimal, they are set to
+    multipliers close to the least ones (`_least_multipliers`), and then to the values
+    of `s`. The solution of the equations must satisfy the KKT conditions of all rows
+    exactly.
     """
     if len(qp.sets) > 1:
         return None
@@ -271,8 +272,8 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
 def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
     """Compute an optimum in rational arithmetic by primal-dual active-set steps.
 
-    Rows with multipliers of the wrong sign leave the set, violated ones enter it.
-    Returns None when a set recurs, since the same sets would follow for ever.
+    Rows with multipliers of the wrong sign leave the set, and violated rows enter it.
+    Returns None if a set recurs, since the iteration would then cycle.
     """
     if len(qp.sets) > 1:
         return None
@@ -297,7 +298,7 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
 
 
 class _ExactPoint(NamedTuple):
-    """A point in fractions."""
+    """A primal-dual point in fractions."""
 
     x: Any  #: (n,)
     y: Any  #: (m,)
@@ -339,10 +340,10 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Mark the KKT conditions that a solution of the KKT equations violates.
+    """Return masks of the KKT conditions that a solution of the KKT equations violates.
 
-    Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a bound that is
-    absent or not active.
+    These are Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a
+    bound that is absent or inactive.
     """
     below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
     under, over = np.zeros(qp.q.size, dtype=bool), np.zeros(qp.q.size, dtype=bool)
@@ -370,7 +371,7 @@ def _exact(qp: QP, s: Solution, point: _ExactPoint) -> ExactOptimum:
 def _with_others(
     qp: QP, s: Solution, is_coupled: NDArray[np.bool_]
 ) -> ExactOptimum | None:
-    """Compute the exact optimum of the coupled variables, and of each other alone."""
+    """Return the exact optimum, with each uncoupled variable computed alone."""
     P = csr_array(qp.P)
     part = replace(
         qp,
@@ -410,7 +411,7 @@ def proves(solve: Reference) -> Proves:
     optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
-        if id(qp) not in optima:  # the QP is kept, or another could get its id
+        if id(qp) not in optima:  # the QP is kept alive, so that its id stays unique
             optima[id(qp)] = qp, proven_optimum(qp, solve)
         return optima[id(qp)][1]
 
@@ -422,12 +423,12 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 
 
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
-    """Return the least multipliers if several balance the gradient.
+    """Return the least multipliers if the multipliers that balance the gradient vary.
 
-    Among all multipliers of the rows that have one in `s`, these minimise the sum of
-    the squares of λᵢ times the terms of row i; a row whose sign would change gets the
-    multiplier zero. Return `s` if the remaining rows do not balance the gradient, up to
-    a negligible part, or if there are other sets than bounds.
+    Among all multipliers of the rows with a multiplier in `s`, they minimise the sum of
+    the squares of λᵢ times the terms of row i. A row whose sign would change gets the
+    multiplier zero. Returns `s` if the remaining rows do not balance the gradient up to
+    a negligible part, or if the QP has sets other than bounds.
     """
     if len(qp.sets) > 1:
         return s
@@ -460,7 +461,7 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
 
 def _size(qp: QP, s: Solution) -> float:
-    """Sum the absolute terms of f and of λᵀ(Bx − c), which rounding of x changes."""
+    """Sum the absolute terms of f and of λᵀ(Bx − c), which scale their rounding."""
     x = np.abs(s.x)
     rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
     work = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)

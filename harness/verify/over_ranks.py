@@ -1,17 +1,18 @@
 """Certificate of decomposed bodies, computed by the ranks that store the subdomains.
 
-The mathematics is that of `harness.verify.substructured`; sums are completed by MPI
-reductions. Each rank stores the components that its subdomains touch, and copies of a
-component on several ranks have equal values. The rows of contact and friction, which
-are as many as there are nodes on the sides, and the coarse problem are replicated.
+The mathematics is that of `harness.verify.substructured`; MPI reductions complete the
+sums. Each rank stores the components of its subdomains. A component on several ranks
+has the same value on all of them. Two kinds of data are replicated on all ranks: the
+rows of contact and friction, about as many as there are nodes on the sides, and the
+coarse problem.
 
-If contact alone supports a body, its rigid motions R are a few distributed columns, and
-products with Rᵀ are reductions in extended precision. The balance of λ̂ with the load
-(`harness.verify.admissible.Balance`) needs only the load along R, and the motion of the
-contact rows, which is replicated.
+If only contact supports a body, its rigid motions R are a few distributed columns, and
+products with Rᵀ are reductions in extended precision. The equilibrium of λ̂ with the
+load (`harness.verify.admissible.Balance`) requires only the load along R and the
+replicated motion of the contact rows.
 
-K is defined as the sum TᵀK_T T over subdomains, since it is not assembled: the rounding
-of an assembled K is not part of the problem.
+K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so the certificate
+contains no rounding of its assembly.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ from mortarbench.harness.verify.substructured import (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contact:
-    """Rows of contact, then of friction with a positive bound; replicated."""
+    """Contact rows, followed by friction rows with a positive bound; replicated."""
 
     rows: csr_array  #: (m, n) rows, with global components as columns
     c: Vector  #: (m,)
@@ -76,23 +77,23 @@ class Contact:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FloatingBodies:
-    """Local rows of the rigid motions of bodies that supports do not fix.
+    """Rigid motions of bodies that supports do not fix, at the components of a rank.
 
-    Columns are orthonormal to double precision, with the inner product over the
-    components of all ranks.
+    Columns are orthonormal to double precision in the inner product over the components
+    of all ranks.
     """
 
     motions: (
         csr_array  #: (n, k) rigid motions of each body in turn, regardless of supports
     )
-    #: (k, r) combinations that do not move prescribed components
+    #: (k, r) coefficients of motions that do not move prescribed components
     combinations: NDArray[np.float64]
     names: tuple[str, ...]  #: names of these bodies
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalBodies:
-    """The part of decomposed bodies that one rank stores."""
+    """Part of decomposed bodies that one rank stores."""
 
     ranks: Ranks
     #: subdomains of the body; T has a column for each of its components
@@ -101,12 +102,13 @@ class LocalBodies:
     shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
     coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
     motions: int  #: number of columns of R on all ranks
-    f: Vector  #: (N,) load; that of a component is the sum over its copies
+    f: Vector  #: (N,) load; the load of a component is the sum over its copies
     fixed: NDArray[np.int64]  #: (h,) positions in `components` of the prescribed ones
     contact: Contact
     floating: FloatingBodies
-    #: (n, n) K as assembled by a single process; None on several. Its rounding is then
-    #: part of the problem if an answer moves bodies together with their supports
+    #: (n, n) K as assembled by a single process; None on several ranks. If an answer
+    #: moves bodies together with their supports, the rounding of K is part of the
+    #: problem
     stored: csr_array | None = None
 
     @cached_property
@@ -123,24 +125,24 @@ class MPIReduction:
         mine = local.components[local.shared]
         interface = np.unique(np.concatenate(comm.allgather(mine)))
         self._size = interface.size
-        #: (n,) position of each component among all shared ones, -1 for inner ones
+        #: (n,) position of each component among all shared ones; -1 if it is not shared
         self._place = np.full(local.components.size, -1)
         self._place[local.shared] = np.searchsorted(interface, mine)
         first = np.full(interface.size, comm.size)
         first[self._place[local.shared]] = comm.rank
         lowest = np.min(comm.allgather(first), axis=0)
-        #: (n,) mask of the components that count here: no lower rank stores them
+        #: (n,) mask of the components that this rank counts: no lower rank stores them
         self.is_owner = np.ones(local.components.size, dtype=bool)
         self.is_owner[local.shared] = lowest[self._place[local.shared]] == comm.rank
 
     def summed(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Sum arrays in the order of the ranks; all ranks get the same digits."""
+        """Sum arrays in the order of the ranks; all ranks get identical sums."""
         parts = np.empty((self._local.ranks.size, *x.shape), dtype=x.dtype)
         self._local.ranks.comm.Allgather(x, parts)
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add what other ranks contribute to components `at` (t,), or to all (n,)."""
+        """Add contributions of other ranks to components `at` (t,), or to all."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)
@@ -170,7 +172,7 @@ class MPIReduction:
     def values_at(self, v: NDArray[Any], at: NDArray[np.int64]) -> Any:
         """Return the values of v (n,) at global components `at` (w,), on all ranks."""
         places, here = self.places(at)
-        owned = self.is_owner[places[here]]  # each component from one rank only
+        owned = self.is_owner[places[here]]  # count each component on one rank only
         values = np.zeros(at.size, dtype=v.dtype)
         values[np.flatnonzero(here)[owned]] = v[places[here][owned]]
         return self.summed(values)
@@ -178,13 +180,16 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local places of global components (w,), and a mask of those here."""
+        """Return local positions of global components (w,), and a mask of these."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S  (r, r),  with M and S summed over all ranks."""
+        """Return  M − Sᵀ diag(scale) S  (r, r),  with M and S summed over all ranks.
+
+        S has a row for each shared component `at` (t,).
+        """
         r, comm = self._local.motions, self._local.ranks.comm
         place = self._place[at]
         # components of a single rank enter its own matrix; only shared ones are sent
@@ -215,8 +220,8 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; all ranks call this and get the same bound.
 
-    The pairs tried are those of `harness.verify.certificate.certify`, except the third,
-    which exchanges rows.
+    The pairs tried are those of `harness.verify.certificate.certify`, except for the
+    exchange of rows.
 
     Parameters
     ----------
@@ -225,7 +230,7 @@ def certify_over_ranks(
 
     Returns
     -------
-    a certificate whose `u` and `off` are those of local components and subdomains
+    a certificate; its `u` and `off` contain local components and subdomains only
 
     Raises
     ------
@@ -288,12 +293,12 @@ def _admissible_pair(
     lam: Extended,
     closed: NDArray[np.bool_],
 ) -> tuple[Extended, Extended, Extended]:
-    """Return û at the components of the rows (w,) and at local ones (n,), and λ̂.
+    """Return û at the components in rows (w,), û at local components (n,), and λ̂.
 
     Raises
     ------
     UncertifiableError
-        When there is no admissible pair near the answer.
+        When no admissible pair near the answer is found.
 
     """
     at, softness, start = trace
@@ -309,7 +314,7 @@ def _admissible_pair(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows restricted to the components they touch (w,), and 1/Kᵢᵢ (w,)."""
+    """Return the rows, restricted to their w components, and 1/Kᵢᵢ (w,)."""
     contact = local.contact
     B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
@@ -336,19 +341,19 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _RigidMotions:
-    """Rigid motions that the supports allow, and the balance of the load along them.
+    """Rigid motions that the supports allow, and the equilibrium of loads along them.
 
     Columns are orthonormal in extended precision, with the inner product over the
-    components of all ranks. The K of subdomains is exactly zero along them.
+    components of all ranks. K_T is exactly zero along them.
     """
 
-    #: (n, r) sparse, at local components. Contact rows open or close along the first p
-    #: motions (felt by contact); along the others (free), gaps change by rounding only
+    #: (n, r) sparse, at local components. The first p motions change gaps
+    #: ("constrained"); the others ("free") change gaps by rounding only
     all: Any
-    at_rows: NDArray[np.float64]  #: (w, p) felt motions at the components of the rows
+    at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
-    balance: Balance  #: balance of the load along constrained motions
-    driven: str = ""  #: the load along free motions that nothing balances, if any
+    balance: Balance  #: equilibrium of the load along constrained motions
+    driven: str = ""  #: error message for a load along free motions, if there is one
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:
         """Subtract the free motions from v (n,)."""
@@ -360,7 +365,7 @@ class _RigidMotions:
         return np.asarray(v - self.all @ along)
 
     def moved(self, v: Extended, alpha: Extended) -> Extended:
-        """Add felt motions with the coefficients alpha (p,) to v (n,)."""
+        """Add constrained motions with the coefficients alpha (p,) to v (n,)."""
         if not alpha.size:
             return v
         free = np.zeros(self.all.shape[1] - alpha.size)
@@ -370,9 +375,9 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions into those that the contact rows feel, and free ones.
+    """Split the rigid motions into those that change gaps, and free ones.
 
-    at : (w,) global components that the rows touch
+    at : (w,) global components in the rows
     """
     reduction, parts, floating = local.reduction, local.parts, local.floating
 
@@ -387,7 +392,7 @@ def _rigid_motions(
         )
 
     def at_components(R: Any) -> NDArray[Any]:
-        """Return columns (n, k) at these components on all ranks: (w, k)."""
+        """Return columns (n, k) at the components `at`, over all ranks: (w, k)."""
         columns = (R[:, [k]].toarray().ravel() for k in range(R.shape[1]))
         return np.stack([reduction.values_at(column, at) for column in columns], axis=1)
 
@@ -437,7 +442,7 @@ def _orthonormal(local: LocalBodies, R: csr_array) -> Any:
 
 
 def _largest(local: LocalBodies, R: Any) -> Extended:
-    """Return the largest absolute entry of each column (k,) over all ranks."""
+    """Return the largest absolute entry (k,) of each column over all ranks."""
     found = abs(csc_array(R))
     sizes = found.max(axis=0).toarray().ravel() if found.nnz else np.zeros(R.shape[1])
     return np.asarray(np.max(local.ranks.comm.allgather(sizes), axis=0))
@@ -447,11 +452,11 @@ class _OnRanks:
     """Bodies distributed over ranks; see `harness.verify.substructured.Split`.
 
     K is not assembled. The residual is that of TᵀK_T T, with the exact kernels of the
-    subdomains, and E is estimated by samples of the rounding of doubles.
+    subdomains. E is estimated by sampling the rounding of double precision.
     """
 
     def __init__(self, local: LocalBodies) -> None:
-        """Compute the data that all pairs share."""
+        """Compute the data that are common to all pairs."""
         self._local = local
         #: (w,) components that the rows touch
         self.at = np.unique(local.contact.rows.indices).astype(np.int64)
@@ -522,7 +527,7 @@ class _OnRanks:
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         if self._local.stored is not None:
-            # where w moves bodies together with their supports, the terms of Kw cancel
+            # if w moves bodies together with their supports, the terms of Kw cancel
             v = self.spread(w)
             Kw, Kv = cancelling(self._local.stored, w[:, None])[:, 0], self.product(v)
             off = Kw - self.joined(Kv)

@@ -17,8 +17,8 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 
     Returns
     -------
-    a function of a guess: the solution whose unknowns without a pivot are those of the
-    guess
+    a function that maps a guess (n,) to the solution that agrees with the guess in all
+    unknowns without a pivot
 
     """
     rows, pivots = np.column_stack([M, b]), list[int]()
@@ -49,9 +49,10 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 def nonnegative_solution(M: Any, b: Any) -> Any | None:
     """Return w ≥ 0 with Mw = b from the simplex method, or None if none exists.
 
-    It is phase one, which minimises the sum of an artificial variable per row. Bland's
-    rule (1977) takes the first column with a negative cost and, of the binding rows,
-    the one whose basic variable comes first. No basis recurs, so degenerate steps end.
+    Phase one of the method minimises the sum of one artificial variable per row.
+    Bland's rule (1977) selects the first column with a negative cost and, among the
+    binding rows, the one with the first basic variable. No basis recurs, so degenerate
+    steps terminate.
 
     M, b : arrays of fractions
     """

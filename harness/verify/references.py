@@ -1,11 +1,10 @@
-"""Reference solutions of contact problems, to more digits than solvers reach.
+"""Reference solutions of contact problems, more accurate than those of solvers.
 
-The injected reference solve, which is none of the solvers under test, identifies the
-closed rows from the dual of the contact rows. `harness.verify.active_set_refinement`
-then computes the solution in extended precision, and `harness.verify.certificate`
-bounds its error, as for any answer. Only the states of the rows and the multipliers,
-for the directions of slip, are cached in a file. They are an initial guess when they
-are read.
+An injected reference solver, which is not under test, identifies the closed rows from
+the dual QP of the contact rows. `harness.verify.active_set_refinement` then computes
+the solution in extended precision, and `harness.verify.certificate` bounds its error.
+Only the states of the rows and the multipliers (for the directions of slip) are cached
+in a file; when read, they serve as an initial guess.
 """
 
 from __future__ import annotations
@@ -35,8 +34,9 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-MAX_CACHED_BOUND = 1e-7  #: largest error bound of a solution from cached rows
-STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}  #: in the cache
+MAX_CACHED_BOUND = 1e-7  #: larger error bounds discard the cached states
+#: Names and types of the cached arrays.
+STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 
 
 class UnsolvedError(Exception):
@@ -63,16 +63,16 @@ class ReferencePoint:
 def reference_point(
     mechanics: Mechanics, solve: Reference, folder: Path | None = None
 ) -> ReferencePoint:
-    """Solve the elastic problem behind a case, starting from cached states if any.
+    """Solve the elastic problem of a case, starting from cached states if available.
 
-    solve : identifies the closed rows from  min ½λᵀFλ − dᵀλ,  RᵀBᵀλ = Rᵀf,  with λ ≥ 0
-        for contact and |λ| ≤ g for friction
-    folder : cache of the states, a file per problem; None for no cache
+    solve : identifies the closed rows from min ½λᵀFλ − dᵀλ with RᵀBᵀλ = Rᵀf, λ ≥ 0 for
+        contact and |λ| ≤ g for friction
+    folder : cache of the states, with a file per problem; None for no cache
 
     Raises
     ------
     UnsolvedError
-        When no admissible pair was found, or `solve` failed.
+            When no admissible pair is found, or `solve` fails.
 
     """
     mechanics = mechanics.whole
@@ -94,7 +94,7 @@ def reference_point(
 
 
 def _stored(path: Path, exact: Exact) -> ActiveSet | None:
-    """Read a cached active set; None if the file is damaged."""
+    """Read a cached active set; return None if the file is damaged."""
     try:
         arrays = read_arrays(path, tuple(STORED))
     except InputError:
@@ -107,7 +107,7 @@ def _stored(path: Path, exact: Exact) -> ActiveSet | None:
     if not fits or (np.abs(states) > 1).any() or not np.isfinite(multipliers).all():
         return None
     states = np.where(exact.contact & (states == UPPER), CLOSED, states)
-    # a huge push, of which only the direction counts
+    # a large value, of which `predicted` uses only the direction
     pushed = predicted(
         exact.forces, 0 * multipliers.astype(Real), exact.compliance, multipliers
     )
@@ -133,7 +133,7 @@ def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
-    """Guess the states of the rows by the dual QP.
+    """Guess the states of the rows from the solution of the dual QP.
 
     If there are no rows, or too many for a dense matrix, the guess follows from the
     displacement without contact.

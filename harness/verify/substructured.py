@@ -4,26 +4,28 @@ The certificate (`harness.verify.certificate`) is formulated for a stiffness
 
     K = TᵀK_T T + E,      K_T = diag(K_1 … K_S),
 
-where the kernel of every K_s is exactly the rigid motions of its subdomain, and E is
-rounding. For admissible û and λ̂ it needs the residual  ρ = Kû − f + Bᵀλ̂  on the
-components without support, in extended precision and with the stored K, and a d with
+where the kernel of every K_s consists exactly of the rigid motions of its subdomain,
+and E is rounding. For admissible û and λ̂ it requires two vectors: the residual ρ = Kû
+− f + Bᵀλ̂ on components without support, in extended precision and with the stored K,
+and a solution d of
 
     TᵀK_T d = ρ                                                                  (5)
 
-to double precision; the residual of (5) is measured. An undivided body is a single
+in double precision, whose residual is measured. An undivided body is a single
 subdomain, T = I, with its supports eliminated: d = K⁺ρ (`Undivided`). For decomposed
-bodies, forces b with Tᵀb = ρ in balance on every subdomain, R_Tᵀb = 0, are those of
-balancing domain decomposition (Mandel 1993), which weights copies by their stiffness W,
+bodies, forces b with Tᵀb = ρ that are in equilibrium on every subdomain, R_Tᵀb = 0, are
+those of balancing domain decomposition (Mandel 1993). Copies are weighted by their
+stiffness W,
 
     b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
       Z = W − WT(TᵀWT)⁻¹TᵀW
 
 where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on the others: the
-range of Z contains the forces of gluing and supports. Then K_T d = b is a small Neumann
-problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three rows per
-subdomain in the plane. It is singular along motions of whole bodies that only contact
-resists; λ̂ balances the load along these (`harness.verify.admissible.balanced`). The
-multipliers of gluing and supports in an answer are not used.
+range of Z contains the gluing and support forces. Then K_T d = b is a small Neumann
+problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three rows per plane
+subdomain. It is singular along motions of whole bodies that only contact resists; λ̂
+balances the load along these motions (`harness.verify.admissible.balanced`).
+Multipliers of gluing and supports in an answer are not used.
 """
 
 from __future__ import annotations
@@ -49,15 +51,17 @@ from mortarbench.harness.mechanics import (
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.verify.products import times_columns
 
-#: Safety factor of the relative difference of energies in K and K_T, estimated at û. It
-#: is largest for the softest displacements, and û is close to these.
+#: Safety factor of the relative difference of the energies in K and K_T. It is
+#: estimated at û. The difference is largest for the softest displacements, and û is
+#: among these.
 SAFETY = 16
 #: Error of a sum over one row of K in `sample`, in units in the last place, with random
 #: signs. The measured standard deviation is 0.4 to 0.5 for sums in extended precision,
 #: and 0.2 to 3.6 for the stored K u against TᵀK_T T u.
 RANDOM_ULPS = 4.0
-#: The same with the sign of u. A slender body has few soft modes, which random signs
-#: may miss: with ¼, the error of a plate 60 : ½ exceeded its bound by 1 %.
+#: Part of that error with the sign of u, in the same unit. Random signs may miss the
+#: few soft modes of a slender body: with ¼, the error of a plate 60 : ½ exceeded its
+#: bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative size of a correction of d that ends the refinement. Bounds are reported to
@@ -69,8 +73,8 @@ class Split(Protocol):
     """Operations of the certificate with K = TᵀK_T T + E.
 
     Vectors of components (n,) have extended precision, and are zero on fixed
-    components. Columns of R are the rigid motions that the supports allow, first those
-    that contact feels.
+    components. Columns of R are the rigid motions that the supports allow; the first
+    ones change contact gaps.
     """
 
     def along(self, v: Extended) -> Extended:
@@ -98,19 +102,19 @@ class Split(Protocol):
         """Return K_T v (N,)."""
 
     def solve(self, rho: Extended) -> Vector:
-        """Return d (N,) of (5) to the digits of doubles, for ρ with Rᵀρ = 0."""
+        """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
 
     def total(self, *numbers: float) -> list[float]:
         """Add numbers over all subdomains."""
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along the `supported` motions (p, h), of those that contact feels."""
+        """Bound E along `supported` (p, h) combinations of motions that change gaps."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Ew (n,) and |wᵀEw| for w with Rᵀw = 0, nonzero on fixed components."""
 
     def scattered(self, v: Extended) -> Extended:
-        """Return √((R∘R)ᵀ(v∘v)) (r,), the size of Rᵀv for v (n,) with random signs."""
+        """Return √((R∘R)ᵀ(v∘v)) (r,), the size of Rᵀv for random signs of v (n,)."""
 
     def noise(self, u: Extended) -> Extended:
         """Return a sample (n,) of the rounding of Ku − f in `residual`."""
@@ -137,7 +141,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) in the same way; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) for the same e; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
@@ -146,7 +150,7 @@ class Neighbour(NamedTuple):
 
     d: Extended  #: (N,) computed part
     Kd: Extended  #: (N,) K_T d
-    left: float  #: bound of the energy norm of the rest
+    left: float  #: bound of the energy norm of the error of d
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
@@ -159,8 +163,8 @@ def without_rigid_motion(split: Split, v: Extended) -> Extended:
 def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
-    The step that would come next is not added, but bounds the rest: if each step is at
-    most q times the one before, the remaining ones add up to at most size/(1 − q).
+    The last step is not added; it bounds the error instead. If each step is at most q
+    times the previous one, the remaining steps sum to at most size/(1 − q).
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
@@ -180,7 +184,7 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
 
 
 def length(split: Split, force: Extended) -> float:
-    """Return the dual norm of forces (n,), less their part along rigid motions."""
+    """Return the dual norm of forces (n,) without their part along rigid motions."""
     d = split.solve(without_rigid_motion(split, force)).astype(Real)
     square = split.total(float(d @ split.product(d)))[0]
     return float(np.sqrt(max(square, 0.0)))
@@ -192,11 +196,11 @@ def sample(
     """Return a sample (n,) of the rounding of a product with u in the precision `real`.
 
     The error of each sum is a few units in the last place of √`variances`, the root of
-    the sum of the squares of its terms: RANDOM_ULPS with a random sign, so that all
-    modes occur, and SMOOTH_ULPS with the sign of u, which is softer than most modes.
-    The random sign is a hash of the component number (n,), so that ranks agree on it.
-    The hash is that of splitmix64, because signs that alternate more evenly than at
-    random do no work along smooth modes.
+    the sum of its squared terms. It has two parts: RANDOM_ULPS with a random sign,
+    which excites all modes, and SMOOTH_ULPS with the sign of u, which is softer than
+    most modes. The random sign is a hash of the component number (n,), so that ranks
+    agree on it. The hash is splitmix64, since signs that alternate too regularly do no
+    work along smooth modes.
     """
     x = components.astype(np.uint64) + np.uint64(1)
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -239,7 +243,7 @@ class _Stored(ABC):
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
         """Return Ku, and vᵀKv and v for v = u − Rα.
 
-        Ku is Kv + (KR)α: KR was computed with twice the digits, since its terms cancel.
+        Ku is Kv + (KR)α. The terms of KR cancel, so it is stored with twice the digits.
         """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u
@@ -258,7 +262,7 @@ class _Stored(ABC):
         return self.free(found)
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Kw − TᵀK_T Tw on free components, and the difference of energies.
+        """Return Kw − TᵀK_T Tw on free components, and the difference of the energies.
 
         If w moves bodies far together with their supports, the terms of Kw cancel.
         """
@@ -330,7 +334,7 @@ class Reduction(Protocol):
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add the other contributions to components `at` (t,), or to all (n,)."""
+        """Add contributions of other processes to components `at` (t,), or to all."""
 
     def gathered(self, alpha: Vector) -> Vector:
         """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
@@ -346,7 +350,7 @@ class Reduction(Protocol):
 
 
 class Sharing:
-    """Distribution of forces ρ over subdomains, in balance on each.
+    """Distribution of forces ρ over subdomains, such that each is in equilibrium.
 
     Z acts only on interfaces and fixed components: for a component with a single copy,
     W − WT(TᵀWT)⁻¹TᵀW vanishes.
@@ -399,15 +403,15 @@ class Sharing:
         return _coarse_solve(coarse, self._floating)
 
     def variances(self, v: Extended) -> Vector:
-        """Return (K∘K)(u∘u) (n,), with the squares of v = Tu in every subdomain."""
+        """Return (K∘K)(u∘u) (n,), summed over subdomains with the squares of v = Tu."""
         squares = self._parts.squared_product(v.astype(np.float64) ** 2)
         return np.asarray(self._reduction.completed(self._squares.T @ squares))
 
     def __call__(self, rho: Vector) -> Vector:
-        """Return b (N,) in balance with Tᵀb = ρ (n,) on free components."""
+        """Return b (N,) with Tᵀb = ρ (n,) on free components and R_Tᵀb = 0."""
         parts, reduction = self._parts, self._reduction
         b = self.part * (parts.spread @ rho)
-        for _ in range(2):  # the second pass restores digits that the first one cancels
+        for _ in range(2):  # the second pass restores digits lost by cancellation
             mu = reduction.local_part(
                 self._coarse(reduction.gathered(parts.kernel.T @ b))
             )

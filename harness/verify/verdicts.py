@@ -37,7 +37,7 @@ from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
 from mortarbench.harness.verify.optimum import Proves, decided
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
-#: Version of the data in a run_id, independent of the schema of records.
+#: Version of the data that form a run_id, independent of the schema of records.
 IDENTITY = 1
 
 
@@ -99,9 +99,9 @@ def judged(
     prove: Proves | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> Record:
-    """Return a record with the claims of an answer `s`, its residuals and the verdict.
+    """Return a record with the claims of an answer `s`, its residuals and its verdict.
 
-    prove : returns the proven optimum of `qp` if residuals cannot decide
+    prove : returns the proven optimum of `qp`; called if residuals cannot decide
     values : residuals and objective, if ranks have evaluated them
     """
     record = record.replace(
@@ -147,7 +147,7 @@ def judged(
 
 
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Evaluate the physical quantities of a point; if that fails, return a note."""
+    """Return the physical quantities of a point, and a note on failure."""
     if not has_point(s):
         return {}, ""
     try:
@@ -161,14 +161,14 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     """Bound the error of a point; return fields of its record, and a note on failure.
 
     ``energy_bound`` bounds the errors of the answer and of û and u_λ
-    (`harness.verify.certificate`). ``certificate`` has its components, relative to a
-    lower bound of ‖u*‖: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` =
+    (`harness.verify.certificate`). ``certificate`` contains its components, relative to
+    a lower bound of ‖u*‖: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` =
     √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer alone), `moved` = ‖u − û‖, and
-    `friction`, the frictional part of `work`; `seminorm` is 1 if bodies can move
-    rigidly, which is not bounded.
+    `friction`, the frictional part of `work`. `seminorm` is 1 if bodies can move
+    rigidly; these motions are not bounded.
 
     Without mechanics, a positive `least_eigenvalue` of an operator P bounds the error
-    of x in the norm of P instead (`certify_by_eigenvalue`).
+    of x in the norm of P (`certify_by_eigenvalue`).
     """
     if not has_point(s):
         return {}, ""
@@ -183,7 +183,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
         return certify(mechanics, mechanics.to_primal(s))
 
     result = _certified(certificate)
-    if not was_loaded and LATE_IMPORT in sys.modules:  # measured again, without import
+    if not was_loaded and LATE_IMPORT in sys.modules:  # repeat without the import time
         result = _certified(certificate)
     return result
 
@@ -193,14 +193,13 @@ def evaluated_by_ranks(
 ) -> dict[str, Any]:
     """Evaluate an answer on all ranks, from the local slices of the solution.
 
-    It uses a new share of the QP, which the solver has not touched. All ranks call it,
-    and a failure on one rank is a failure on all (`harness.distributed.failures`).
+    The evaluation uses a new share of the QP, which the solver cannot have modified.
+    All ranks call this function, and a failure on one rank is a failure on all
+    (`harness.distributed.failures`).
 
-    Returns
-    -------
-    `values`: objective and residuals, None if they need the whole QP; `bounds`: fields
-    of `certified`, and `quantities`, None if they need the whole QP; `recover_seconds`:
-    time of the quantities; `notes` on failures.
+    Returns ------- `values`: objective and residuals, None if they need the whole QP;
+    `bounds`: fields of `certified`; `quantities`, None if they need the whole QP;
+    `recover_seconds`: time of the evaluation of the quantities; `notes` on failures.
 
     """
     found: dict[str, Any] = {
@@ -239,10 +238,10 @@ def evaluated_by_ranks(
 def _values_by_ranks(
     emitted: DistributedQP, s: Solution, ranks: Ranks
 ) -> dict[str, float] | None:
-    """Evaluate objective and residuals; None if they are not finite.
+    """Evaluate objective and residuals; return None if they are not finite.
 
-    Also None if a scale of energy needs the whole QP: a distributed vector raises
-    TypeError for operations that its slice does not determine.
+    Also returns None if a scale of energy needs the whole QP: a distributed vector
+    raises TypeError for operations that its slice does not determine.
     """
     qp = emitted.share().qp
     qp = replace(qp, G=DistributedColumns(no_rows(qp.q.size), ranks))
@@ -278,7 +277,7 @@ def _certified(
 
 
 def has_point(s: Solution) -> bool:
-    """Return True if there are variables, and all four vectors are finite."""
+    """Return True if there are variables and all four vectors are finite."""
     return bool(s.x.size) and all(
         np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box)
     )
