@@ -212,6 +212,9 @@ cdef extern from "discs.h" nogil:
                        const double *p, const double *Hp, double tau, double *phi,
                        double *free, double *result)
     void chop_discs(const discs *D, const double *x, const double *g, double *beta)
+    int mark_discs(const discs *D, const double *x, double *free)
+    void tangential_discs(const discs *D, const double *x, const double *g,
+                          const double *v, double *w)
     void step_on_discs(const discs *D, const double *x, const double *g, double length,
                        bint free_only, double *s, double *result)
     double inward_energy_of_discs(const discs *D, const double *x, const double *g,

@@ -254,6 +254,44 @@ static void step_on_discs(const discs *D, const double *x, const double *g,
         WITH_DIMENSION(D, step_on_each, x, g, length, 0, s, result);
 }
 
+/* free = 1 on discs off their boundary, else 0; return 1 if that changes any of them. */
+static int mark_discs(const discs *D, const double *x, double *free)
+{
+    int changed = 0;
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double inside = is_inside(D, i, square_of_disc(D, 0, i, x));
+        FOR_VARIABLES(D, i, 0, j) {
+            changed |= free[j] != inside;
+            free[j] = inside;
+        }
+    }
+    return changed;
+}
+
+/* w = T(w + κv) on discs that g holds on their boundary, where T removes the part along
+   the normal n and κ = −nᵀg/‖x + c‖ is the multiplier of ½(‖x + c‖² − r²) ≤ 0, by which
+   the boundary curves the cost. Zero on discs of radius zero.
+
+   v : NULL for zero */
+static void tangential_discs(const discs *D, const double *x, const double *g,
+                             const double *v, double *w)
+{
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double square = square_of_disc(D, 0, i, x), along = 0;
+        int is_point = D->radius[i] == 0;
+        if (is_inside(D, i, square))
+            continue;
+        double share = is_point ? 0 : held_share(D, 0, i, x, g, square);
+        if (share < 0)
+            FOR_VARIABLES(D, i, 0, j)
+                along += about_centre(D, x, j) * w[j] / square;
+        FOR_VARIABLES(D, i, 0, j) {
+            double bend = share < 0 && v ? share * v[j] : 0;
+            w[j] = is_point ? 0 : w[j] - along * about_centre(D, x, j) - bend;
+        }
+    }
+}
+
 /* Return Σ (norm gᵢ)²/Dᵢᵢ over the projected gradient on discs, see `inward_energy`. */
 static double inward_energy_of_discs(const discs *D, const double *x, const double *g,
                                      const double *diagonal, double norm, double noise)

@@ -44,6 +44,7 @@ STEPS = {
     "e": "expansion",
     "f": "fallback",
     "p": "proportioning",
+    "n": "newton",
 }
 #: "solved" is claimed if the KKT residuals are within this factor of the tolerance
 CLAIM_FACTOR = 5.0

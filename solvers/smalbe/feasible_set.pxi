@@ -205,6 +205,34 @@ cdef class FeasibleSet:
         if self.D.count:
             chop_discs(&self.D, x, g, beta)
 
+    cdef bint marks(self, const double *x, double *free) noexcept:
+        """free ← 1 off the boundary, else 0; return True if that changes any of them."""
+        cdef Py_ssize_t i
+        cdef double inside
+        cdef bint changed = False
+        for i in range(self.n):
+            if self.has_bound(i):
+                inside = self.lower[i] < x[i] < self.upper[i]
+                changed = changed or free[i] != inside
+                free[i] = inside
+        return mark_discs(&self.D, x, free) or changed
+
+    cdef void follow(
+        self, const double *x, const double *g, const double *v, double *w
+    ) noexcept:
+        """w ← T(w + κv), T the projection on the tangents of the boundary at x.
+
+        Bounds that x attains remain active, and so do discs that g holds on their
+        boundary, whose multiplier κ is the curvature of the cost along it (discs.h).
+
+        v : NULL for zero
+        """
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            if not self.lower[i] < x[i] < self.upper[i]:
+                w[i] = 0.0
+        tangential_discs(&self.D, x, g, v, w)
+
     cdef void project_free(
         self, const double *x, const double *g, double tau, double *y
     ) noexcept:

@@ -41,6 +41,10 @@ cdef enum:
     # problem with 88 to 1468 discs takes as many products with 10 or 40, 2 % more with 5
     # and 35 % more with 1, which is monotone; with 10 428 discs, 12 % more with 10.
     MEMORY = 20
+    # Spectral steps in a row on an unchanged face before the first Newton step.
+    SETTLED_FACE = 10
+    # Most of them before a further one.
+    MAX_PATIENCE = 200
 
 
 # Share of the linear decrease that a spectral step must achieve (Armijo).
@@ -50,6 +54,9 @@ cdef double SUFFICIENT_DECREASE = 1e-4
 # to 11 % more products.
 cdef double LONG_STEP = 0.5
 
+
+# Share of the tangential gradient that conjugate gradients leave of a Newton step.
+cdef double NEWTON_ACCURACY = 0.1
 
 # Factor of Γ² for spectral steps, which decrease φ as well as β. Over Mindlin's problem
 # with 60 to 1468 discs 0.01 and 1 take 5 % more products on average.
@@ -180,6 +187,11 @@ cdef class MPRGP:
     directions of slip vary, CG cannot follow them: it begins on a face only if a step of
     length α along φ stays in the set.
 
+    Spectral steps take products in proportion to the condition of H once the face is
+    settled. *Newton steps* (n) then follow: x ← P(x − d), where d minimises the second-order
+    model of the cost on the tangents of the boundary, (H + κT)d = Tg, by CG. They are
+    taken only if the cost decreases.
+
     Every step except those of projcg and spectral steps decreases the cost, and with the model τI by as much
     as the rate of the book requires. Except for the first expansion by a model with
     directions, an expansion does not free components that the half step left on the
@@ -234,6 +246,9 @@ cdef class MPRGP:
     cdef IncompleteFactor factor  # of the free part of a sparse P; None for none
     cdef long layers  # of neighbours that a proportioning lets go as well
     cdef Directions directions
+    cdef Directions tangents  # those of CG for a Newton step
+    cdef double *marked  # 1 off the boundary, else 0, at the last spectral step
+    cdef long settled, patience  # spectral steps on that face, and those before Newton's
     cdef double spectral_length  # α of the last step; 0 before the first one
     cdef double cost_now  # relative to the cost at the start of the run
     cdef double costs[MEMORY]  # the last ones
@@ -242,7 +257,7 @@ cdef class MPRGP:
     cdef int make_room(self) except -1:
         """Allocate the vectors."""
         cdef Py_ssize_t n = self.n, r = self.rows.r
-        self.room = Room(16 * n + 3 * r)
+        self.room = Room(17 * n + 3 * r)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -251,9 +266,9 @@ cdef class MPRGP:
         self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
         self.face_set = FeasibleSet.of(at, at + n, n, self.over)
-        self.rhs, self.g0 = at + 2 * n, at + 3 * n
+        self.rhs, self.g0, self.marked = at + 2 * n, at + 3 * n, at + 4 * n
         self.x0 = self.z  # z is recomputed after each expansion
-        at += 4 * n
+        at += 5 * n
         self.Cv, self.Cw, self.Cx = at, at + r, at + 2 * r
         return 0
 
@@ -281,6 +296,7 @@ cdef class MPRGP:
             not self.is_preconditioned()
         ) and not self.set.D.count and self.expansion != SPECTRAL
         self.cost_now, self.n_costs = 0.0, 0
+        self.settled, self.patience = 0, SETTLED_FACE
         self.record_cost(0.0)
         # 1. The face of x, the minimum along the stored directions on it, and the first
         #    direction of conjugate gradients.
@@ -304,6 +320,11 @@ cdef class MPRGP:
                     return 0
                 before, least, cost = fmin(least, before), INFINITY, self.sums[0]
                 check = 2 * len(trace)
+            if self.expansion == SPECTRAL and not inside and self.is_settled():
+                begun = False
+                if self.step_by_newton(most, trace):
+                    self.record_step(b"n", trace, note)
+                continue
             weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
             if self.parts.beta_square > self.Gamma_square * weight:
                 # 3. Proportioning: the boundary promises more decrease than the face.
@@ -535,6 +556,71 @@ cdef class MPRGP:
         self.record_cost(change_along(&self.line, length))
         self.to(length, self.s, self.Hs, False)
         return 1
+
+    cdef bint is_settled(self) except -1:
+        """Return True if spectral steps have left the face unchanged for long."""
+        if self.over.any(self.set.marks(self.x, self.marked)):
+            self.settled = 0
+        else:
+            self.settled += 1
+        return self.settled > self.patience
+
+    cdef bint step_by_newton(self, long most, bytearray trace) except -1:
+        """Step to the minimum on the tangents of the boundary, projected on the set.
+
+        Returns False if that does not decrease the cost. Patience ends where steps halve
+        the projected gradient, and doubles where they do not.
+
+        most : limit of the letters of `trace`, which receives one per step of CG
+        """
+        cdef Py_ssize_t n = self.n
+        cdef double before = self.parts.phi_square + self.parts.beta_square
+        cdef double enough, square
+        cdef double *d = self.x2
+        cdef const double *z
+        self.settled, self.patience = 0, min(2 * self.patience + 1, MAX_PATIENCE)
+        memset(self.phi, 0, n * sizeof(double))
+        for i in range(n):
+            self.free[i] = 1.0
+        self.set.follow(self.x, self.phi, NULL, self.free)
+        if self.is_preconditioned():
+            self.preconditioner.enter(self.free)
+        self.tangents.begin(self.free)
+        memset(d, 0, n * sizeof(double))
+        memcpy(self.phi, self.g, n * sizeof(double))
+        self.set.follow(self.x, self.g, NULL, self.phi)
+        square = self.over.total(dot(self.phi, self.phi, n))
+        enough = NEWTON_ACCURACY * NEWTON_ACCURACY * square
+        while square > enough and len(trace) < most and self.tangents.count < MAX_DIRECTIONS:
+            z = self.preconditioned_gradient()
+            memcpy(self.p, z, n * sizeof(double))
+            self.set.follow(self.x, self.g, NULL, self.p)
+            self.tangents.conjugate(self.phi, self.p)
+            self.H(self.p, self.Hp)
+            self.set.follow(self.x, self.g, self.p, self.Hp)
+            self.sums[0], self.sums[1] = dot(self.phi, self.p, n), dot(self.p, self.Hp, n)
+            self.over.add(self.sums, 2)
+            if self.sums[1] <= 0:
+                break
+            add(self.sums[0] / self.sums[1], self.p, d, n)
+            add(-self.sums[0] / self.sums[1], self.Hp, self.phi, n)
+            self.tangents.add(self.p, self.Hp, self.sums[1])
+            square = self.over.total(dot(self.phi, self.phi, n))
+            trace.append(c"n")
+        self.set.project(self.x, 1.0, d, self.s)
+        for i in range(n):
+            self.s[i] = self.x[i] - self.s[i]
+        self.H(self.s, self.Hs)
+        self.line.slope, self.line.curvature = dot(self.g, self.s, n), dot(self.s, self.Hs, n)
+        self.over.add(&self.line.slope, 1)
+        self.over.add(&self.line.curvature, 1)
+        if change_along(&self.line, 1.0) >= 0:
+            return False
+        self.record_cost(change_along(&self.line, 1.0))
+        self.to(1.0, self.s, self.Hs, False)
+        if 4 * (self.parts.phi_square + self.parts.beta_square) < before:
+            self.patience = 0
+        return True
 
     cdef double searched_projection(self, double tau, double rise) except? -1:
         """Return the length of the step −s = P(x − g/τ) − x; 0 for s = 0. One product.

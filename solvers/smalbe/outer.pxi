@@ -88,6 +88,9 @@ cdef class SMALBE(MPRGP):
         if problem.discs:  # CG takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
+        self.tangents = Directions(
+            self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0, self.over
+        )
         self.choose_directions(spectrum.ritz)
         self.make_room()
 
