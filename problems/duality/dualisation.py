@@ -90,23 +90,17 @@ def dualise(
     f, m_E = -primal.q, primal.b.size
     B_I, c_I = contact_rows(primal, friction)
     B, c = csr_array(vstack([primal.A, B_I])), np.append(primal.b, c_I)
-    R = inverse.kernel
     free = inverse(f) if free is None else free
     structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
     sets = multiplier_sets(m_E, primal.h.size, friction.bound, friction.tangents)
-    qp = _dual(structure, c, inverse, free, sets)
-    if R.shape[1]:
-        qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
+    qp = _dual(structure, c, inverse, f, free, sets)
 
     def recover(s: Solution) -> Solution:
-        u = inverse(f - B.T @ s.x)  # (6)
-        if R.shape[1]:
-            u = u - R @ s.y
+        u = _without_motion(inverse(f - B.T @ s.x), inverse, s)  # (6)
         return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
 
     def interface_displacement(s: Solution) -> Vector:
-        u = free - inverse.at_constraints(B.T @ s.x)
-        return u - R @ s.y if R.shape[1] else u
+        return _without_motion(free - inverse.at_constraints(B.T @ s.x), inverse, s)
 
     return Transformed(
         qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
@@ -119,19 +113,22 @@ def dual_bounds(
     free: Vector | None = None,
     friction: Friction = NO_FRICTION,
 ) -> Transformed:
-    """Dualise the contact rows alone; without friction, the dual has λ ≥ 0 only.
+    """Return the dual with respect to the contact rows alone.
 
     ::
 
-        min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,    F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
+        min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,  RᵀB_Iᵀλ = Rᵀf
+        F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The inverse map is  u = K⁺(f − B_Iᵀλ).  The multipliers of the supports (reactions)
-    follow from stationarity.
+    The equations, which balance the rigid motions R that the supports leave, are absent
+    if there are none. The inverse map is  u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The
+    multipliers of the supports, the reactions, follow from stationarity.
 
     Parameters
     ----------
     primal : QP whose equality rows are unit vectors with zero right-hand side
-    clamped : K⁺ with zero rows and columns at the components that these rows fix
+    clamped : K⁺ that is zero at these components, with an orthonormal basis R of the
+        rigid motions that are zero there
     free : K⁺f (n,), if already computed
     friction : law with a prescribed bound; its rows follow the contact rows
 
@@ -142,15 +139,15 @@ def dual_bounds(
     fixed = np.unique(csr_array(primal.A).indices).astype(np.int64)
     structure = Structure(K=primal.P, B=B, fixed=fixed)
     sets = multiplier_sets(0, primal.h.size, friction.bound, friction.tangents)
-    qp = _dual(structure, c, clamped, free, sets)
+    qp = _dual(structure, c, clamped, f, free, sets)
 
     def recover(s: Solution) -> Solution:
-        u = clamped(f - B.T @ s.x)
+        u = _without_motion(clamped(f - B.T @ s.x), clamped, s)
         reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
         return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
     def interface_displacement(s: Solution) -> Vector:
-        return free - clamped.at_constraints(B.T @ s.x)
+        return _without_motion(free - clamped.at_constraints(B.T @ s.x), clamped, s)
 
     return Transformed(
         qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
@@ -185,20 +182,31 @@ def multiplier_sets(
     return Box(lower, upper), friction_discs(bound, tangents, contact)
 
 
+def _without_motion(u: Vector, inverse: GeneralisedInverse, s: Solution) -> Vector:
+    """Return u − Rα, with α the multipliers y of the equations RᵀBᵀλ = Rᵀf."""
+    R = inverse.kernel
+    return u - R @ s.y if R.shape[1] else u
+
+
 def _dual(
     structure: Structure,
     c: Vector,
     inverse: GeneralisedInverse,
+    f: Vector,
     free: Vector,
     sets: tuple[ConvexSet, ...],
 ) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  over `sets`; `free` is K⁺f."""
-    m, B = c.size, structure.B
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over sets.
+
+    free : K⁺f
+    """
+    m, B, R = c.size, structure.B, inverse.kernel
+    moves = bool(R.shape[1])
     return QP(
         P=inverse.congruence(B),
         q=c - B @ free,
-        A=no_rows(m),
-        b=np.zeros(0),
+        A=np.ascontiguousarray((B @ R).T) if moves else no_rows(m),
+        b=R.T @ f if moves else np.zeros(0),
         G=no_rows(m),
         h=np.zeros(0),
         sets=sets,

@@ -15,7 +15,11 @@ import numpy as np
 
 from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
 from mortarbench.problems.contact.balance import check_friction
-from mortarbench.problems.contact.bodies import Bodies, factorise_floating, support_rows
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    factorise_supported,
+    support_rows,
+)
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     forces_at_nodes,
@@ -32,7 +36,6 @@ from mortarbench.problems.contact.stepping import (
 from mortarbench.problems.duality.dualisation import (
     Transformed,
     dual_bounds,
-    dualise,
     with_friction_bound,
 )
 from mortarbench.problems.duality.problem import ContactProblem, Linearise
@@ -151,7 +154,7 @@ def load_path(
         bodies,
         stages,
         lambda _: linearise,
-        factorise,
+        lambda _: factorise(),
         reference,
         transform,
         initial_force,
@@ -162,27 +165,25 @@ def load_path(
 def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Return the load path of a contact problem on undivided bodies.
 
-    If supports exclude all rigid motions, only the contact rows are dualised.
+    Only the contact rows are dualised: with the supports in the dual as well, its
+    dense matrix has several times as many rows in space.
     """
-    elastic, stages = problem.bodies, problem.stages
-    fixed = np.unique(np.concatenate([stage.fixed for stage in stages]))
-    bodies = elastic.assembled
+    elastic, bodies = problem.bodies, problem.bodies.assembled
 
-    def factor() -> GeneralisedInverse:
-        if fixed.size == elastic.fixed.size:
-            return elastic.floating
-        return factorise_floating(replace(bodies, B_D=support_rows(bodies.mesh, fixed)))
+    def factorise(fixed: Nodes) -> GeneralisedInverse:
+        if fixed is elastic.fixed:
+            return elastic.clamped if elastic.is_supported else elastic.supported
+        return factorise_supported(
+            replace(bodies, B_D=support_rows(bodies.mesh, fixed))
+        )
 
-    is_supported = elastic.is_supported and all(
-        stage.fixed is elastic.fixed for stage in stages
-    )
     return _path(
         bodies,
-        stages,
+        problem.stages,
         lambda laws: problem.linearise(bodies, laws),
-        (lambda: elastic.clamped) if is_supported else factor,
+        factorise,
         reference,
-        dual_bounds if is_supported else dualise,
+        dual_bounds,
         problem.initial_force,
     )
 
@@ -191,14 +192,20 @@ def _path(
     bodies: Bodies,
     stages: Sequence[Stage],
     linearise: Callable[[tuple[FrictionLaw, ...]], Linearise],
-    factorise: Callable[[], GeneralisedInverse],
+    factorise: Callable[[Nodes], GeneralisedInverse],
     reference: Reference,
     transform: Transform,
     initial_force: float,
 ) -> MonolithicPath:
-    inverse = cache(factorise)
-    # stages share loads and supports; K⁺f is stored for the full load
-    bodies_by_stage, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
+    # loads and supports recur in several stages; K⁺f is stored for the full load
+    bodies_by_stage = dict[tuple[int, int], Bodies]()
+    inverses = dict[int, GeneralisedInverse]()
+    free = dict[tuple[int, int], Vector]()
+
+    def inverse(stage: Stage) -> GeneralisedInverse:
+        if id(stage.fixed) not in inverses:
+            inverses[id(stage.fixed)] = factorise(stage.fixed)
+        return inverses[id(stage.fixed)]
 
     def bodies_of(stage: Stage) -> Bodies:
         names = id(stage.forces), id(stage.fixed)
@@ -211,7 +218,7 @@ def _path(
 
     def pose(stage: Stage, at: State) -> MonolithicLinearisation:
         rows = linearise(stage.laws)(at.u * bodies.length)
-        loaded, load = bodies_of(stage), id(stage.forces)
+        loaded, load = bodies_of(stage), (id(stage.forces), id(stage.fixed))
         primal = primal_qp(loaded, rows, stage.part)
         first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
         if first.bound.size and not any(law.mu for law in stage.laws):
@@ -220,8 +227,8 @@ def _path(
         @cache
         def dual() -> Transformed:
             if load not in free:
-                free[load] = inverse()(loaded.f)
-            return transform(primal, inverse(), free[load] * stage.part, first)
+                free[load] = inverse(stage)(loaded.f)
+            return transform(primal, inverse(stage), free[load] * stage.part, first)
 
         return MonolithicLinearisation(
             loaded, primal, first, rows.place, dual, reference, stage.part
