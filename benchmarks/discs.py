@@ -7,8 +7,9 @@
   amplify small changes, each problem is solved with ten norms in the first step, and
   with ten loads, that differ by up to 3 %.
 * conic: processor times of `smalbe` and of conic solvers to a verified point.
-* time: processor time of `smalbe` over that of its products alone, measured
-  alternately (set OMP_NUM_THREADS=1, as the times of threads add up).
+* time: errors, bound, peak memory and processor time of `smalbe` up to 512² cells, and
+  the latter over that of its products alone, measured alternately (set
+  OMP_NUM_THREADS=1, as the times of threads add up).
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from time import process_time
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from numpy.typing import NDArray
 
 import mortarbench as mb
-from mortarbench.harness import QP
+from mortarbench.case import Case
+from mortarbench.harness import QP, Verdict, kkt_residuals, verdict
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import Solver
 from mortarbench.solvers import SOLVERS
@@ -38,7 +42,7 @@ TOL = 1e-8
 CELLS = (12, 24, 36, 48)  #: per side: 88, 376, 820 and 1468 discs
 PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm, or of the load
 LARGE = (256, 512)  #: cells per side, P an operator
-ROUNDS = 5  #: of the measurement of times
+ROUNDS = 3  #: of the measurement of times
 CONIC = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
 METHODS: dict[str, Solver] = {
     **{
@@ -50,24 +54,31 @@ METHODS: dict[str, Solver] = {
 }
 
 
-def mindlin(cells: int, nu: float, Q: float, *, dense: bool = True) -> QP:
+def mindlin(cells: int, nu: float, Q: float) -> Case:
     """Build the tangential problem of Cattaneo and Mindlin."""
-    qp = mb.build(f"half-space/n={cells}/law=mindlin/nu={nu}/Q={Q}/dual").qp
-    return replace(qp, P=assembled(qp.P)) if dense else qp
+    return mb.build(f"half-space/n={cells}/law=mindlin/nu={nu}/Q={Q}/dual")
+
+
+def with_dense(qp: QP) -> QP:
+    """Replace the operator P by its matrix."""
+    return replace(qp, P=assembled(qp.P))
 
 
 def count(name: str, qp: QP) -> int:
-    """Solve and verify; return the products with P, or the sweeps."""
+    """Solve and verify by residuals; return the products with P, or the sweeps."""
     s = METHODS[name].prepare(qp, TOL)()
-    answer = mb.verify(qp, s.x, y=s.y, z=s.z, z_box=s.z_box, tol=TOL)
-    assert answer.verdict.value == "verified", (name, answer.residuals)
+    residuals = kkt_residuals(qp, s)
+    assert verdict(s.status, residuals, TOL) is Verdict.VERIFIED, (name, residuals)
     return s.counts["sweeps" if name == "nsgs" else "P_products"]
 
 
 def products() -> None:
     """Print the products of all methods, ν = 0.3, Q/μP = 0.3 and 0.9."""
     for name in METHODS:
-        pairs = [[count(name, mindlin(n, 0.3, Q)) for Q in (0.3, 0.9)] for n in CELLS]
+        pairs = [
+            [count(name, with_dense(mindlin(n, 0.3, Q).qp)) for Q in (0.3, 0.9)]
+            for n in CELLS
+        ]
         print(f"| {name} |", " | ".join(f"{a} ({b})" for a, b in pairs), "|")
 
 
@@ -96,43 +107,61 @@ def ratios() -> None:
     names = [name for name in METHODS if name != "nsgs"]
     for kind in ("norms", "loads"):
         spent = []
-        for nu in (0.0, 0.3, 0.45):
-            for n in CELLS:
-                for Q in (0.1, 0.3, 0.5, 0.7, 0.9):
-                    qp = mindlin(n, nu, Q, dense=False)
-                    for factor in PERTURBED:
-                        norm, load = (factor, 1) if kind == "norms" else (1, factor)
-                        with perturbed_norm(norm):
-                            loaded = replace(qp, q=load * qp.q)
-                            spent.append([count(name, loaded) for name in names])
+        for nu, n in product((0.0, 0.3, 0.45), CELLS):
+            of_size = []
+            for Q in (0.1, 0.3, 0.5, 0.7, 0.9):
+                qp = mindlin(n, nu, Q).qp
+                for factor in PERTURBED:
+                    norm, load = (factor, 1) if kind == "norms" else (1, factor)
+                    with perturbed_norm(norm):
+                        loaded = replace(qp, q=load * qp.q)
+                        of_size.append([count(name, loaded) for name in names])
+            means = np.exp(np.log(of_size).mean(axis=0))
+            print(f"{kind}, ν = {nu}, {n}² cells:", _ratio(np.log(of_size)), end="; ")
+            listed = zip(names, means, strict=True)
+            print(", ".join(f"{name} {mean:.1f}" for name, mean in listed), flush=True)
+            spent.append(of_size)
         logs = np.log(spent).reshape(-1, len(PERTURBED), len(names))
-        means = zip(names, np.exp(logs.mean(axis=(0, 1))), strict=True)
-        print(kind, "perturbed, geometric means of products:")
-        print("  ", ", ".join(f"{name} {mean:.1f}" for name, mean in means))
-        for over, values in (("problems", logs.mean(axis=1)), ("solves", logs)):
-            ratio = np.exp(values[..., 0] - values[..., 1:].min(axis=-1))
-            print(
-                f"   smalbe to the best other method, {ratio.size} {over}: geometric "
-                f"mean {np.exp(np.log(ratio).mean()):.2f}, largest {ratio.max():.2f}"
-            )
+        print(kind, "problems:", _ratio(logs.mean(axis=1)), "solves:", _ratio(logs))
+
+
+def _ratio(logs: NDArray[np.float64]) -> str:
+    """Compare the first column of logarithms with the least of the others."""
+    ratio = logs[..., 0] - logs[..., 1:].min(axis=-1)
+    return f"{np.exp(ratio.mean()):.2f}, at most {np.exp(ratio.max()):.2f}"
 
 
 def time() -> None:
-    """Print the ratios of times, ν = 0.3, Q/μP = 0.5."""
-    cases = [(CELLS[-1], True), *((n, False) for n in LARGE)]
-    for n, dense in cases:
-        qp = mindlin(n, 0.3, 0.5, dense=dense)
-        F, v, measured = Product(qp.P, qp.q.size), qp.q.copy(), []
+    """Print errors, memory and times of `smalbe` up to 512² cells.
+
+    The ratio is that of the time of a solve to the time of its products alone.
+    """
+    header = "cells, discs", "ν", "Q/μP", "error of c/a", "of Q", "bound", "peak memory"
+    print(*header, "products", "solve", "ratio", sep=" | ")
+    forces = (0.1, 0.3, 0.5, 0.7, 0.9)
+    cases = [(CELLS[-1], 0.3, 0.5), *((n, 0.0, Q) for n in LARGE for Q in forces)]
+    for n, nu, Q in [*cases, *((n, 0.3, 0.5) for n in LARGE)]:
+        case = mindlin(n, nu, Q)
+        answer = mb.solve(case, "smalbe", tol=TOL)
+        assert answer.verdict is Verdict.VERIFIED, answer.residuals
+        qp = with_dense(case.qp) if n in CELLS else case.qp
+        F, v, solves, ratios = Product(qp.P, qp.q.size), qp.q.copy(), [], []
         for _ in range(ROUNDS):
             began = process_time()
             s = METHODS["smalbe"].prepare(qp, TOL)()
-            solved, calls = process_time() - began, s.counts["P_products"]
+            solves.append(process_time() - began)
             began = process_time()
-            for _ in range(calls):
+            for _ in range(s.counts["P_products"]):
                 F(v)
-            measured.append(solved / (process_time() - began))
-        sizes = qp.sets[1].block.size // 2, calls
-        print(sizes, " ".join(f"{ratio:.2f}" for ratio in sorted(measured)))
+            ratios.append(solves[-1] / (process_time() - began))
+        of = answer.quantities
+        print(
+            f"{n}², {of['cells']} | {nu} | {Q} | {of['c_over_a_error']:.2%} | "
+            f"{of['force_error']:.0e} | {answer.energy_bound:.1e} | "
+            f"{answer.record.peak_mib / 1024:.2f} GiB | {s.counts['P_products']} | "
+            f"{np.median(solves):.2f} s | {np.median(ratios):.2f}",
+            flush=True,
+        )
 
 
 def conic() -> None:
@@ -140,20 +169,18 @@ def conic() -> None:
 
     Each solver runs at 1e-6, 1e-8, … until its point is verified; the last run counts.
     """
-    for n in CELLS[:3]:
-        qp, cells = mindlin(n, 0.3, 0.5), []
-        for name in ("smalbe", *CONIC):
-            for tol in (1e-6, 1e-8, 1e-10, 1e-12):
-                began = process_time()
-                s = SOLVERS[name].prepare(qp, tol)()
-                ms = 1e3 * (process_time() - began)
-                answer = mb.verify(qp, s.x, y=s.y, z=s.z, z_box=s.z_box, tol=TOL)
-                if answer.verdict.value == "verified":
-                    cells.append(f"{name} {ms:.3g} ms ({tol:.0e})")
-                    break
-            else:
-                cells.append(f"{name} not verified")
-        print(qp.sets[1].radius.size, "discs:", ", ".join(cells))
+    for n, name in product(CELLS, ("smalbe", *CONIC)):
+        qp, result = with_dense(mindlin(n, 0.3, 0.5).qp), "not verified"
+        for tol in (1e-6, 1e-8, 1e-10, 1e-12):
+            began = process_time()
+            s = SOLVERS[name].prepare(qp, tol)()
+            ms = 1e3 * (process_time() - began)
+            answer = mb.verify(qp, s.x, y=s.y, z=s.z, z_box=s.z_box, tol=TOL)
+            if answer.verdict is Verdict.VERIFIED:
+                natural = answer.normality.natural_map
+                result = f"{ms:.3g} ms (tol {tol:.0e}), natural map {natural:.0e}"
+                break
+        print(f"{qp.sets[1].block.size // 2} discs, {name}: {result}", flush=True)
 
 
 if __name__ == "__main__":

@@ -34,8 +34,9 @@ PRIMAL = 1  #: the exit flag that has a certificate
 #: Eigenvalues of P below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-14
 #: Sizes of the unknowns of corrections, relative to ‖x‖∞. Which of them helps depends
-#: on the QP: the first is needed at tol 1e-6, the last reaches 1e-8.
-CORRECTION_SIZES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
+#: on the QP, as ECOS breaks down near the optimum at a residual that varies by two
+#: orders of magnitude between neighbouring sizes: four per decade.
+CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
 #: largest KKT residual, relative to tol, of a point that is claimed solved
 CLAIM_FACTOR = 10.0
 
