@@ -427,21 +427,30 @@ def _shear_quantities(
 ) -> dict[str, Any]:
     """Compare stick zone and tangential force of full spheres with the exact solution.
 
-    `tangential_force` is the force along x on the lower sphere in N; `stick_radius` is
-    that of a disc with the area of all sticking nodes in m; `c_over_a` is the stick
-    radius over the exact contact radius; `c_over_a_moment` follows from
-    ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which is exact for Cattaneo and Mindlin's q.
+    tangential_force: along x on the lower sphere, N. stick_area: of the sticking nodes,
+    which stick as a whole, m². stick_radius: √(5∫sr²dA/2∫s dA), m, with s = μp − q on
+    these nodes. It is exact for Cattaneo and Mindlin's q, with which s is distributed
+    like Hertz's pressure, with the radius c. c_over_a: over the exact contact
+    radius. c_over_a_moment: from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), exact for the same q.
     """
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None
-    area = copies * side.length[side.friction == "stick"].sum()
-    radius, total = np.sqrt(area / np.pi), -copies * side.force[:, 0].sum()
+    assert side.push is not None
+    sticks = side.friction == "stick"
+    total = -copies * side.force[:, 0].sum()
     limit, a = exact.mu * exact.normal.P, exact.normal.a
     r2 = (solution.sides.bodies.mesh.points[side.nodes, :2] ** 2).sum(axis=1)
+    unused = exact.mu * side.push - np.linalg.norm(side.friction_force, axis=1)
+    radius = (
+        np.sqrt(2.5 * (unused @ (sticks * r2)) / (unused @ sticks))
+        if sticks.any()
+        else 0.0
+    )
     moment = -copies * (side.friction_force[:, 0] @ r2) / (0.4 * limit * a**2)
     return {
         "tangential_force": float(total),
         "tangential_force_error": float(total / (exact.Q * limit) - 1),
+        "stick_area": float(copies * side.length[sticks].sum()),
         "stick_radius": float(radius),
         "c_over_a": float(radius / a),
         "c_over_a_error": float(radius / exact.c - 1),
