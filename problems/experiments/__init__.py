@@ -1,4 +1,4 @@
-"""The experiments behind the figures and tables of the paper."""
+"""Experiments that reproduce the figures and tables of the paper."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def paper_experiment(
 
     Parameters
     ----------
-    solve, baseline : our solver of the dual QPs and that of the paper; both are timed
+    solve, baseline : our solver of the dual QPs and that of the paper, both timed
     reference : solver for the experiments on accuracy, not timed
-    environment : stored with the measurements
-    say : called with one line before each experiment
+    environment : description of the environment, stored with the measurements
+    say : callback that receives one line before each experiment
 
     """
     tables = {"table1": list(counts(plan.scaling[-1], plan.Nh))}

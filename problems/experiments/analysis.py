@@ -1,10 +1,10 @@
-"""The whole analysis, mesh to displacement, timed part by part (Figure 6, Section 5).
+"""The whole analysis, from mesh to displacement, timed by parts (Figure 6, Section 5).
 
 Two variants of the same ten load steps are compared, both with all Dirichlet rows in
 the dual. The variant ``per-row`` of the paper solves with the factor of K for each row
-of B in each step, and solves the dual QPs by the textbook SMALBE. Our variant
-``condensed`` computes K⁺ on the interface once, so that each step takes one small
-product, and solves the dual QPs by our SMALBE.
+of B in each step, and uses the textbook SMALBE for the dual QPs. Our variant
+``condensed`` computes K⁺ on the interface once, so that each step requires one small
+product, and uses our SMALBE.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mortarbench.problems.models.beam_ring import bodies as bodies_of
 WAYS = {
     "per-row": False,
     "condensed": True,
-}  #: variant → True if K⁺ is condensed onto the interface
+}  #: variants by name; True if K⁺ is condensed onto the interface
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Analysis:
 def analyse(
     Nr: int, Nh: int, *, solve: Reference, condense: bool, steps: int, radial: int = 0
 ) -> Analysis:
-    """Run all load steps; radial = 0 stands for 2·Nh layers of the ring.
+    """Run all load steps; radial = 0 selects 2·Nh layers of the ring.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
             "m_E": analysis.primal.b.size,
             "m_I": analysis.primal.h.size,
         }
-        # one warm-up at the smallest size is enough, since larger runs take seconds
+        # one warm-up at the smallest size suffices, because larger runs take seconds
         for row in race(contestants, plan.scaling_rounds, warm=Nr == first):
             yield size | row
 
@@ -118,7 +118,7 @@ def _laps(run: partial[Analysis]) -> Laps:
 
 
 def states(plan: Plan, solve: Reference) -> dict[str, Fields]:
-    """Return the deformed bodies of Figure 2, for both rules of the ring, and 7."""
+    """Return the deformed bodies of Figure 7, and of Figure 2 with either ring mesh."""
     Nr, Nh = plan.example
     largest = plan.scaling[-1], plan.Nh, 2 * plan.Nh
     problems = {

@@ -1,7 +1,7 @@
-"""Timing of experiments, in which methods take turns in one process.
+"""Timing of methods by alternating runs in one process.
 
-Turns spread a drift of the machine evenly over all methods. Every sample is stored;
-reports compute medians and intervals.
+Alternation distributes a drift of the machine evenly over all methods. Every sample is
+stored; reports compute medians and intervals.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
-Laps = Mapping[str, float]  #: name of a part → seconds
+Laps = Mapping[str, float]  #: seconds by name of the part
 Contestant = Callable[[], Laps]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """Number of repeats: `most`, or fewer if they take too long."""
+    """Number of rounds: `most`, or fewer, but at least `least`, if rounds are slow."""
 
     most: int
     least: int = 5
     seconds: float = (
-        20.0  #: time after which no round starts once `least` rounds are done, s
+        20.0  #: after this time, no round starts if `least` rounds are complete, s
     )
 
 
 class Stopwatch:
-    """Stopwatch that sums seconds by the name of a part."""
+    """Stopwatch that accumulates seconds by name of the part."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
@@ -55,9 +55,9 @@ def timed_as_one(work: Callable[[], object], part: str = "all") -> Contestant:
 def race(
     contestants: Mapping[str, Contestant], rounds: Rounds, *, warm: bool = True
 ) -> list[dict[str, str | int | float]]:
-    """Time methods in turns; return a row (method, part, repeat, seconds) per lap.
+    """Time methods alternately; return a row (method, part, repeat, seconds) per lap.
 
-    warm : True to run each method once before, so that cold caches do not count
+    warm : True to run each method once before timing, to exclude cold caches
 
     """
     if warm:

@@ -1,4 +1,4 @@
-"""Timing of single parts: assembly, contact rows, generalised inverse."""
+"""Timing of individual parts: assembly, contact rows, generalised inverse."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def contact(plan: Plan) -> Rows:
         for Nh in plan.contact[1]:
             bodies = model(
                 Nr, Nh, 2, "strain"
-            )  # the number of layers of the ring does not enter
+            )  # the number of layers of the ring has no effect
             (pair,) = bodies.pairs
             points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
             contestants = {
@@ -101,7 +101,7 @@ def inverse(plan: Plan) -> Rows:
         rows = race(contestants, plan.inverse_rounds)
         if mesh.dofs <= plan.dense:
             pinv = {"pinv": partial(_pinv, K, v)}
-            # in a race of its own: its gigabytes would evict the caches of the others
+            # timed separately, because its gigabytes would evict the caches of others
             rows += race(pinv, plan.inverse_rounds, warm=False)
         for row in rows:
             yield {"Nr": Nr, "n": mesh.dofs} | row
@@ -126,7 +126,7 @@ def _spectral(mesh: Mesh, points: NDArray[np.float64]) -> Nodes:
 def _pinv(K: Any, v: NDArray[np.float64]) -> Laps:
     dense = K.toarray()
     watch = Stopwatch()
-    P = np.linalg.pinv(dense)  # by singular values, as in MATLAB
+    P = np.linalg.pinv(dense)  # singular value decomposition, as in MATLAB
     watch.lap("build")
     P @ v
     watch.lap("multiply")

@@ -19,11 +19,11 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
-#: (steps, linearisations per step) of a converged path; larger numbers give the same
-#: result
+#: (steps, linearisations per step) of a converged path; larger numbers do not change
+#: the result
 CONVERGED = (2, 8)
 
-#: name of contact rows in figures → keys of a case
+#: keys of a case by the name of its contact rows in figures
 ROWS: Mapping[str, Mapping[str, Value]] = {
     "nts": {"contact": "nts"},
     "mortar": {"contact": "mortar", "basis": "dual"},
@@ -36,7 +36,7 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
 
     A row contains steps, relin, tip_x, tip_y in m, energy in J/m, and force_x, force_y
     in N/m. The last row is the converged result, with contact linearised at the
-    solution itself; the other rows approach it.
+    solution itself; the other rows converge to it.
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
     inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
@@ -66,8 +66,9 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
 
     A row contains contact, step, node, angle in degrees, length in m, force in N/m and
     pressure in Pa of one slave node. The angle is that of the undeformed node about the
-    centre of the ring, from the right foot; the length is its share ∫N_j of the arc,
-    the force is the normal force ‖(Bᵀλ)_j‖, and the pressure is force per length.
+    centre of the ring, measured from the right foot; the length is the part ∫N_j of the
+    arc assigned to the node, the force is the normal force ‖(Bᵀλ)_j‖, and the pressure
+    is force per length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
     inverse = factorise_clamped(bodies)
@@ -98,9 +99,10 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
 def verification(plan: Plan, solve: Reference) -> Rows:
     """Yield errors against exact solutions: the patch test and Hertz's pressure.
 
-    A row contains problem, contact, n and error for one mesh, where n is the number of
-    elements along the upper block, or per half width of the contact, and the error is
-    max|σ_y + p|/p, or the relative L2 error of the pressure.
+    A row contains problem, contact, n and error for one mesh. For the patch test, n is
+    the number of elements along the upper block, and the error is max|σ_y + p|/p. For
+    Hertz's pressure, n is the number of elements per half width of the contact, and the
+    error is the relative L2 error of the pressure.
     """
     for contact, keys in ROWS.items():
         for upper in plan.patch:

@@ -1,4 +1,4 @@
-"""Sizes and repeats of the experiments of the paper, and shorter ones."""
+"""Sizes and repetitions of the experiments, for the paper and for quick runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mortarbench.problems.experiments.clock import Rounds
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Parameters of all experiments; the paper does not give most of its sizes."""
+    """Parameters of all experiments; the paper does not state most of its sizes."""
 
     assembly: tuple[int, ...]  #: Nr of Figure 3
     assembly_rounds: Rounds
@@ -17,15 +17,15 @@ class Plan:
     contact_rounds: Rounds
     inverse: tuple[int, ...]  #: Nr of Figure 5
     inverse_rounds: Rounds
-    dense: int  #: dofs up to which a dense pseudoinverse is computed
-    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last is that of Table 1
+    dense: int  #: largest number of dofs for which a dense pseudoinverse is computed
+    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last also of Table 1
     scaling_rounds: Rounds
-    Nh: int = 15  #: size of Figures 6, 7 and Table 1
+    Nh: int = 15  #: Nh of Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
     steps: int = 10  #: load steps
-    stepped: tuple[int, int]  #: Nr, Nh of the study of the stepping
-    stepping: tuple[int, ...]  #: numbers of steps in this study
-    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations of each step in this study
+    stepped: tuple[int, int]  #: Nr, Nh of the study of the load stepping
+    stepping: tuple[int, ...]  #: numbers of load steps in this study
+    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations per step in this study
     patch: tuple[int, ...]  #: elements along the upper block of the patch test
     hertz: tuple[int, ...]  #: elements per half width of Hertz's contact
 

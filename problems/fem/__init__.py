@@ -1,1 +1,1 @@
-"""Finite elements: meshes, stiffness, generalised inverses and stresses."""
+"""Finite elements: meshes, stiffness matrices, generalised inverses and stresses."""

@@ -1,7 +1,7 @@
 /* Integrals over single cells, summed into the values of a CSC matrix.
 
-   The functions work for n nodes and dim coordinates. They are inlined, so that compilers
-   unroll the loops where callers pass constants, as for the paper's quadrilaterals. */
+   The functions work for any n nodes and dim coordinates. They are inlined, so that
+   compilers unroll the loops for callers that pass constants. */
 
 #include <stddef.h>
 
@@ -9,7 +9,7 @@
 #define DIM 3
 
 #if defined(__x86_64__) && defined(__gnu_linux__)
-/* compiled twice, selected at load time; without FMA both variants round alike */
+/* compiled twice, selected at load time; without FMA, both versions round identically */
 #define CLONED __attribute__((target_clones("avx2", "default")))
 #else
 #define CLONED
@@ -28,7 +28,7 @@ static const int VOIGT[DIM + 1][DIM][DIM] = {
 /* Finite element as data, see problems.fem.elements. */
 typedef struct {
     int points, pairs;
-    const double *gradients; /* (points, dim, n) of the shape functions */
+    const double *gradients; /* (points, dim, n) gradients of the shape functions */
     const double *weights;   /* (points,) */
     const int *edges;        /* (dim, pairs, 2) first and last nodes of edges per axis */
 } element;
@@ -69,7 +69,7 @@ INLINED void cell_stiffness(
         Ke[i] = 0;
     for (int q = 0; q < elem->points; q++) {
         const double *reference = elem->gradients + q * dim * n;
-        /* J = ∂x/∂ξ by differences of corners: Σ x_a ∂N_a/∂ξ would cancel digits */
+        /* J = ∂x/∂ξ by differences of corners; Σ x_a ∂N_a/∂ξ would lose digits */
         for (int k = 0; k < dim; k++)
             for (int m = 0; m < dim; m++) {
                 const int *last = elem->edges + 2 * k * pairs + 1;
@@ -79,7 +79,7 @@ INLINED void cell_stiffness(
                          * span[(k * pairs + e) * dim + m];
                 J[k][m] = sum;
             }
-        /* grad lacks its factor 1/det; it enters twice: w det (1/det)² = w/det */
+        /* grad omits its factor 1/det, which enters twice: w det (1/det)² = w/det */
         const double weight = elem->weights[q] / adjugate(dim, J, adj);
         for (int m = 0; m < dim; m++)
             for (int a = 0; a < n; a++) {
@@ -190,7 +190,7 @@ INLINED void cell_tangent(
         for (int a = 0; a < n; a++)
             for (int i = 0; i < dim; i++)
                 for (int j = 0; j < dim; j++) {
-                    double left[DIM]; /* ∂N_a/∂X_m A_imjk of every k */
+                    double left[DIM]; /* Σ_m ∂N_a/∂X_m A_imjk for each k */
                     for (int k = 0; k < dim; k++) {
                         double sum = grad[a * dim] * A[((i * dim) * dim + j) * dim + k];
                         for (int m = 1; m < dim; m++)

@@ -1,13 +1,13 @@
 """Nested dissection of a mesh: elimination order of a sparse Cholesky factorisation.
 
 A set of nodes is bisected across its longest principal axis. The nodes of the second
-half with a neighbour in the first form the separator, which is eliminated after both
-halves. The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM J.
-Numer. Anal. 10, 1973; bisection by coordinates as in Gilbert, Miller and Teng, SIAM J.
-Sci. Comput. 19, 1998). Selected nodes are eliminated last of all, so that the trailing
-block of the factor is that of the Schur complement on them.
+half with a neighbour in the first half form the separator, which is eliminated after
+both halves. The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM
+J. Numer. Anal. 10, 1973; bisection by coordinates as in Gilbert, Miller and Teng, SIAM
+J. Sci. Comput. 19, 1998). Selected nodes are eliminated last, so that the trailing
+block of the factor is the Cholesky factor of the Schur complement on these nodes.
 
-Leaves and separators, the sets eliminated together, are the fronts of a multifrontal
+Leaves and separators, each eliminated as a whole, are the fronts of a multifrontal
 factorisation (`problems.fem.multifrontal`), in postorder: a separator comes after both
 of its halves.
 """
@@ -23,7 +23,7 @@ from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
 
-LEAF_SIZE = 8  #: largest number of nodes of a set that is not bisected further
+LEAF_SIZE = 8  #: sets of at most this many nodes are not bisected further
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -34,17 +34,17 @@ Marks = NDArray[np.bool_]
 class Fronts:
     """Fronts: sets of positions in the elimination order, in postorder of their tree.
 
-    Front s eliminates the positions start[s] … start[s + 1] − 1. Its border,
-    border[first[s]:first[s + 1]], consists of the later positions, ascending, with
-    entries in its rows from the matrix or from fill-in. Its children are the last
-    `children[s]` roots of subtrees before s.
+    Front s eliminates the positions start[s] … start[s + 1] − 1. The border of s,
+    border[first[s]:first[s + 1]], lists the later positions with nonzeros (including
+    fill-in) in the rows of s, ascending. The children of s are the last `children[s]`
+    roots of subtrees before s.
     """
 
     start: Ints  #: (F + 1,)
     first: Ints  #: (F + 1,)
     border: Ints
     children: Ints  #: (F,)
-    roots: Marks  #: (F,) True for the fronts of the nodes to be eliminated last
+    roots: Marks  #: (F,) True for fronts of the nodes to be eliminated last
 
 
 def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
@@ -73,7 +73,7 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
 
 
 def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:
-    """Replace each position i by the positions ends[i] … ends[i + 1] − 1, if any."""
+    """Replace each position i by the (possibly empty) ends[i] … ends[i + 1] − 1."""
     count = np.diff(ends)[fronts.border]
     above = np.append(0, np.cumsum(count))
     each = np.arange(above[-1]) - np.repeat(above[:-1], count)

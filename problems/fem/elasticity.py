@@ -1,10 +1,11 @@
 """Linear elasticity with linear and multilinear elements, in the plane and in space.
 
-In the plane this is the bilinear quadrilateral of the paper (Section 2); triangles are
-degenerate quadrilaterals with two coincident corners, see `problems.fem.mesh`.
+In the plane the element is the bilinear quadrilateral of the paper (Section 2);
+triangles are degenerate quadrilaterals with two coincident corners, see
+`problems.fem.mesh`.
 
-Voigt's notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy) in the plane,
-(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in space, and stress in the same order. Plane
+In Voigt's notation, strain is (ε_x, ε_y, γ_xy) in the plane and
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in space, and stress has the same order. In the plane,
 stiffness is per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m
 and forces are in N.
 """
@@ -55,7 +56,7 @@ class Material:
 
 
 def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
-    """Return D (3, 3) of σ = D ε in plane strain or stress, or (6, 6) in space, Pa."""
+    """Return D in σ = D ε, Pa: (3, 3) in plane strain or stress, (6, 6) in space."""
     E, nu = material.E, material.nu
     if plane == "stress":
         factor, off, shear = E / (1 - nu**2), nu, (1 - nu) / 2
@@ -88,7 +89,7 @@ def shape_gradients(corners: Floats, xi: Vector) -> tuple[Floats, Vector]:
 
 
 def strain_matrix(gradients: Floats) -> Floats:
-    """Return B (E, v, n·dim) with ε = B u_e and u_e = (u_x1, u_y1, …) at the nodes."""
+    """Return B (E, v, n·dim) with ε = B u_e, where u_e = (u_x1, u_y1, …)."""
     E, n, dim = gradients.shape
     B = np.zeros((E, dim * (dim + 1) // 2, n * dim))
     for (i, j), component in np.ndenumerate(VOIGT[dim]):
@@ -108,7 +109,7 @@ def stiffness(
     ----------
     D : (v, v) elasticity matrix, or (k, v, v) for k materials
     material : (E,) material of each cell, 0 … k − 1; default: 0
-    pattern : sparsity pattern of the mesh, if it was computed before
+    pattern : sparsity pattern of the mesh, if already computed
 
     """
     pattern = pattern or sparsity(mesh)
@@ -129,7 +130,7 @@ def stiffness(
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Sparsity pattern of a stiffness matrix; it depends on the cells alone."""
+    """Sparsity pattern of a stiffness matrix, which only depends on the cells."""
 
     cells: NDArray[np.int32]  #: (E, c)
     ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
@@ -154,9 +155,9 @@ def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
 def rigid_motions(points: Floats) -> Floats:
     """Return the linearised rigid motions (n, r) of one body with the nodes (N, dim).
 
-    These are a translation along each axis, then for each pair of axes (k, l) the
-    linearised rotation about the centroid of the nodes, x_k e_l − x_l e_k. r is 1 on a
-    line, 3 in the plane and 6 in space.
+    The columns are a translation along each axis, followed by the linearised rotation
+    x_k e_l − x_l e_k about the centroid of the nodes for each pair of axes (k, l). The
+    number r is 1 on a line, 3 in the plane and 6 in space.
     """
     N, dim = points.shape
     # about the centroid, rotations are orthogonal to translations
@@ -172,8 +173,8 @@ def rigid_motions(points: Floats) -> Floats:
 def rigid_modes(points: Floats) -> Floats:
     """Return an orthonormal basis R (n, r) of ker K of one body, for eq. (4).
 
-    In the plane, the analytic rigid motions are orthogonal already; in space, they are
-    if the rotations are about the principal axes of inertia of the nodes.
+    In the plane, the analytic rigid motions are orthogonal. In space, rotations about
+    the principal axes of inertia of the nodes are used, which are orthogonal.
     """
     R = rigid_motions(points)
     dim = points.shape[1]

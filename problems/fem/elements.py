@@ -2,19 +2,20 @@
 
 A simplex with the vertices v_0 … v_d has the barycentric coordinates λ_0 … λ_d, affine
 functions with λ_i(v_j) = δ_ij. The reference cell is the product of one or more
-simplices (intervals [−1, 1], unit triangles, unit tetrahedra); a corner is a choice of
-one vertex in each, and its shape function is the product
+simplices (intervals [−1, 1], unit triangles, unit tetrahedra). A corner is a choice of
+one vertex of each simplex, and its shape function is the product
 
     N_a(ξ) = Π_f λ_{a_f}(ξ_f)
 
-Quadrilaterals and hexahedra are products of intervals, wedges are a triangle times an
-interval, and tetrahedra a single simplex. An isoparametric cell is the image of the
-reference cell under x(ξ) = Σ N_a(ξ) x_a.
+Quadrilaterals and hexahedra are products of intervals, wedges are products of a
+triangle and an interval, and tetrahedra are single simplices. An isoparametric cell is
+the image of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
 
-Each simplex has d + 1 points of equal weight: centroid + (vertex − centroid)/√(d + 2),
-exact for polynomials of degree 2, on intervals 3 (Stroud, Approximate calculation of
-multiple integrals, 1971, T_n: 2-1). Stiffness of affine cells is therefore exact. On a
-single simplex gradients are constant, and the centroid suffices.
+The quadrature rule of a simplex has d + 1 points of equal weight, centroid +
+(vertex − centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3
+on intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1).
+The stiffness of affine cells is therefore exact. If the cell is a single simplex,
+gradients are constant, and the centroid suffices.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from mortarbench.harness import Vector
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: vertices (d + 1, d) of the simplices
+#: vertices (d + 1, d) of each simplex
 INTERVAL = np.array([[-1], [1]])
 TRIANGLE = np.array([[0, 0], [1, 0], [0, 1]])
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
@@ -41,7 +42,7 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 class Element:
     """A product of simplices with n corners."""
 
-    kind: str  #: name of its cells in meshio
+    kind: str  #: name of the cells in meshio
     simplices: tuple[Ints, ...]  #: vertices of each factor
     vertices: Ints  #: (n, factors) vertex of each factor at each corner
 
@@ -93,7 +94,10 @@ class Element:
         return np.hstack([slope * rest[:, None] for slope, rest in columns])
 
     def _coordinates(self, xi: Vector) -> tuple[Floats, list[Floats]]:
-        """Return λ of each factor at each corner (factors, n), and its gradients."""
+        """Return, for each factor, λ at ξ for the vertex of each corner, and gradients.
+
+        The values are (factors, n).
+        """
         values, slopes, start = [], [], 0
         for simplex, vertex in zip(self.simplices, self.vertices.T, strict=True):
             d = simplex.shape[1]
@@ -114,8 +118,8 @@ class Element:
     def edges(self) -> NDArray[np.int32]:
         """First and last corners (dim, p, 2) of the edges along each axis.
 
-        Axis k of a simplex joins its vertices 0 and k + 1. Axes with fewer edges than
-        others end with pairs of equal corners.
+        Axis k of a simplex joins its vertices 0 and k + 1. Axes with fewer than p edges
+        are padded with pairs of equal corners.
         """
         axes = []
         for f, simplex in enumerate(self.simplices):
@@ -176,5 +180,5 @@ def inverse_transpose(A: Floats) -> Floats:
 
 
 def cross(a: Floats, b: Floats) -> Vector:
-    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
+    """Return a_x b_y − a_y b_x (…) for vectors (…, 2)."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -27,21 +27,26 @@ def eliminate(
     const int64_t[::1] offset,
     double[::1] rows,
 ):
-    """Write the rows of U front by front; return False if a pivot is not positive."""
+    """Compute the rows of U front by front; return False if a pivot is not positive.
+
+    indptr, indices, data : K in CSC; order, position : elimination order and its
+    inverse; start, first, border, children : see `Fronts`; offset, rows : see
+    `Multifrontal`; `rows` is overwritten and must be zero initially.
+    """
     cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, depth = 0
     cdef int low, pivots, rest, size, info = 0
     cdef double one = 1.0, minus = -1.0
     cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
     cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
     cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
-    # stack of the Schur complements of fronts whose parents are still to come
+    # stack of the Schur complements of fronts whose parents are not yet assembled
     cdef double[::1] store = np.empty(peak_storage(first, children))
     cdef double *U
     cdef double *S
     for s in range(children.shape[0]):
         low, pivots, rest = start[s], start[s + 1] - start[s], first[s + 1] - first[s]
         size = pivots + rest
-        # S lies above the children's complements on the stack, which it takes up first
+        # S is above the complements of the children on the stack, which are added to it
         U, S = &rows[0] + offset[s], &store[0] + top
         for i in range(pivots):
             place[low + i] = i
@@ -63,14 +68,14 @@ def eliminate(
             add(&store[top], &to[0], m, pivots, rest, U, S)
         if pivots:
             dpotrf(b"L", &pivots, U, &size, &info)
-            # not (… > 0): also True for NaN, which dpotrf need not report
+            # not (… > 0) also catches NaN, which dpotrf may not report
             if info or not U[(pivots - 1) * (<Py_ssize_t> size + 1)] > 0:
                 return False
         if pivots and rest:
             dtrsm(b"R", b"L", b"T", b"N", &rest, &pivots, &one, U, &size, U + pivots,
                   &size)
             dsyrk(b"L", b"N", &rest, &pivots, &minus, U + pivots, &size, &one, S, &rest)
-        if children[s]:  # … and is moved to the place of the children's afterwards
+        if children[s]:  # S then replaces the complements of the children
             for i in range(rest):
                 t = i * rest + i
                 memmove(&store[top + t], S + t, (rest - i) * sizeof(double))
@@ -103,7 +108,7 @@ cdef void add(
     Py_ssize_t rest,
     double *U, double *S,
 ) noexcept nogil:
-    """Add the upper triangle of a child's Schur complement at the places `to` (m,).
+    """Add the upper triangle of the Schur complement of a child at places `to` (m,).
 
     below (m, m) complement of the child; U (pivots, pivots + rest) and
     S (rest, rest) of the parent front
@@ -136,7 +141,7 @@ def substitute(
     cdef double *U
     cdef double *xs
     for t in range(2 * fronts):
-        s = min(t, 2 * fronts - 1 - t)  # forward up the tree, backward down again
+        s = min(t, 2 * fronts - 1 - t)  # forward up the tree, then backward down
         pivots, rest = start[s + 1] - start[s], first[s + 1] - first[s]
         size = pivots + rest
         if not pivots:
@@ -161,9 +166,9 @@ def substitute(
 def scatter_symmetric(
     const double[:, :] upper, const int[::1] at, double[:, ::1] to
 ):
-    """Copy a symmetric matrix, stored as upper triangle, to rows and columns `at`.
+    """Copy a symmetric matrix, given by its upper triangle, to rows and columns `at`.
 
-    Rows and columns with a negative place are skipped.
+    Rows and columns with negative `at` are skipped.
     """
     cdef Py_ssize_t i, j
     for i in range(at.shape[0]):

@@ -1,25 +1,25 @@
 """Finite strain with bilinear quadrilaterals: total Lagrangian, plane strain.
 
-With the displacement u = x − X of the nodes, F = I + Σ_a u_a ⊗ ∂N_a/∂X, and 2×2 Gauss
-points in the reference configuration,
+With the nodal displacement u = x − X, the deformation gradient F = I + Σ_a u_a ⊗
+∂N_a/∂X, and 2×2 Gauss points in the reference configuration,
 
     Π(u) = Σ_e ∫ W(F) dA,     r = ∂Π/∂u = Σ_e ∫ P ∂N/∂X,     K_t = ∂r/∂u
 
 (Wriggers 2008, "Nonlinear Finite Element Methods", Section 4.2). Triangles are
 degenerate quadrilaterals, see `problems.fem.mesh`; their F is constant.
 
-Nearly incompressible materials (ν ≥ NEARLY_INCOMPRESSIBLE) lock: the four Gauss points
-impose four conditions on the volume, which eight displacements cannot satisfy. Their
-cells use the mean dilatation (Q1P0; Simo, Taylor and Pister 1985): with W = w + U(θ),
-the volumetric part depends on the average over the cell only,
+Nearly incompressible materials (ν ≥ NEARLY_INCOMPRESSIBLE) would lock, because the four
+Gauss points of a cell impose more volume constraints than its nodes can satisfy. Cells
+of such materials use the mean dilatation (Q1P0; Simo, Taylor and Pister 1985): with
+W = w + U(θ), the volumetric part only depends on the average over the cell,
 
     Π_e = ∫ w(F) dA + V U(θ̄),    θ̄ = 1/V ∫ θ(F) dA,    K_e = ∫ ∂²(w + U′(θ̄)θ) + U″/V ggᵀ
 
-with g = ∫ ∂θ/∂u dA. Since Π_e is an energy, K_e is symmetric. On triangles the method
-has no effect. Q1P0 may develop hourglass modes under strong compression.
+with g = ∫ ∂θ/∂u dA. Since Π_e is an energy, K_e is symmetric. The method has no effect
+on triangles. Q1P0 may develop hourglass modes under strong compression.
 
-Units follow from those of the coordinates and moduli: with lengths in l and moduli in
-F₀/l, forces are in F₀ and energies in F₀l.
+The units of coordinates and moduli determine all others: with lengths in units of l and
+moduli in units of F₀/l, forces are in units of F₀ and energies in units of F₀l.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
-#: smallest Poisson's ratio with mean dilatation; below it, cells are those of linear
-#: elasticity. Without mean dilatation, a cantilever is 3.9 % too stiff at ν = 0.45, and
-#: 21 times as stiff at ν = 0.4999
+#: smallest Poisson's ratio with mean dilatation; below it, fully integrated cells are
+#: used. Without mean dilatation, a cantilever is 3.9 % too stiff at ν = 0.45, and 21
+#: times as stiff at ν = 0.4999
 NEARLY_INCOMPRESSIBLE = 0.4
-#: eigenvalues of a cell's tangent above −EIGENVALUE_ROUNDING times its largest count as
-#: rounding of the zero eigenvalues of translations
+#: negative eigenvalues of a cell tangent count as zero (translations) up to this share
+#: of its largest eigenvalue
 EIGENVALUE_ROUNDING = 1e-12
-#: replacement of negative eigenvalues, as a share of the cell's largest one
+#: replacement of negative eigenvalues, as a share of the largest one of the cell
 CLIPPED_EIGENVALUE = 1e-6
 
 
 class InvertedCellError(ArithmeticError):
-    """Raised for an inverted cell: J ≤ 0 at one of its Gauss points."""
+    """Error for an inverted cell, with J ≤ 0 at one of its Gauss points."""
 
     def __init__(self, cell: int, determinant: float) -> None:
         self.cell, self.determinant = cell, determinant
@@ -65,7 +65,7 @@ class InvertedCellError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Data of the cells of hyperelastic bodies that do not depend on u."""
+    """Data of the cells of hyperelastic bodies that are independent of u."""
 
     mesh: Mesh
     materials: tuple[Hyperelastic, ...]  #: material of each body
@@ -77,7 +77,7 @@ class Cells:
 
 
 class EnergyDerivatives(NamedTuple):
-    """Strain energy of a state, with its derivatives."""
+    """Strain energy of a state, with its derivatives with respect to u."""
 
     energy: float  #: Π
     forces: Vector  #: (n,)  r = ∂Π/∂u, internal forces
@@ -87,7 +87,11 @@ class EnergyDerivatives(NamedTuple):
 def cells_of(
     mesh: Mesh, materials: Sequence[Hyperelastic], body: NDArray[np.int64]
 ) -> Cells:
-    """Return the cells of a mesh, with the material of each body; `body` (E,)."""
+    """Return the data of the cells of a mesh.
+
+    materials : material of each body
+    body : (E,) body of each cell
+    """
     corners = mesh.points[mesh.cells]
     points = [shape_gradients(corners, point) for point in mesh.element.points]
     return Cells(
@@ -107,7 +111,7 @@ def deformation_gradients(cells: Cells, u: Vector) -> Floats:
 
 
 def _deformed(cells: Cells, u: Vector, gradients: Floats) -> Floats:
-    """Return F (E, q, dim, dim) at points with the given shape function gradients."""
+    """Return F (E, q, dim, dim) at points with shape function gradients `gradients`."""
     E, _, n, dim = gradients.shape
     moved = u[cells.dofs].reshape(E, 1, n, dim)
     return np.asarray(np.eye(dim) + np.swapaxes(moved, -1, -2) @ gradients)
@@ -134,7 +138,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     Raises
     ------
     InvertedCellError
-        When J ≤ 0 at a Gauss point; it names the cell with the smallest J.
+        If J ≤ 0 at a Gauss point. The error states the cell with the smallest J.
 
     """
     F = deformation_gradients(cells, u)
@@ -154,7 +158,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
         P = w.first + slope[..., None, None] * theta.first
         nodal = _nodal(P, gradients, volumes)
         forces += np.bincount(cells.dofs[index].ravel(), nodal.ravel(), u.size)
-        # ∂²(w + U′θ)/∂F² at fixed U′; the rest is U″ θ′⊗θ′, or U″/V ggᵀ of the mean
+        # ∂²(w + U′θ)/∂F² at fixed U′; the remainder is U″ θ′⊗θ′, or U″/V ggᵀ for Q1P0
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
             A += np.einsum("eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first)
@@ -181,16 +185,16 @@ def convex_tangent(
 ) -> tuple[csc_array, int]:
     """Assemble K_t, modified cell by cell if it is not positive definite.
 
-    The negative eigenvalues of each cell's tangent are then replaced by a small
+    The modification replaces negative eigenvalues of each cell tangent by a small
     positive share of its largest one (Teran, Sifakis, Irving and Fedkiw 2005, "Robust
     quasistatic finite elements and flesh simulation", who replace them by 0). Zero
-    eigenvalues are kept, so that translations stay in the kernel of a cell.
+    eigenvalues are kept, so that translations remain in the kernel of each cell.
 
     Parameters
     ----------
     tangents : tangents of the cells, see `EnergyDerivatives`
-    positive : predicate that returns True if K_t (n, n) is positive definite together
-        with the supports, by its Cholesky factorisation
+    positive : returns True if K_t (n, n) is positive definite on the motions that the
+        supports allow, as tested by a Cholesky factorisation
 
     Returns
     -------
@@ -199,10 +203,10 @@ def convex_tangent(
     Raises
     ------
     ArithmeticError
-        When even the modified K_t is not positive definite.
+        If the modified K_t is not positive definite either.
 
     """
-    # cells may be indefinite while their sum is not: modify only if necessary
+    # the sum of indefinite cell tangents may be definite: modify only if necessary
     exact = assemble(cells, tangents)
     if positive(exact):
         return exact, 0
@@ -217,7 +221,13 @@ def convex_tangent(
 
 
 def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
-    """Replace negative eigenvalues of matrices (E, k, k); count these matrices."""
+    """Replace negative eigenvalues of matrices (E, k, k).
+
+    Returns
+    -------
+    new matrices, and the number of matrices with negative eigenvalues
+
+    """
     values, vectors = np.linalg.eigh(tangents)
     largest = np.abs(values).max(axis=1, initial=0.0)
     negative = values < -EIGENVALUE_ROUNDING * largest[:, None]
@@ -226,7 +236,7 @@ def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
     vectors = vectors[changed]
     clipped = tangents.copy()
     product = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    # makes the result symmetric to the last digit
+    # make the result exactly symmetric
     clipped[changed] = (product + np.swapaxes(product, 1, 2)) / 2
     return clipped, int(changed.sum())
 
@@ -273,7 +283,7 @@ def _by_material(cells: Cells) -> list[tuple[Hyperelastic, NDArray[np.int64]]]:
 
 
 def _average(values: Floats, volumes: Floats) -> Floats:
-    """Return the mean over each cell, repeated at each of its Gauss points (E, q)."""
+    """Return the mean over each cell, repeated for all of its Gauss points, (E, q)."""
     mean = (values * volumes).sum(axis=1) / volumes.sum(axis=1)
     return np.repeat(mean[:, None], volumes.shape[1], axis=1)
 
@@ -286,10 +296,11 @@ def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
 
 
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:
-    """Add the rows and columns of a triangle's repeated corner to those of its twin.
+    """Add rows and columns of the fourth corner of triangles to those of the third.
 
-    The assembled sum is unchanged, and the eigenvalues of the block are those of the
-    triangle, instead of a quadrilateral whose two equal corners may separate.
+    A triangle repeats its third corner. The assembled sum is unchanged, but the
+    eigenvalues of a block are then those of the triangle instead of a quadrilateral
+    whose equal corners may separate.
     """
     moved, cells = tangents.copy(), is_triangle(mesh.cells)
     moved[cells, 4:6] += moved[cells, 6:]

@@ -1,9 +1,9 @@
-"""Fixing nodes of a floating body: a few nodes spread over it.
+"""Fixing nodes of a floating body: a few nodes, far apart, that exclude rigid motions.
 
-The farther apart these nodes are, the better K without their rows and columns is
-conditioned: two neighbouring corners cost three digits, the central nodes of four parts
-hardly any. In space the nodes must not lie on a line, about which the body could
-rotate.
+The farther apart the fixing nodes are, the better is the condition of K without their
+rows and columns: two neighbouring corners lose three digits, the central nodes of four
+parts hardly any. In space the nodes must not be collinear, because the body could
+rotate about their line.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from scipy.sparse.linalg import eigsh
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 
-#: fixing nodes per body: with fewer, K is worse conditioned; with more, the factor has
-#: more fill-in
+#: number of fixing nodes per body; fewer nodes worsen the condition, more nodes
+#: increase fill-in
 PARTS = 4
-#: least distance of some fixing node from the line through all of them, relative to the
-#: farthest node of the body; blocks have 0.35 and more, bars of one cell may have 0
+#: smallest admissible distance of the fixing nodes from their common line (maximum over
+#: the nodes), relative to that of the farthest node of the body. Blocks have at least
+#: 0.35, bars of one cell may have 0
 MIN_DISTANCE = 0.25
 
 
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
-    """Choose `parts` (a power of two) fixing nodes of one body, by geometry.
+    """Select `parts` (a power of two) fixing nodes of one body, by geometry.
 
-    The nodes (N, dim) are bisected recursively across the longest principal axis, at
-    most down to single nodes; the node nearest to the centroid of each part is chosen.
-    In space, the last node is replaced by one off the line if all are nearly collinear.
+    The nodes `points` (N, dim) are bisected recursively across the longest principal
+    axis, at most down to single nodes. The node nearest to the centroid of each part is
+    selected. In space, if all selected nodes are nearly collinear, the last one is
+    replaced by a node off their line.
     """
     groups = [np.arange(len(points))]
     while len(groups) < parts and all(group.size > 1 for group in groups):
@@ -51,11 +53,11 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
 
 
 def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes:
-    """Choose fixing nodes by spectra of the mesh graph, as the paper and its ref. [8].
+    """Select fixing nodes by spectra of the mesh graph, as in the paper and ref. [8].
 
     The nodes are bisected recursively at the median of the Fiedler vector (the second
-    eigenvector of the graph Laplacian). In each part, the node with the largest entry
-    of the Perron vector of the adjacency matrix, its most central node, is chosen.
+    eigenvector of the graph Laplacian). In each part, the most central node, with the
+    largest entry of the Perron vector of the adjacency matrix, is selected.
 
     Parameters
     ----------
@@ -82,7 +84,7 @@ def _graph(cells: Nodes, nodes: int) -> csr_array:
 def _bisected(graph: Matrix, group: Nodes) -> tuple[Nodes, Nodes]:
     part = laplacian(graph[group][:, group]).tocsc()
     shift = -1e-3 / group.size  # σ just below the zero eigenvalue: L − σI is definite
-    start = np.linspace(-1, 1, group.size)  # by default eigsh draws one at random
+    start = np.linspace(-1, 1, group.size)  # the default of eigsh is random
     values, vectors = eigsh(part, k=2, sigma=shift, which="LM", v0=start)
     order = group[np.argsort(vectors[:, values.argmax()], kind="stable")]
     return order[: len(order) // 2], order[len(order) // 2 :]

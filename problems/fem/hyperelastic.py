@@ -1,21 +1,22 @@
 """Hyperelastic materials in plane strain: energy, stress and tangent from F.
 
-A material is a strain energy W per reference area of the deformation gradient F = ∂x/∂X
-(plane strain: F₃₃ = 1), split into a part for shear and one for dilatation,
+A material is defined by its strain energy W per reference area, a function of the
+deformation gradient F = ∂x/∂X (plane strain: F₃₃ = 1). It is split into a shear and a
+dilatational part,
 
     W(F) = w(F) + U(θ(F)),        P = ∂W/∂F  (first Piola-Kirchhoff),  A = ∂P/∂F
 
-with a measure θ of the dilatation. The mean dilatation method needs this split, see
-`problems.fem.finite_strain`. With Lamé's constants Λ, μ of E and ν:
+with a measure θ of the dilatation. The mean dilatation method requires this split, see
+`problems.fem.finite_strain`. With the Lamé constants Λ, μ:
 
     neo-Hooke                 w = μ/2 (F:F − 2 − 2 ln J),    θ = J,     U = Λ/2 ln²θ
     St. Venant-Kirchhoff      w = μ E:E,   E = ½(FᵀF − I),   θ = tr E,  U = Λ/2 θ²
 
-(neo-Hooke as Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite Element
-Analysis", Section 6.4; the trace of C in three dimensions is F:F + 1). At F = I both
-tangents are those of linear elasticity. St. Venant-Kirchhoff softens under compression
-and has no barrier against J → 0: below a uniaxial stretch of 1/√3 the magnitude of its
-stress decreases.
+(Neo-Hooke is from Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite
+Element Analysis", Section 6.4; the trace of C in three dimensions is F:F + 1.) At F = I
+both tangents are those of linear elasticity. St. Venant-Kirchhoff softens under
+compression and has no barrier against J → 0: the magnitude of its stress decreases
+below a uniaxial stretch of 1/√3.
 """
 
 from __future__ import annotations
@@ -63,11 +64,11 @@ class Hyperelastic(ABC):
 
     @abstractmethod
     def shear(self, F: Floats) -> Derivatives:
-        """Return w with its derivatives by F, Pa."""
+        """Return w with its derivatives with respect to F, Pa."""
 
     @abstractmethod
     def dilatation(self, F: Floats) -> Derivatives:
-        """Return the dilatation measure θ with its derivatives by F."""
+        """Return the dilatation measure θ with its derivatives with respect to F."""
 
     @abstractmethod
     def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
@@ -104,7 +105,7 @@ class NeoHooke(Hyperelastic):
     """Compressible neo-Hooke, W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J."""
 
     def shear(self, F: Floats) -> Derivatives:
-        """Return w = μ/2 (F:F − 2 − 2 ln J); NaN where J ≤ 0."""
+        """Return w = μ/2 (F:F − 2 − 2 ln J) with its derivatives; NaN if J ≤ 0."""
         mu, back = self.shear_modulus, inverse_transpose(F)
         with np.errstate(invalid="ignore", divide="ignore"):
             log_J = np.log(determinant(F))
@@ -119,7 +120,7 @@ class NeoHooke(Hyperelastic):
         )
 
     def dilatation(self, F: Floats) -> Derivatives:
-        """Return θ = J."""
+        """Return θ = J with its derivatives."""
         J = determinant(F)
         return Derivatives(
             J,
@@ -128,7 +129,7 @@ class NeoHooke(Hyperelastic):
         )
 
     def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return U = Λ/2 ln²θ; NaN where θ ≤ 0."""
+        """Return U = Λ/2 ln²θ with its derivatives; NaN if θ ≤ 0."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log = np.log(theta)
         return (
@@ -147,7 +148,7 @@ class StVenantKirchhoff(Hyperelastic):
     """St. Venant-Kirchhoff, W = Λ/2 (tr E)² + μ E:E with E = ½(FᵀF − I)."""
 
     def shear(self, F: Floats) -> Derivatives:
-        """Return w = μ E:E."""
+        """Return w = μ E:E with its derivatives."""
         mu, E = self.shear_modulus, (np.swapaxes(F, -1, -2) @ F - _I) / 2
         return Derivatives(
             mu * (E**2).sum((-2, -1)),
@@ -161,7 +162,7 @@ class StVenantKirchhoff(Hyperelastic):
         )
 
     def dilatation(self, F: Floats) -> Derivatives:
-        """Return θ = tr E."""
+        """Return θ = tr E with its derivatives."""
         theta = (F**2).sum((-2, -1)) / 2 - 1  # tr E = ½ F:F − 1 in the plane
         identity = np.einsum("ik,jl->ijkl", _I, _I)
         return Derivatives(
@@ -169,7 +170,7 @@ class StVenantKirchhoff(Hyperelastic):
         )
 
     def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return U = Λ/2 θ²."""
+        """Return U = Λ/2 θ² with its derivatives."""
         lame = self.lame
         return lame / 2 * theta**2, lame * theta, np.full_like(theta, lame)
 
@@ -186,8 +187,8 @@ MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyTy
 
 
 def hyperelastic(name: str, linear: Material, unit: float = 1.0) -> Hyperelastic:
-    """Return the material `name` of MATERIALS that is `linear` at small strains.
+    """Return the material `name` of MATERIALS with the moduli of `linear`.
 
-    unit : unit of stress, Pa, by which its moduli are divided
+    unit : unit of stress, Pa, by which the moduli are divided
     """
     return MATERIALS[name](linear.E / unit, linear.nu)

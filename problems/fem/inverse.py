@@ -1,21 +1,21 @@
 """Generalised inverses K⁺ of the stiffness by sparse Cholesky, and their condensation.
 
-K of a floating body is regularised by fixing nodes (Brzobohatý, Dostál,
-Kozubek, Kovář, Markopoulos 2011, the paper's reference [8]): with R* the rows of the
-rigid modes at a few nodes (orthonormalised, zero elsewhere) and ρ > 0,
+The stiffness matrix K of a floating body is regularised by fixing nodes (Brzobohatý,
+Dostál, Kozubek, Kovář, Markopoulos 2011, reference [8] of the paper): with R* the rows
+of the rigid modes at a few nodes (orthonormalised, zero elsewhere) and ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
-so K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that costs one sparse Cholesky factor.
-It is not the Moore-Penrose inverse; for balanced loads (Rᵀf = 0) the two solutions
-differ by a rigid motion only. For supported bodies, K⁺ is K_ff⁻¹ on the free components
-and zero on the prescribed ones.
+so that K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
+factor. It is not the Moore-Penrose inverse, but for balanced loads (Rᵀf = 0) both
+solutions only differ by a rigid motion. For supported bodies, K⁺ is K_ff⁻¹ on the free
+components and zero on the prescribed ones.
 
-B has entries only in the components c of contact sides and supports. If these are
-eliminated last, the trailing block L_cc of the factor gives (K⁺)_cc = (L_cc L_ccᵀ)⁻¹,
-and  F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  (eq. (3) of the paper) is one small product in every
-load step. Fixing nodes are eliminated together with c, so that their coupling by
-ρ R*R*ᵀ across the body causes no fill-in elsewhere.
+The entries of B are in the components c of contact sides and supports. If these
+components are eliminated last, the trailing block L_cc of the factor yields
+(K⁺)_cc = (L_cc L_ccᵀ)⁻¹, and  F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  (eq. (3) of the paper)
+requires one small product in every load step. Fixing nodes are eliminated together with
+c, so that the term ρ R*R*ᵀ, which couples them, causes no fill-in elsewhere.
 """
 
 from __future__ import annotations
@@ -67,12 +67,15 @@ class GeneralisedInverse(Protocol):
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n), exactly symmetric."""
 
     def at_constraints(self, b: Vector) -> Vector:
-        """Return K⁺b (n,) on the interface components, for b (n,) that acts on them."""
+        """Return K⁺b (n,), valid on the interface components.
+
+        b : (n,) forces that are zero outside the interface components
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class CholeskyInverse:
-    """K⁺ by CHOLMOD's factor, with one solve per row of B in BK⁺Bᵀ, as in the paper."""
+    """K⁺ by CHOLMOD; BK⁺Bᵀ requires one solve per row of B, as in the paper."""
 
     factor: Factor
     free: Nodes  #: components on which K⁺ acts; it is zero on the others
@@ -91,13 +94,13 @@ class CholeskyInverse:
         return np.asarray((F + F.T) / 2)
 
     def at_constraints(self, b: Vector) -> Vector:
-        """Return K⁺b, here on all components."""
+        """Return K⁺b, valid on all components."""
         return self(b)
 
 
 @dataclass(frozen=True, eq=False)
 class CondensedInverse:
-    """K⁺ from a multifrontal factor; stores its block (K⁺)_cc on the interface."""
+    """K⁺ by a multifrontal factor, with its block (K⁺)_cc on the interface."""
 
     factor: Multifrontal
     interface: Nodes  #: components c with entries in constraint rows, ascending
@@ -136,7 +139,7 @@ def regular_inverse(
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When K_ff is singular; CHOLMOD's error is raised without an interface.
+        If K_ff is singular. Without an interface, the error is that of CHOLMOD.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)
@@ -148,15 +151,16 @@ def floating_inverse(
     fixing: Sequence[Nodes],
     interface: Interface | None = None,
 ) -> GeneralisedInverse:
-    """Factorise the stiffness of floating bodies numbered one after another.
+    """Factorise the stiffness of floating bodies with consecutive numbers.
 
     Parameters
     ----------
-    K : (n, n) block diagonal over the bodies
-    kernels : per body, an orthonormal basis (n_body, r_body) of its rigid modes
-    fixing : per body, the components (numbered within it) of its fixing nodes, on which
-        no rigid mode vanishes: at least two nodes in the plane, three in space
-    interface : components c for (K⁺)_cc; None: one solve per row of B
+    K : (n, n) block diagonal matrix with one block per body
+    kernels : for each body, an orthonormal basis (n_body, r_body) of its rigid modes
+    fixing : for each body, the components of its fixing nodes, numbered within the
+        body; no rigid mode may vanish on them, which requires at least two nodes in the
+        plane and three in space
+    interface : components c for (K⁺)_cc; None to solve once per row of B instead
 
     """
     starred, fixed, start = [], [], 0
@@ -179,24 +183,24 @@ def supported_inverse(
     rigid: NDArray[np.float64],
     interface: Interface | None = None,
 ) -> GeneralisedInverse:
-    """Factorise K_ff of bodies whose supports may leave rigid motions.
+    """Factorise K_ff of bodies whose supports may allow rigid motions.
 
-    One further component is fixed for each such motion, chosen by a QR factorisation of
-    the motions with pivoting. Balanced loads cause no reactions there.
+    For each such motion, one further component is fixed, selected by a QR factorisation
+    of the motions with pivoting. Balanced loads cause no reactions at these components.
 
     Parameters
     ----------
     rigid : (n, r) rigid motions of all bodies, ignoring supports
-    interface : components c for (K⁺)_cc; None: one solve per row of B
+    interface : components c for (K⁺)_cc; None to solve once per row of B instead
 
     """
     fixed = np.setdiff1d(np.arange(K.shape[0]), free)
     kernel = rigid @ null_space(rigid[fixed]) if fixed.size else rigid
     if not kernel.shape[1]:
         return _inverse(csc_array(K), free, kernel, interface)
-    kernel[fixed] = 0  # exactly: null_space leaves rounding
+    kernel[fixed] = 0  # null_space is zero up to rounding only
     kernel = np.linalg.qr(kernel)[0]
-    # pivoting picks components on which the motions are well conditioned
+    # pivoting selects components on which the motions are well conditioned
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     return _inverse(csc_array(K), np.setdiff1d(free, pins), kernel, interface)
 
@@ -221,7 +225,7 @@ def _inverse(
     number[c] = np.arange(c.size, dtype=np.int32)
     compliance = np.zeros((c.size, c.size))
     for components, U in factor.trailing() if c.size else ():
-        # (UᵀU)⁻¹ on the components eliminated last; those outside c are skipped
+        # (UᵀU)⁻¹ on the components eliminated last; skip components outside c
         lower, _ = lapack.dpotri(U.T, lower=1)
         scatter_symmetric(lower.T, number[components], compliance)
     return CondensedInverse(factor, c, compliance, kernel, perf_counter() - start)

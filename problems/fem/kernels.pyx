@@ -2,8 +2,9 @@
 """Compiled loops of the assembly, and of congruences BCBᵀ.
 
 Cells couple each node to few others. The sparsity pattern is therefore computed node by
-node, and each cell adds its entries directly to the CSC arrays, without triplets and
-sorting. The integrals, for any element, are in `cells.h`. Types are in `kernels.pyi`.
+node, and the entries of each cell are added directly to the CSC arrays, without
+triplets and sorting. The integrals for all elements are in `cells.h`, and types are in
+`kernels.pyi`.
 """
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 def node_pattern(const int[:, ::1] cells, int nodes):
     """Return the nodes that share a cell with each node, ascending, as CSR (ptr, idx).
 
-    cells : (E, n) node numbers, below `nodes`
+    cells : (E, n) node numbers, less than `nodes`
     """
     cdef Py_ssize_t e, a, b, i, j, k, t, first, end = 0, n = cells.shape[1]
     starts = np.zeros(nodes + 1, dtype=np.int32)
@@ -66,7 +67,7 @@ def dof_pattern(const int[::1] ptr, const int[::1] idx, int dim):
 
 
 def slots(const int[:, ::1] cells, const int[::1] ptr, const int[::1] idx):
-    """Return the index of node b among the neighbours of a, for a, b of a cell.
+    """Return the index of node b among the neighbours of node a, for a, b in a cell.
 
     The result is (E, n, n), with a along the second and b along the third axis.
     """
@@ -117,10 +118,10 @@ def add_stiffness(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Sum ∫ BᵀDB over the cells into the values of the dof pattern.
+    """Return the values of Σ_e ∫ BᵀDB in the dof pattern.
 
-    elem : element; points : (N, dim); cells : (E, n); D : (materials, v, v) in Voigt's
-    notation; material : (E,) material of each cell
+    elem : `Element`; points : (N, dim); cells : (E, n); D : (materials, v, v) in
+    Voigt's notation; material : (E,) material of each cell; ptr, slot : see `Pattern`
     """
     cdef int n = cells.shape[1], dim = points.shape[1]
     cdef const double[:, :, ::1] gradients = elem.table
@@ -148,7 +149,7 @@ def add_tangents(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Sum tangents (E, n·dim, n·dim) of cells into the values of the dof pattern."""
+    """Return the sum of cell tangents (E, n·dim, n·dim) as values of the dof pattern."""
     cdef int n = cells.shape[1]
     cdef int dim = tangents.shape[1] // n
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
@@ -168,7 +169,7 @@ def cell_tangents(
 ):
     """Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of each cell.
 
-    gradients : (E, q, n, dim) of the shape functions at the quadrature points;
+    gradients : (E, q, n, dim) shape function gradients at the quadrature points;
     volumes : (E, q) v_q; A : (E, q, dim, dim, dim, dim), symmetric. The result
     (E, n·dim, n·dim) is exactly symmetric.
     """
@@ -194,8 +195,8 @@ def congruence(
 ):
     """Return BCBᵀ (m, m), exactly symmetric, for sparse B (m, n) in CSR.
 
-    Column j of B belongs to row number[j] of the symmetric C (c, c). The second value
-    returned is False if B has an entry in a column with number[j] < 0.
+    Column j of B corresponds to row number[j] of the symmetric C (c, c). The second
+    returned value is False if B has an entry in a column j with number[j] < 0.
     """
     cdef Py_ssize_t i, j, k, t, m = ptr.shape[0] - 1, c = C.shape[0]
     cdef double total

@@ -1,4 +1,4 @@
-"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes on uniform grids, unit tension."""
+"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes under unit tension, uniform grids."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from scipy.sparse import csc_array, diags_array, kron
 def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
     """Assemble K for linear (one direction) or bilinear elements (two directions).
 
-    Nodes are numbered along the last direction first.
+    Node numbers vary fastest along the last direction.
 
     Parameters
     ----------
     cells : number of cells along each of one or two directions
-    h : length of a cell, the same in all directions; K in two directions does not
-        depend on it
+    h : length of a cell in all directions; in two directions, K is independent of h
 
     """
-    # stiffness of the product grid: K ⊗ M + M ⊗ K
+    # stiffness of a tensor product grid: K ⊗ M + M ⊗ K
     K, M = zip(*(_along(n, h) for n in cells), strict=True)
     terms = (
         reduce(kron, [K[i] if i == j else M[i] for i in range(len(cells))])
@@ -32,7 +31,7 @@ def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
 def _along(n: int, h: float) -> tuple[csc_array, csc_array]:
     """Return ∫N_a′N_b′ and ∫N_aN_b of n linear elements in a row."""
     inside = np.ones(n)
-    # number of cells at each node
+    # number of cells adjacent to each node
     ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]
     K = diags_array([-inside, ends, -inside], offsets=[-1, 0, 1]) / h
     M = diags_array([inside, 2 * ends, inside], offsets=[-1, 0, 1]) * (h / 6)

@@ -1,18 +1,19 @@
 """Meshes with named boundaries (paper, Section 2 and Figure 1).
 
-Dimension and number of corners determine the element. Plane meshes consist of
-quadrilaterals and triangles in any mixture. A triangle is a degenerate quadrilateral
-whose last two corners coincide: the bilinear map is then onto the triangle, and
-N₁, N₂, N₃ + N₄ are its barycentric coordinates,
+The dimension and the number of corners determine the element. Plane meshes may mix
+quadrilaterals and triangles. A triangle is a degenerate quadrilateral whose last two
+corners coincide. The bilinear map is then onto the triangle, and N₁, N₂, N₃ + N₄ are
+its barycentric coordinates,
 
     Σ N_a x_a = x,   Σ N_a = 1   ⟹   N₁, N₂, N₃ + N₄ are linear in x,
 
 so that the bilinear element *is* the linear triangle (P1). 2×2 Gauss points integrate
 its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
 
-Meshes in space consist of tetrahedra, wedges or hexahedra. In mixtures, all cells are
-hexahedra, degenerate in the same way: a tetrahedron is (a, b, c, c, d, d, d, d), a
-wedge (a, b, c, c, d, e, f, f). Both have the stiffness of the elements themselves.
+Meshes in space consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
+are stored as hexahedra, which are degenerate in the same way: a tetrahedron is
+(a, b, c, c, d, d, d, d), a wedge (a, b, c, c, d, e, f, f). The stiffness of such a cell
+is that of the tetrahedral or wedge element.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Elemen
 
 Nodes = NDArray[np.int64]
 
-#: corners of a degenerate hexahedron, by kind, see the module's docstring
+#: corners of a degenerate hexahedron, by kind of cell
 REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]}
 
 
@@ -39,8 +40,9 @@ class Mesh:
     """Nodes, cells and named boundaries; lengths in m.
 
     In the plane, a boundary is a chain of nodes with the body on its left: with the
-    unit tangent t, the outward normal is (t_y, −t_x). In space it is a table (k, 4) of
-    faces, their corners anticlockwise from outside; triangles repeat their last corner.
+    unit tangent t, the outward normal is (t_y, −t_x). In space, a boundary is an array
+    (k, 4) of faces with corners anticlockwise from outside; triangles repeat their last
+    corner.
 
     >>> mesh = rectangle((0.0, 0.0), (2.0, 1.0), (2, 1))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["bottom"].tolist()
@@ -55,7 +57,7 @@ class Mesh:
 
     @property
     def dim(self) -> int:
-        """Dimension of space: coordinates and displacement components per node."""
+        """Dimension of space, the number of displacement components per node."""
         return int(self.points.shape[1])
 
     @property
@@ -65,21 +67,21 @@ class Mesh:
 
     @property
     def element(self) -> Element:
-        """Element of all cells, of which those in mixed meshes may be degenerate."""
+        """Element of all cells, which may be degenerate in mixed meshes."""
         return ELEMENTS[self.dim, self.cells.shape[1]]
 
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
-        """Cells grouped by kind, with the names of meshio."""
+        """Cells grouped by kind, with meshio's names."""
         return cell_blocks(self.cells, self.dim)
 
 
 @dataclass(frozen=True, eq=False)
 class StructuredGrid:
-    """Structured grid, of which any block can be generated without the rest.
+    """Structured grid; any block of it can be generated separately.
 
-    Node (row j, column i) has the number j·(columns) + i; cells are numbered in the
-    same way.
+    The node in row j and column i has the number j·(nx + 1) + i; cells are numbered in
+    the same way.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes
@@ -125,7 +127,7 @@ class StructuredGrid:
         row, column = np.divmod(node, self.columns.size)
         points = np.empty((node.size, 2))
         by_rows = np.unique(row).size <= np.unique(column).size
-        # line by line: `place` evaluates products of columns and rows only
+        # line by line, because `place` evaluates full products of columns and rows
         for line in np.unique(row if by_rows else column):
             k = np.flatnonzero((row if by_rows else column) == line)
             parameters = (
@@ -137,7 +139,7 @@ class StructuredGrid:
         return points
 
     def prefixed(self, prefix: str) -> StructuredGrid:
-        """Return the body with `prefix` before the names of its sides."""
+        """Return a copy with `prefix` added to the names of the sides."""
         first, second, third, fourth = (prefix + name for name in self.names)
         return replace(self, names=(first, second, third, fourth))
 
@@ -151,18 +153,18 @@ class StructuredGrid:
 class HalfDisc:
     """Half disc of rings of cells, with triangles at its centre.
 
-    With a angles and r radii, node (ring j, angle i) has the number  j·a + i,  and the
-    centre is the last node. Cells are numbered ring by ring, the triangles last.
+    With a angles and r radii, the node on ring j at angle i has the number  j·a + i,
+    and the centre is the last node. Cells are numbered ring by ring, triangles last.
     """
 
     centre: tuple[float, float]
-    angles: Vector  #: (a,) increasing, from end to end of the arc, π apart
-    radii: Vector  #: (r,) decreasing and positive, from the radius of the arc inwards
+    angles: Vector  #: (a,) increasing, from one end of the arc to the other, π apart
+    radii: Vector  #: (r,) positive and decreasing, from the radius of the arc inwards
     names: tuple[str, str] = ("arc", "flat")  #: names of the sides
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Number of cells along a ring; number of rings, including the triangles."""
+        """Number of cells per ring, and number of rings including the triangles."""
         return self.angles.size - 1, self.radii.size
 
     @property
@@ -189,9 +191,11 @@ class HalfDisc:
         return np.asarray(np.asarray(self.centre) + radius * self._direction[angle])
 
     def block(self, angles: slice, rings: slice) -> tuple[Nodes, Nodes]:
-        """Return the nodes (k,) of a block of cells, and these cells (E, 4).
+        """Return the nodes (k,) of a block of cells, and its cells (E, 4).
 
-        angles, rings : ranges of cells; corners are indices into the nodes returned
+        Corners of cells are indices into the returned nodes.
+
+        angles, rings : ranges of cells along rings, and of rings
         """
         a, r = self.angles.size, self.radii.size
         # the innermost ring consists of triangles with the centre as common corner
@@ -210,13 +214,13 @@ class HalfDisc:
     def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
         """Return the mean lengths of cells along radii and along arcs.
 
-        Each is a pair of factors, one per ring of cells and one per angle of cells.
+        Each length is the product of a factor per ring and a factor per angle of cells.
         """
         half, r = np.diff(self.angles) / 2, np.append(self.radii, 0.0)
         return (-np.diff(r), np.cos(half)), ((r[1:] + r[:-1]) / 2, 2 * np.sin(half))
 
     def prefixed(self, prefix: str) -> HalfDisc:
-        """Return the body with `prefix` before the names of its sides."""
+        """Return a copy with `prefix` added to the names of the sides."""
         arc, flat = (prefix + name for name in self.names)
         return replace(self, names=(arc, flat))
 
@@ -238,7 +242,10 @@ def cells_of_block(columns: int, rows: int) -> Nodes:
 def rectangle_grid(
     corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
 ) -> StructuredGrid:
-    """Divide a rectangle into nx × ny equal cells; sides bottom, right, top, left."""
+    """Divide a rectangle into nx × ny equal cells.
+
+    The sides are bottom, right, top and left.
+    """
     nx, ny = divisions
     return StructuredGrid(
         columns=corner[0] + size[0] * np.arange(nx + 1) / nx,
@@ -251,9 +258,9 @@ def rectangle_grid(
 def box(
     corner: tuple[float, ...], size: tuple[float, ...], divisions: tuple[int, ...]
 ) -> Mesh:
-    """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
+    """Mesh a box by nx × ny × nz equal hexahedra; numbers vary fastest along x.
 
-    The boundaries have the names of those of `box_grid`. Lengths are in m.
+    The names of boundaries are those of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
@@ -267,9 +274,10 @@ def box(
 
 
 def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
-    """Mesh a box by hexahedra between increasing coordinates, x numbered fastest.
+    """Mesh a box by hexahedra between increasing coordinates.
 
-    Boundaries: left and right (x), front and back (y), bottom and top (z).
+    Numbers vary fastest along x. The boundaries are left and right (x), front and back
+    (y), bottom and top (z).
     """
     axes = x, y, z
     counts = [axis.size for axis in axes]
@@ -296,8 +304,8 @@ def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
 def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
     """Extrude a plane mesh of quadrilaterals to layers of hexahedra from z = 0, m.
 
-    Nodes and cells are numbered layer by layer. A chain of nodes becomes faces of the
-    same name; those at both ends of the thickness have no name.
+    Nodes and cells are numbered layer by layer. A chain of nodes becomes a set of faces
+    of the same name. The end faces have no name.
     """
     N = len(mesh.points)
     step = N * np.arange(layers + 1)
@@ -305,7 +313,7 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
     points = np.column_stack([np.tile(mesh.points, (layers + 1, 1)), z])
     ends = step[:-1, None, None], step[1:, None, None]
     cells = np.concatenate([mesh.cells + at for at in ends], axis=2)
-    # with the body on the left of the chain, (a, b, b', a') is anticlockwise outside
+    # the body is on the left of the chain, so (a, b, b', a') is anticlockwise outside
     facets = {
         name: np.stack([chain[:-1], chain[1:], chain[1:] + N, chain[:-1] + N], axis=-1)
         for name, chain in mesh.boundaries.items()
@@ -317,7 +325,7 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
 
 
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
-    """Move the nodes of a `box` at random; those of a side stay in its plane.
+    """Move the nodes of a `box` at random; nodes of a side remain in its plane.
 
     share : largest shift along an axis, relative to the mean cell size along this axis
     """
@@ -332,9 +340,9 @@ def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
 def half_ring_grid(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> StructuredGrid:
-    """Divide the upper half of a ring by equal angles × equal layers.
+    """Divide the upper half of a ring by equal angles and equal layers.
 
-    Sides: outer (from angle 0 to π), left_foot, inner, right_foot.
+    The sides are outer (from angle 0 to π), left_foot, inner and right_foot.
     """
     angles, layers = divisions
 
@@ -355,7 +363,7 @@ def rectangle(
 ) -> Mesh:
     """Mesh a rectangle by nx × ny equal cells.
 
-    Boundaries: bottom, right, top, left. Lengths are in m.
+    The boundaries are bottom, right, top and left. Lengths are in m.
 
     >>> rectangle((0.0, 0.5), (2.0, 0.25), (8, 1)).points[-1].tolist()
     [2.0, 0.75]
@@ -366,32 +374,32 @@ def rectangle(
 def half_ring(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh the upper half of a ring by equal angles × equal layers.
+    """Mesh the upper half of a ring by equal angles and equal layers.
 
-    Boundaries: outer (from angle 0 to π), left_foot, inner, right_foot.
+    The boundaries are outer (from angle 0 to π), left_foot, inner and right_foot.
     """
     return half_ring_grid(centre, radii, divisions).mesh()
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
-    """Mesh half a disc by rings of cells that end in triangles at its centre.
+    """Mesh half a disc by rings of cells, with triangles at its centre.
 
-    Boundaries: arc (anticlockwise) and flat (through the centre).
+    The boundaries are arc (anticlockwise) and flat (through the centre).
 
     Parameters
     ----------
     angles : increasing, from one end of the arc to the other, π apart
-    radii : decreasing and positive, from the radius of the arc inwards
+    radii : positive and decreasing, from the radius of the arc inwards
 
     """
     return HalfDisc(centre, angles, radii).mesh()
 
 
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
-    """Join the meshes of bodies, without merging nodes; also return each cell's body.
+    """Join the meshes of bodies without merging nodes; return the mesh and `body` (E,).
 
-    Names of boundaries must differ between the bodies: of equal names, the last body's
-    boundary is kept. `prefixed` makes them differ.
+    Names of boundaries must be distinct (see `prefixed`): of several boundaries with
+    the same name, only that of the last body is kept.
 
     >>> block = rectangle((0.0, 0.0), (1.0, 1.0), (1, 1))
     >>> mesh, body = join((prefixed(block, "a_"), prefixed(block, "b_")))
@@ -411,7 +419,7 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
 
 
 def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, Nodes]:
-    """Return the sides of bodies, with nodes numbered as by `join`."""
+    """Return the sides of bodies by name, with nodes numbered as in `join`."""
     starts = np.cumsum([0] + [body.nodes for body in bodies])
     return {
         name: nodes + start
@@ -421,7 +429,7 @@ def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, No
 
 
 def prefixed(mesh: Mesh, prefix: str) -> Mesh:
-    """Return the mesh with `prefix` before the name of each boundary, see `join`."""
+    """Return the mesh with `prefix` added to the name of each boundary, see `join`."""
     return replace(
         mesh, boundaries={prefix + name: b for name, b in mesh.boundaries.items()}
     )
@@ -444,7 +452,7 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
 
 
 def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vector]:
-    """Return the nodes of faces (k, 4) in space, ascending, and their shares ∫N_j, m².
+    """Return the nodes of faces (k, 4) in space, ascending, and nodal areas ∫N_j, m².
 
     >>> unit = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
     >>> nodes, areas = nodal_areas(unit.points, unit.boundaries["top"])
@@ -461,14 +469,14 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
 
 
 def nodes_of_side(side: Nodes) -> Nodes:
-    """Return the nodes of a chain, in its order, or of faces, ascending."""
+    """Return the nodes of a chain in order, or of faces in ascending order."""
     return side if side.ndim == 1 else np.unique(side)
 
 
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
     """Return the displacement components of nodes: dim·i, dim·i + 1, … for node i.
 
-    axis : 0, 1, …: only the components along this axis
+    axis : 0, 1, … selects the components along one axis; None selects all
 
     >>> dofs_of(np.array([0, 3]), 2).tolist(), dofs_of(np.array([0, 3]), 2, 1).tolist()
     ([0, 1, 6, 7], [1, 7])
@@ -479,5 +487,5 @@ def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
 
 
 def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
-    """Return a view of a dof vector (dim·N,) as one vector per node (N, dim)."""
+    """Return a view (N, dim), one row per node, of a dof vector (dim·N,)."""
     return u.reshape(-1, dim)

@@ -1,9 +1,9 @@
 """Sparse Cholesky factors by the multifrontal method (Duff and Reid 1983; Liu 1992).
 
 Each front assembles a small dense matrix from the entries of K in its rows and the
-Schur complements of its children, eliminates its unknowns, and passes the Schur
-complement on its border to its parent. Nearly all work is in dense products (Liu, SIAM
-Review 34, 1992).
+Schur complements of its children, eliminates the unknowns of the front, and passes the
+Schur complement on its border to its parent. Nearly all work is in dense products (Liu,
+SIAM Review 34, 1992).
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Multifrontal:
-    """Factor K_oo = LLᵀ, stored by fronts as U = Lᵀ, pivots × (pivots + border)."""
+    """Factor K_oo = LLᵀ, stored as rows of U = Lᵀ, front by front.
+
+    The block of a front is pivots × (pivots + border).
+    """
 
     order: Nodes  #: o, components in elimination order
     fronts: Fronts  #: fronts of positions in `order`
@@ -44,7 +47,7 @@ class Multifrontal:
         return x.T.reshape(b.shape)
 
     def trailing(self) -> list[tuple[Nodes, Floats]]:
-        """Return the unknowns eliminated last in each connected part, and U on them."""
+        """Return the unknowns eliminated last and their U, for each connected part."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
             positions = slice(f.start[s], f.start[s + 1])
@@ -57,20 +60,20 @@ class Multifrontal:
 def multifrontal(
     K: Matrix, free: Nodes, points: NDArray[np.float64], last: Nodes
 ) -> Multifrontal:
-    """Factorise K_ff in nested dissection order, with the nodes of `last` at the end.
+    """Factorise K_ff in nested dissection order, eliminating the nodes of `last` last.
 
     Parameters
     ----------
     K : (n, n) symmetric, CSC
     free : components f
-    points : (N, dim) positions of the nodes; node i has n/N components from i·n/N on
-    last : components whose nodes are eliminated last; K should couple distant nodes
-        only among these
+    points : (N, dim) positions of the nodes; node i has the n/N components from i·n/N
+    last : components whose nodes are eliminated last. If K couples distant nodes, they
+        should be among these nodes
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        When K_ff is not positive definite.
+        If K_ff is not positive definite.
 
     """
     n, N = K.shape[0], len(points)

@@ -10,15 +10,15 @@ import numpy as np
 #: Jacobi sweeps for a 3 × 3 matrix; convergence is quadratic, and four suffice for
 #: double precision
 cdef int SWEEPS = 8
-#: off-diagonal entries, and differences of eigenvalues, that count as zero, relative
-#: to the trace
+#: off-diagonal entries and differences of eigenvalues below this share of the trace
+#: count as zero
 cdef double ROUNDING = 1e-9
 
 
 def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
-    """Contract a matrix pattern with d components per node to the graph of its nodes.
+    """Return the node graph (ptr, idx) of a matrix pattern with d components per node.
 
-    Returns the neighbours of each node as (ptr, idx), without the node itself.
+    A node is not its own neighbour.
     """
     cdef Py_ssize_t a, b, t, end = 0
     pointers = np.zeros(nodes + 1, dtype=np.int32)
@@ -38,7 +38,7 @@ def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
 
 
 def components(const int[::1] ptr, const int[::1] idx):
-    """Number the connected components in the order of their first nodes: (N,)."""
+    """Return the connected component of each node (N,), numbered by first nodes."""
     cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
     cdef int count = 0
     numbers = np.full(nodes, -1, dtype=np.int32)
@@ -64,26 +64,26 @@ def dissect_components(
 
     Returns order (N,), start (F + 1,), children (F,) and roots (F,).
     """
-    # component by component, in each the nodes of `is_last` at the end, both ascending
+    # order by component, then `is_last`, then node number
     key = 2 * components(ptr, idx) + is_last
     chosen = np.argsort(key, kind="stable").astype(np.int32)
     ends = np.append(0, np.bincount(key, minlength=key.max() // 2 * 2 + 2).cumsum())
     cdef int[::1] order = chosen
     cdef const int64_t[::1] end = ends
 
-    # a part of n nodes is bisected at most n − 1 times, which bounds the fronts
+    # a part of n nodes is bisected at most n − 1 times, which bounds the array sizes
     cdef Py_ssize_t nodes = points.shape[0], depth, low, high, middle, separator
     cdef Py_ssize_t c, begin, fronts = 0
     lengths, branches = np.zeros((2, 3 * nodes), dtype=np.int32)
     roots = np.zeros(3 * nodes, dtype=np.bool_)
     cdef int[::1] length = lengths, children = branches
     cdef int[:, ::1] stack = np.empty((2 * nodes, 2), dtype=np.int32)
-    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # in the last bisection
+    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # half in the last bisection
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
     cdef double[:, ::1] along = np.empty((2, nodes))
     cdef int cut = 0
     for c in range(end.shape[0] // 2):
-        # in reversed postorder: separator, second half, first half
+        # reversed postorder: separator, second half, first half
         begin, depth = fronts, 0
         if end[2 * c] < end[2 * c + 1]:
             stack[0, 0], stack[0, 1], depth = end[2 * c], end[2 * c + 1], 1
@@ -104,7 +104,7 @@ def dissect_components(
                 stack[depth, 0], stack[depth, 1] = low, middle
                 stack[depth + 1, 0], stack[depth + 1, 1] = middle, separator
                 depth += 2
-            else:  # a leaf, or nodes that all have the same coordinate
+            else:  # a leaf, or all nodes have the same coordinate
                 length[fronts], children[fronts] = high - low, 0
             fronts += 1
         lengths[begin:fronts] = lengths[begin:fronts][::-1].copy()
@@ -121,10 +121,11 @@ cdef void bisect(
     int[::1] side, int cut, int[::1] kind, int[::1] copy, double[:, ::1] along,
     Py_ssize_t *middle, Py_ssize_t *separator,
 ) noexcept:
-    """Reorder `part` to first half, second half, separator; return their offsets.
+    """Reorder `part` to first half, second half and separator.
 
-    side becomes `cut` on the first half and cut + 1 on the rest. kind, copy and along
-    (2, N) are workspace.
+    `middle` and `separator` are set to the offsets of the second half and of the
+    separator, and `side` to `cut` on the first half and cut + 1 on the rest. kind, copy
+    and along (2, N) are workspace.
     """
     cdef Py_ssize_t a, t, s, n = part.shape[0]
     cdef double value, least = INFINITY, most = -INFINITY
@@ -133,8 +134,8 @@ cdef void bisect(
     for t in range(n):
         along[1, t] = along[0, t]
         least, most = fmin(least, along[0, t]), fmax(most, along[0, t])
-    # the tolerance keeps a grid line at the median together, which rounding of the
-    # coordinates would split between both halves
+    # without the tolerance, rounding of the coordinates could split a grid line at the
+    # median between both halves
     value = find(&along[1, 0], n, n // 2) - 1e-9 * (most - least)
     for t in range(n):
         side[part[t]] = cut + (along[0, t] >= value)
@@ -184,8 +185,8 @@ cdef void coordinates(
 cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
     """Write the eigenvector of the largest eigenvalue of C (upper triangle).
 
-    In space by Jacobi's cyclic method; entries of the size of rounding are not rotated
-    away, so that a cube is bisected along its edges.
+    In space, it is computed by the cyclic Jacobi method. Off-diagonal entries due to
+    rounding are not eliminated, so that a cube is bisected along its edges.
     """
     cdef Py_ssize_t k, l, j, sweep, longest = 0
     cdef double angle, c, s, one, other, size = C[0][0] + C[1][1] + C[2][2]
@@ -212,7 +213,7 @@ cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcep
                 for j in range(3):  # … and its transpose times C from the left
                     one, other = C[k][j], C[l][j]
                     C[k][j], C[l][j] = c * one + s * other, c * other - s * one
-    for k in range(1, 3):  # of axes that are equally long up to rounding, the first
+    for k in range(1, 3):  # select the first of axes that are equal up to rounding
         if C[k][k] > C[longest][longest] + ROUNDING * size:
             longest = k
     for k in range(3):
@@ -220,9 +221,9 @@ cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcep
 
 
 cdef double find(double *v, Py_ssize_t n, Py_ssize_t k) noexcept:
-    """Return the k-th smallest number, counted from 0, of v (n,), which is reordered.
+    """Return the k-th smallest entry of v (n,), k = 0, 1, …; v is reordered.
 
-    Hoare, Algorithm 65: Find, Comm. ACM 4, 1961.
+    Source: Hoare, Algorithm 65: Find, Comm. ACM 4, 1961.
     """
     cdef Py_ssize_t i, j, low = 0, high = n - 1
     cdef double pivot
@@ -251,7 +252,7 @@ def borders(
     const int[::1] start,
     const int[::1] children,
 ):
-    """Compute the border of each front: later neighbours of it and of its children.
+    """Compute the borders: later neighbours of a front, and borders of its children.
 
     Returns first (F + 1,) and border, see `Fronts`.
     """
@@ -286,7 +287,7 @@ def borders(
         stack[depth] = s
         depth += 1
 
-    # two counting sorts, by position and then by front: borders ascend at linear cost
+    # two counting sorts, by position and then by front, sort borders at linear cost
     cdef int[::1] at = np.append(0, np.bincount(entries[:end], minlength=nodes)).cumsum(
         dtype=np.int32
     )

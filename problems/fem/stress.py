@@ -1,12 +1,12 @@
 """Stresses from displacements: at cell centres and Gauss points, recovered at nodes.
 
-Superconvergent patch recovery after Zienkiewicz and Zhu (1992). Stresses are
-superconvergent at the centres of multilinear cells and most accurate at the centroids
-of linear triangles and tetrahedra; a linear polynomial is fitted to these around each
-interior node. A boundary node takes the mean of the polynomials of the interior nodes
-with which it shares a cell; if there are none (at the corner of a single triangle),
-that of its boundary neighbours. Bodies share no nodes, so that no average extends over
-several bodies.
+Nodal stresses follow from superconvergent patch recovery (Zienkiewicz and Zhu 1992).
+Stresses are superconvergent at the centres of multilinear cells, and most accurate at
+the centroids of linear triangles and tetrahedra. Around each interior node, a linear
+polynomial is fitted to these values. At a boundary node, the polynomials of the
+interior nodes with which it shares a cell are averaged. If there are none (at the
+corner of a single triangle), the average is over its boundary neighbours. Bodies have
+no common nodes, so that no average extends over several bodies.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
     )
     offset = (centre[cells] - mesh.points[nodes]) / size
-    # 1, x, … about the node, in units of the extent of the mesh
+    # basis 1, x, … relative to the node, in units of the extent of the mesh
     basis = np.column_stack([np.ones(len(nodes)), offset])
     normal, right = np.empty((N, terms, terms)), np.empty((N, terms, k))
     for p, q in combinations_with_replacement(range(terms), 2):
@@ -82,7 +82,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     polynomial = np.zeros((N, terms, k))
     polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
     has_value = interior
-    for _ in range(2):  # from interior nodes, then from boundary nodes
+    for _ in range(2):  # average over interior nodes, then over boundary nodes
         b, i = _neighbours(mesh, ~has_value, has_value)
         moved = polynomial[i]  # expanded about node b
         offset = (mesh.points[b] - mesh.points[i]) / size
@@ -93,7 +93,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         has_value = has_value | (count > 0)
     # the constant term is the value at the node about which it is expanded
     result = polynomial[:, 0]
-    isolated = ~has_value  # one layer of cells: take the mean of the adjacent cells
+    isolated = ~has_value  # in a single layer of cells: average over adjacent cells
     result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]
     return result
 
@@ -101,7 +101,9 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
 def von_mises(
     stress: NDArray[np.float64], nu: Vector | float, plane: Plane | None
 ) -> Vector:
-    """Return σ_vM (…) of stresses (…, 3), in Voigt's notation; (…, 6) if plane is None.
+    """Return the von Mises stress (…) of stresses in Voigt's notation.
+
+    Stresses are (…, 3) in the plane, and (…, 6) if `plane` is None.
 
     In plane strain, σ_z = ν(σ_x + σ_y).
     """
@@ -115,7 +117,7 @@ def von_mises(
 
 
 def von_mises_of(stress: NDArray[np.float64]) -> Vector:
-    """Return σ_vM (…) of stresses (…, 4): σ_x, σ_y, τ_xy, σ_z."""
+    """Return the von Mises stress (…) of stresses (…, 4): σ_x, σ_y, τ_xy, σ_z."""
     x, y, shear, z = np.moveaxis(stress, -1, 0)
     squares = ((x - y) ** 2 + (y - z) ** 2 + (z - x) ** 2) / 2 + 3 * shear**2
     return np.asarray(np.sqrt(squares))
@@ -124,7 +126,7 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
 def _neighbours(
     mesh: Mesh, first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all pairs of a node of `first` and one of `second` in a common cell."""
+    """Return all pairs of nodes in a common cell, from masks `first` and `second`."""
     cells = mesh.cells[first[mesh.cells].any(axis=1)]
     corners = cells.shape[1]
     a, b = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, corners).ravel()

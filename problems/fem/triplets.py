@@ -1,7 +1,7 @@
 """Assembly of the stiffness by triplets, vectorised as in the paper's library [6].
 
-All element matrices are computed at once and sorted into a sparse matrix. Benchmarks
-and the paper's experiments compare `problems.fem.elasticity.stiffness` with it.
+All element matrices are computed at once and sorted into a sparse matrix. This method
+is the baseline for `problems.fem.elasticity.stiffness` in benchmarks and experiments.
 """
 
 from __future__ import annotations

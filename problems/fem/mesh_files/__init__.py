@@ -1,1 +1,1 @@
-"""Readers of meshes with named parts, by the ending of the file's name."""
+"""Readers of meshes with named parts, selected by file name extension."""

@@ -21,7 +21,7 @@ from mortarbench.problems.fem.mesh_files.named import (
     Words,
 )
 
-#: memory of meshio's parser, as a multiple of the size of the file
+#: memory required by meshio's parser, as a multiple of the size of the file
 _PARSER_FACTOR = 32
 _LINEAR = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -{} -order 1"
 _NAMING = 'Physical {}("NAME") in the .geo file'
@@ -50,7 +50,7 @@ def read_msh_sets(path: Path) -> FileMesh:
     Raises
     ------
     InputError
-        When the file cannot be read, or its cells have nodes that it does not define.
+        If the file cannot be read, or contains cells with undefined nodes.
 
     """
     mesh = _read(path)
@@ -70,7 +70,7 @@ def read_msh_sets(path: Path) -> FileMesh:
                     name, [np.zeros(0, dtype=np.int64) for _ in blocks]
                 )
                 rows[k] = np.flatnonzero(tag == number)
-    # gmsh omits entities in no physical group, unless there are no groups at all
+    # gmsh omits entities without a physical group, unless no groups exist
     is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
     more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
     return FileMesh(
@@ -102,7 +102,7 @@ def _read(path: Path) -> Any:
         tags = mesh.cell_data.get("gmsh:physical", [])
         numbers = _numbers(path.read_bytes())
         tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
-    # node numbers start at 1; meshio would take −1 as an index from the end
+    # node numbers start at 1; meshio would interpret −1 as an index from the end
     if numbers is not None and (numbers < 1).any():
         raise InputError(f"{path}: cells with node numbers below 1; expected 1 or more")
     if tags and not tagged:
@@ -111,10 +111,10 @@ def _read(path: Path) -> Any:
 
 
 def _parse(path: Path) -> Any:
-    """Parse a file by meshio, also with entities that are in no physical group.
+    """Parse a file with meshio, admitting entities without a physical group.
 
-    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. Format 2.2 marks
-    them with tag 0; format 4.1 has no tag, on which meshio fails. If so, tag 0 is
+    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2
+    they have tag 0. In format 4.1 they have no tag, so that meshio fails; tag 0 is then
     inserted into a copy of the text.
     """
     import meshio  # imported here: workers and other families do not need it
@@ -133,7 +133,7 @@ def _parse(path: Path) -> Any:
     lines = [line.split() for line in entities.split(b"\n") if line.split()]
     points = int(lines[0][0])
     for i, fields in enumerate(lines[1:]):
-        # after tag and position or box: the number of physical tags
+        # the number of physical tags follows the tag and the position or box
         at = 4 if i < points else 7
         if fields[at] == b"0":
             fields[at : at + 1] = [b"1", b"0"]
@@ -145,7 +145,7 @@ def _parse(path: Path) -> Any:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64] | None:
-    """Return the node numbers in the cells of a text file; None for a binary one."""
+    """Return the node numbers in the cells of a text file; None for a binary file."""
     head, _, rest = data.partition(b"$Elements")
     version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
     if kind != b"0":

@@ -1,9 +1,10 @@
 """Reader of flat input files of Abaqus and CalculiX (.inp).
 
-The keywords *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE define the mesh; all others are
-skipped, except those that would change it. meshio's reader is not used: it drops
-*SURFACE, all but the last *NODE block and plane strain elements, attributes sets of
-*ELEMENT to the wrong block of cells, and opens any file that *INCLUDE names.
+The keywords *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE define the mesh. Other keywords
+are skipped, or refused if they would change the mesh. meshio's reader is not used,
+because it drops *SURFACE, all but the last *NODE block and plane strain elements,
+assigns sets of *ELEMENT to the wrong block of cells, and opens any file named by
+*INCLUDE.
 
 Reference: G. Dhondt, CalculiX CrunchiX USER'S MANUAL, sections on *ELEMENT and *DLOAD
 (numbers of element faces).
@@ -32,7 +33,7 @@ from mortarbench.problems.fem.mesh_files.named import (
     Words,
 )
 
-#: memory of the parser and members of all sets, as multiples of the size of the file
+#: memory of the parser, and total size of all sets, as multiples of the file size
 _PARSER_FACTOR = 32
 _WORDS = Words(
     body="element set",
@@ -97,17 +98,17 @@ class _Section(NamedTuple):
 
     @property
     def fields(self) -> list[str]:
-        """All fields of the data lines that are not empty."""
+        """All non-empty fields of the data lines."""
         fields = (field.strip() for line in self.lines for field in line.split(","))
         return [field for field in fields if field]
 
 
 class _Sets:
-    """Named sets of the numbers of nodes or of elements; case is ignored in names."""
+    """Named sets of node or element numbers; names are case-insensitive."""
 
     def __init__(self, numbers: Nodes, limit: int) -> None:
-        self.numbers = numbers  #: (k,) all of them, sorted
-        self._limit = limit  #: of the sizes of all sets together
+        self.numbers = numbers  #: (k,) all numbers in the file, sorted
+        self._limit = limit  #: largest total size of all sets
         self._members: dict[str, tuple[str, Nodes]] = {}
 
     def extend(self, name: str, members: Nodes) -> None:
@@ -115,12 +116,12 @@ class _Sets:
         name, before = self._members.get(name.upper(), (name, _NONE))
         members = np.unique(np.append(before, members))
         self._limit -= members.size
-        if self._limit < 0:  # sets of sets would take time without end
+        if self._limit < 0:  # nested sets could grow exponentially
             raise InputError("sets repeat their members too often; expected fewer sets")
         self._members[name.upper()] = name, members
 
     def resolve(self, fields: Iterable[str], where: str) -> Nodes:
-        """Return the members that numbers and names of other sets stand for."""
+        """Return the members listed as numbers or as names of other sets."""
         fields, numbers = list(fields), np.zeros(0, dtype=np.int64)
         names = [field for field in fields if not field.isdecimal()]
         if len(names) < len(fields):
@@ -137,7 +138,7 @@ class _Sets:
         return np.concatenate([numbers, *others])
 
     def generate(self, section: _Section) -> Nodes:
-        """Return the members of the ranges first, last[, step] of a section."""
+        """Return the members of the ranges "first, last[, step]" of a section."""
         parts = [_NONE]
         for line in section.lines:
             first, last, *step = (int(v) for v in line.split(",") if v.strip())
@@ -146,7 +147,7 @@ class _Sets:
         return np.concatenate(parts)
 
     def read(self, sections: Sequence[_Section], keyword: str) -> None:
-        """Add the sets that sections with this keyword define."""
+        """Add the sets defined by sections with `keyword`."""
         for section in sections:
             if section.keyword == keyword:
                 name = _name(section, keyword)
@@ -166,10 +167,10 @@ class _Sets:
 class _Elements(NamedTuple):
     """All elements, with their cells by kind."""
 
-    cells: Mapping[str, Nodes]  #: corners, as rows of the nodes of the file
-    number: Nodes  #: (k,) sorted
-    kind: NDArray[np.str_]  #: (k,) of each element
-    row: Nodes  #: (k,) in the table of its kind
+    cells: Mapping[str, Nodes]  #: corners by kind, as indices into the nodes
+    number: Nodes  #: (k,) element numbers, sorted
+    kind: NDArray[np.str_]  #: (k,) kind of each element
+    row: Nodes  #: (k,) row of each element in the table of its kind
 
     def rows(self, members: Nodes) -> dict[str, Nodes]:
         """Return the rows of elements in the tables of their kinds."""
@@ -184,13 +185,13 @@ _NONE = np.zeros(0, dtype=np.int64)
 def read_inp(path: Path) -> FileMesh:
     """Read nodes, elements, sets and surfaces of elements.
 
-    A surface of elements becomes cells of its facets.
+    A surface of elements is converted to cells, which are its facets.
 
     Raises
     ------
     InputError
-        When the file is damaged, refers to other files, generates nodes or elements,
-        or contains elements of other types than linear solids, shells and trusses.
+        If the file is damaged, refers to other files, generates nodes or elements, or
+        contains elements other than linear solids, shells and trusses.
 
     """
     text = content(path, "an .inp file", copies=_PARSER_FACTOR)
@@ -203,7 +204,7 @@ def read_inp(path: Path) -> FileMesh:
 
 
 def _sections(text: str) -> Iterator[_Section]:
-    """Split a file at its keywords; comments are left out."""
+    """Split a file at its keywords and drop comments."""
     section, is_continued = _Section("", {}, []), False
     for line in text.split("\n"):
         if line.startswith("**") or not line.strip():
@@ -346,7 +347,10 @@ def _surfaces(
     element_sets: _Sets,
     node_sets: _Sets,
 ) -> dict[str, dict[str, list[Nodes]]]:
-    """Return facets of surfaces by kind; surfaces of nodes extend the sets of nodes."""
+    """Return the facets of surfaces, by name and kind.
+
+    Surfaces of nodes are added to `node_sets`.
+    """
     surfaces: dict[str, dict[str, list[Nodes]]] = {}
     for section in sections:
         if section.keyword != "SURFACE":

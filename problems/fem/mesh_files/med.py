@@ -2,13 +2,14 @@
 
 ::
 
-    ENS_MAA/MESH[/STEP]/NOE/COO         coordinates, one component after the other
+    ENS_MAA/MESH[/STEP]/NOE/COO         coordinates, component by component
     ENS_MAA/MESH[/STEP]/MAI/TYPE/NOD    first corners of all cells, second corners, …
-    …/FAM                               family of each node or cell; 0: none
+    …/FAM                               family of each node or cell; 0 for none
     FAS/MESH/(NOEUD|ELEME)/FAMILY       attribute NUM, GRO/NOM: groups of the family
 
-meshio's reader is not used: it refuses files in which one kind of cells has no families
-(edges of Salome), reads results with the mesh, and follows links to other files.
+meshio's reader is not used, because it refuses files in which a kind of cells has no
+families (edges in Salome), reads results with the mesh, and follows links to other
+files.
 
 Reference: EDF, CEA, Open Cascade, MED-file 4.1, https://docs.salome-platform.org.
 """
@@ -64,7 +65,7 @@ _WORDS = {
         _LINEAR,
     ),
 }
-#: memory of the tables made from an array, as a multiple of its size
+#: memory of the tables derived from an array, as a multiple of its size
 _PARSER_FACTOR = 8
 
 
@@ -74,11 +75,11 @@ def read_med(path: Path) -> FileMesh:
     Raises
     ------
     InputError
-        When the file is damaged or too large, contains several meshes or time steps, or
+        If the file is damaged or too large, contains several meshes or time steps, or
         refers to other files.
 
     """
-    import h5py  # late: workers of solvers need no HDF5
+    import h5py  # imported here, because workers of solvers do not need HDF5
 
     nodes: dict[str, Any] = {}
     with opened(path, _EXPECTED) as stream:
@@ -116,7 +117,7 @@ def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
         numbers = np.asarray(nodes[key][()], dtype=np.int64)
         kind = _KINDS.get(key.split("/")[-2], key.split("/")[-2])
         count = int(nodes[key].attrs["NBR"])
-        # a view: cells are stored by corner
+        # transpose, because NOD stores all first corners, then all second corners, …
         blocks.append((kind, numbers.reshape(-1, count).T - 1))
         families.append(_families(nodes, key[:-3], count))
     cell_sets: dict[int, dict[str, list[Nodes]]] = {}
@@ -141,14 +142,14 @@ def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
 
 
 def _families(nodes: Mapping[str, Any], place: str, count: int) -> NDArray[np.int64]:
-    """Return the family of each node or cell; without the array, 0."""
+    """Return the family (count,) of each node or cell, 0 without families."""
     if f"{place}FAM" not in nodes:
         return np.zeros(count, dtype=np.int64)
     return np.asarray(nodes[f"{place}FAM"][()], dtype=np.int64).reshape(count)
 
 
 def _groups(nodes: Mapping[str, Any], place: str) -> dict[str, list[int]]:
-    """Return the numbers of the families of each group."""
+    """Return the family numbers of each group, by name."""
     groups: dict[str, list[int]] = {}
     for key in nodes:
         if key.startswith(place) and key.endswith("/GRO/NOM"):

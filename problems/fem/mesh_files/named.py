@@ -16,11 +16,11 @@ from mortarbench.harness.mechanics import KINDS, boundary_facets, cell_blocks
 from mortarbench.problems.fem.elements import ELEMENTS, cross
 from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
 
-#: largest deviation from a plane z = const, relative to the extent
+#: largest deviation of a plane mesh from z = const, relative to its extent
 FLATNESS_TOLERANCE = 1e-9
 #: dimension of each supported kind of cell
 DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
-#: larger coordinates are refused: products of them overflow
+#: larger coordinates are refused, because their products would overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items()}
 #: corners in the order of the mirrored cell, by kind
@@ -31,7 +31,7 @@ _MIRRORED = {
 
 
 class Words(NamedTuple):
-    """Terms of a file format for named parts, used in messages."""
+    """Terms of a file format for named parts, for error messages."""
 
     body: str = "body"
     boundary: str = "boundary"
@@ -45,12 +45,12 @@ class FileMesh(NamedTuple):
 
     path: Path
     points: NDArray[np.float64]  #: (N, 2) or (N, 3)
-    #: cells by kind, with the names of meshio; numbers of nodes start at 0
+    #: cells by kind, with meshio's names; node numbers start at 0
     blocks: Sequence[tuple[str, NDArray[Any]]]
-    #: rows in each block, by dimension and name
+    #: sets of cells by dimension and name; a set lists its rows in each block
     cell_sets: Mapping[int, Mapping[str, Sequence[Nodes]]]
     node_sets: Mapping[str, Nodes]
-    vocabulary: Mapping[int, Words]  #: by the dimension of the bodies
+    vocabulary: Mapping[int, Words]  #: terms by the dimension of the bodies
 
     @property
     def dim(self) -> int:
@@ -59,7 +59,7 @@ class FileMesh(NamedTuple):
 
     @property
     def words(self) -> Words:
-        """Words of the format for bodies of this dimension."""
+        """Terms of the format for bodies of this dimension."""
         return self.vocabulary[self.dim]
 
     @property
@@ -68,10 +68,12 @@ class FileMesh(NamedTuple):
         return tuple(self.cell_sets.get(self.dim, {}))
 
     def cells(self, dim: int, rows: Sequence[Nodes]) -> Nodes:
-        """Return cells of one dimension, by rows in each block, in one table.
+        """Return selected cells of one dimension as a single array (E, c).
 
-        Triangles have four columns, as quadrilaterals; so have all cells of a mixture
-        in space eight.
+        Triangles are stored as degenerate quadrilaterals, c = 4, and mixed cells in
+        space as degenerate hexahedra, c = 8.
+
+        rows : rows in each block
         """
         is_mixed = len({kind for kind, _ in self.blocks if DIMENSION[kind] == 3}) > 1
         parts: list[Nodes] = []
@@ -91,12 +93,12 @@ class NamedMesh(NamedTuple):
     """A mesh with named parts, in the plane or in space."""
 
     points: NDArray[np.float64]  #: (N, dim)
-    cells: Nodes  #: (E, c) as of a `problems.fem.mesh.Mesh`
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body, in space a volume
-    #: of each named curve, edges (k, 2) with the body on their left; in space of
-    #: each named surface, faces (k, 4), anticlockwise from outside
+    cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
+    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in space)
+    #: edges (k, 2) of each named curve, with the body on their left; in space, faces
+    #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
-    spots: Mapping[str, Nodes]  #: nodes of each named point, in space also curve
+    spots: Mapping[str, Nodes]  #: nodes of each named point, or curve in space
     words: Words = Words()
 
     @property
@@ -106,7 +108,7 @@ class NamedMesh(NamedTuple):
 
 
 def check_numbers(file: FileMesh) -> None:
-    """Raise InputError for coordinates, kinds of cells or nodes that are not valid."""
+    """Raise InputError for invalid coordinates, kinds of cells or node numbers."""
     path, points = file.path, file.points
     if (
         points.ndim != 2
@@ -126,7 +128,7 @@ def check_numbers(file: FileMesh) -> None:
                 f"{path}: {kind} cells with {nodes.shape[-1]} nodes; expected "
                 f"{CORNERS[kind]}"
             )
-        # meshio numbers nodes that the file does not define as −1
+        # meshio assigns −1 to nodes that the file does not define
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
             raise InputError(
                 f"{path}: cells with nodes that are not in the file; expected nodes "
@@ -137,20 +139,19 @@ def check_numbers(file: FileMesh) -> None:
 def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     """Select bodies and boundaries by name.
 
-    Sets of cells may overlap. Bodies are those in `bodies`, then other sets with cells
-    that belong to no body yet. Boundaries are sets of facets, and sets of nodes that
-    contain all corners of a facet on the boundary of the bodies.
+    Sets of cells may overlap. The bodies are the sets in `bodies`, followed by other
+    sets with cells that are not in any body yet. Boundaries are sets of facets, and
+    sets of nodes that contain all corners of a facet on the boundary of the bodies.
 
-    Nodes and cells are numbered body by body, on which generalised inverses rely.
-    Within a body, they keep the order of the file, where kinds of cells are in blocks.
-    Nodes without cells (such as centres of arcs) are left out.
+    Nodes and cells are numbered body by body, which generalised inverses require.
+    Within a body, they keep the order of the file, where cells are grouped by kind.
+    Nodes without cells (such as centres of arcs) are dropped.
 
     Raises
     ------
     InputError
-        When the file has surfaces that are not plane but no volumes, or contains cells
-        without a name, bodies that share cells or nodes, or a body of several
-        disconnected parts.
+        If the file contains surfaces that are not plane but no volumes, cells without a
+        name, bodies that share cells or nodes, or a body of several disconnected parts.
 
     """
     path, points, dim, words = file.path, file.points, file.dim, file.words
@@ -213,9 +214,9 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
 def refine(mesh: NamedMesh) -> NamedMesh:
     """Refine a plane mesh: bisect every edge, and divide each cell into four.
 
-    New nodes lie on the straight edges, so that bodies keep their shape. A triangle is
-    divided into four similar ones, a quadrilateral about the mean of its corners. Nodes
-    remain numbered body by body.
+    New nodes lie on the straight edges, so that the shape of bodies is unchanged. A
+    triangle is divided into four similar triangles, and a quadrilateral about the mean
+    of its corners. Nodes remain numbered body by body.
     """
     cells, corners = mesh.cells, mesh.cells.T
     is_quad = ~is_triangle(cells)
@@ -224,7 +225,7 @@ def refine(mesh: NamedMesh) -> NamedMesh:
         np.sort(edges.reshape(-1, 2), axis=1), axis=0, return_inverse=True
     )
     n = len(mesh.points)
-    # the degenerate edge of a triangle has no midpoint but its repeated corner
+    # the midpoint of the degenerate edge of a triangle is its repeated corner
     is_edge = ends[:, 0] != ends[:, 1]
     number = np.where(is_edge, n + np.cumsum(is_edge) - 1, ends[:, 0])
     m = number[middle].reshape(-1, 4).T
@@ -243,8 +244,8 @@ def refine(mesh: NamedMesh) -> NamedMesh:
         ],
         axis=-1,
     )
-    # of the third corner, which a triangle repeats: one child cut off there, and the
-    # triangle of the midpoints in place of the other
+    # a triangle repeats its third corner: one of the two children at this corner is
+    # replaced by the triangle of the midpoints
     children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
     children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
     fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
@@ -271,7 +272,7 @@ def refine(mesh: NamedMesh) -> NamedMesh:
 def _bodies(
     file: FileMesh, chosen: Collection[str]
 ) -> list[tuple[str, Sequence[Nodes]]]:
-    """Return the name and the rows in each block of every body, in the file's order."""
+    """Return the name of each body and its rows in each block, in file order."""
     path, dim, words = file.path, file.dim, file.words
     sets = file.cell_sets.get(dim, {})
     owner = [np.full(len(nodes), -1) for _, nodes in file.blocks]
@@ -308,7 +309,7 @@ def _dimension(kind: str) -> int:
 
 
 def _remedy(kind: str, words: Words) -> str:
-    """Return the expectation of the message about unsupported cells."""
+    """Return the part of an error message that states which cells are expected."""
     if kind.startswith("pyramid"):
         return "expected no pyramids: volumes of tetrahedra alone"
     if any(kind.startswith(known) for known in DIMENSION):
@@ -323,7 +324,7 @@ def _unique_in_order(parts: list[Nodes]) -> Nodes:
 
 
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
-    """Reorder clockwise cells; raise InputError for flat and non-convex ones."""
+    """Reorder clockwise cells; raise InputError for flat and non-convex cells."""
     x, triangle = points[cells], is_triangle(cells)[:, None]
     twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of both diagonals
     reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
@@ -335,7 +336,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
             "distinct corners, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
-    # at every corner of a convex cell, the boundary bends to the left
+    # the boundary of a convex cell turns left at every corner
     corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
         x, y = points[cells[bad.argmax()]].mean(axis=0)
@@ -347,7 +348,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
 
 
 def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
-    """Reorder mirrored cells; raise InputError for cells without volume at a point."""
+    """Reorder mirrored cells; raise InputError if a Jacobian is not positive."""
     cells = cells.copy()
     for block in cell_blocks(cells, 3):
         element = ELEMENTS[3, block.nodes.shape[1]]
@@ -371,7 +372,7 @@ def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Node
 def _check_apart(
     path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes], words: Words
 ) -> None:
-    """Raise InputError for bodies that share nodes, or consist of several parts."""
+    """Raise InputError for bodies that share nodes or are disconnected."""
     owner = np.full(nodes, -1)
     names = list(surfaces)
     for i, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""Reading of a mesh file by the ending of its name."""
+"""Readers of mesh files, selected by file name extension."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def read_mesh_file(path: Path) -> FileMesh:
     Raises
     ------
     InputError
-        When the file is damaged, too large or of another format, or contains cells
-        that are not of first order, or pyramids.
+        If the file is damaged, too large or of another format, or contains pyramids or
+        cells of higher order.
 
     """
     file = _READERS.get(path.suffix.lower(), read_msh_sets)(path)
