@@ -72,7 +72,7 @@ def reference_point(
     Raises
     ------
     UnsolvedError
-            When no admissible pair is found, or `solve` fails.
+        When no admissible pair is found, or `solve` fails.
 
     """
     mechanics = mechanics.whole
