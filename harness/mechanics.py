@@ -34,8 +34,8 @@ from mortarbench.harness.solution import Solution
 #: the size of double rounding have some correct digits.
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
-#: Change of the gaps by a rigid motion, or load along it, that counts as rounding of
-#: coordinates, normals and tractions, relative to the sum of its absolute terms.
+#: Change of the gaps by a rigid motion, or load along it, that counts as rounding (of
+#: coordinates, normals and tractions), relative to the sum of its absolute terms.
 MOTION_ROUNDING = 1e-10
 
 
@@ -100,12 +100,12 @@ class Friction:
 
     T u is the tangential motion of the slave relative to the master, and s its initial
     value: zero for a single static load, and T u of the previous step for slip
-    increments. A contact row i with friction has d consecutive rows Tᵢ, one for each
-    tangential direction, of equal bound: d = 1 in the plane, where ‖·‖ is |·|, and 2
-    in space.
+    increments. A contact row i with friction has d consecutive rows Tᵢ of equal bound,
+    one for each tangential direction. In the plane d = 1, and ‖·‖ is |·|; in space d =
+    2.
 
-    By the law of friction the bound should be g = cohesion + mu·λ_n, with the
-    multiplier λ_n of the contact row: mu = 0 for Tresca, cohesion = 0 for Coulomb.
+    The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
+    the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
     """
 
     T: csr_array  #: (k, n) tangential rows, d of each contact row in turn
@@ -127,7 +127,7 @@ class Friction:
         return np.arange(self.row.size).reshape(-1, self.tangents)
 
     def discs(self, first: int) -> Discs:
-        """Return the sets of the multipliers λ_t, of which `first` is the first."""
+        """Return the sets of the multipliers λ_t, which begin at variable `first`."""
         return friction_discs(self.bound, self.tangents, first)
 
     def slip(self, u: NDArray[Any]) -> NDArray[Any]:
@@ -285,10 +285,10 @@ class AdmissibleForces:
         return np.where(self.contact, np.maximum(nearest, 0), nearest)
 
     def room(self, multipliers: Extended) -> Extended:
-        """Return g − ‖λ‖ of each friction vector, zero if it is extended rounding.
+        """Return g − ‖λ‖ of each friction vector; rounding is set to zero.
 
-        Projected multipliers are on their circle up to rounding, and stand for the
-        nearest point on it: √ of 1e-19 in the work would dominate certificates.
+        Projected multipliers are on their circle up to rounding in extended precision,
+        about 1e-19. In the work, √1e-19 would dominate certificates.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -369,7 +369,7 @@ class RigidMotions(NamedTuple):
     matters if bodies move far; see `harness.verify.certificate`.
     """
 
-    felt: Any  #: (n, p) sparse; contact rows open or close along these
+    felt: Any  #: (n, p) sparse; motions that open or close contact rows
     free: Any  #: (n, q) sparse; gaps change by rounding only
     G: Extended  #: (m, p)  B·felt
     largest: (
@@ -390,8 +390,9 @@ KINDS = {
 }
 
 
-#: Corners of the facets of each kind, the cell on their left: in space anticlockwise
-#: from outside, and triangles repeat their last corner.
+#: Corners of the facets of each kind. In the plane the cell is on the left of an edge;
+#: in space the corners are anticlockwise from outside, and triangles repeat the last
+#: one.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),

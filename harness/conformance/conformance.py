@@ -1,8 +1,8 @@
 """Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
-The name of each check is a statement about the solver. A check passes, fails with a
-description of the violation, or is declined with the solver's reason if the solver
-declines the QP. If an equivalent formulation changes the answer, that is reported as a
+The name of each check is a statement about the solver. A check passes, or fails with a
+description of the violation. If the solver declines the QP, the check is declined with
+the same reason. An answer that changes under an equivalent formulation is reported as a
 weakness, which most solvers have.
 """
 

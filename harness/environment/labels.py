@@ -58,7 +58,7 @@ def named(key: str) -> str:
 
 
 def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
-    """Return a list of differences in words; the first few, and the number of others.
+    """Describe the first few differences in words, and count the others.
 
     one, other : words that distinguish the two values, such as "then" and "now"
 

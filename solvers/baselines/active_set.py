@@ -16,7 +16,8 @@ from mortarbench.solvers.common.conversion import csc, dense
 
 DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
 KAPPA = 1e4  #: ρ·aD⁻¹aᵀ, penalty of a row a relative to the curvature along it
-#: changes of the active set, without fewer wrong constraints, before single exchanges
+#: Number of changes of the active set without fewer wrong constraints after which
+#: constraints are exchanged one at a time.
 PATIENCE = 10
 SIGN_ROUNDING = 1e-13  #: relative errors of signs and bounds below this are rounding
 

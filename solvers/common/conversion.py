@@ -49,7 +49,7 @@ def needs_independent_rows(qp: QP) -> str | None:
     gram = dense(csc(qp.A) @ csc(qp.A).T)
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
-    return "the equality rows depend on each other"
+    return "the equality rows are linearly dependent"
 
 
 def csc(M: Matrix) -> csc_matrix:

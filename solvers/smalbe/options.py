@@ -114,8 +114,8 @@ class Options:
     def step_rule_for(self, qp: QP) -> StepRule | None:
         """Return a rule for this QP, or None for the option `expansion`.
 
-        For subclasses (`solvers.smalbe.extension`). The rule is asked for a trial point
-        wherever a CG step would leave the box.
+        For subclasses (`solvers.smalbe.extension`). The rule is called for a trial
+        point whenever a CG step would leave the box.
         """
         return None
 
