@@ -74,9 +74,9 @@ class Verdict(StrEnum):
 class Measurement:
     """Costs of preparing and solving; None if not measured.
 
-    Every field is also a field of the journal. A field that is added here, and set by
-    `harness.verify.measure`, is transferred from the worker to the record unchanged.
-    Values must not be negative.
+    Every field is also a field of the journal. A new field that
+    `harness.verify.measure` sets is transferred from the worker to the record without
+    further code. Values must not be negative.
     """
 
     prepare_seconds: float | None = None

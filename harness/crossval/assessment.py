@@ -137,10 +137,10 @@ def point_norm(qp: QP, s: Solution) -> float:
 def distances(
     P: Matrix, kernel: NDArray[np.float64], points: Sequence[Vector]
 ) -> NDArray[np.float64]:
-    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf where one is not finite.
+    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf if one of them is not finite.
 
-    They are computed from the Gram matrix, whose cancellation hides distances below
-    1e-8 of the norm of the longer vector. So the points have to be deviations from a
+    Cancellation in the Gram matrix hides distances below 1e-8 of the norm of the longer
+    vector. The points must therefore be deviations from a common reference.
     common reference.
 
     kernel : (n, r) orthonormal rigid motions, which are projected out
