@@ -108,7 +108,7 @@ class Friction:
     the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
     """
 
-    T: csr_array  #: (k, n) tangential rows, d of each contact row in turn
+    T: csr_array  #: (k, n) tangential rows, d consecutive ones per contact row
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
@@ -118,7 +118,7 @@ class Friction:
 
     @property
     def tangents(self) -> int:
-        """Number d of tangential directions: of rows per contact row with friction."""
+        """Number d of tangential directions, or friction rows per contact row."""
         return int(np.bincount(self.row).max(initial=1))
 
     @property
@@ -266,7 +266,7 @@ class AdmissibleForces:
     """Set of the multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction vectors."""
 
     rows: int  #: m
-    discs: Discs  #: of the friction rows, the last ones
+    discs: Discs  #: discs of the friction rows, which are the last rows
 
     @cached_property
     def contact(self) -> NDArray[np.bool_]:
@@ -302,7 +302,7 @@ class AdmissibleForces:
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return the bounds (m,) of each λᵢ where the others keep their values."""
+        """Return the bounds (m,) of each λᵢ, with the other components fixed."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -363,19 +363,18 @@ class Exact(NamedTuple):
 
 
 class RigidMotions(NamedTuple):
-    """Rigid motions that the supports allow: felt by contact, or free.
+    """Rigid motions that the supports allow, split into constrained and free ones.
 
-    Columns are orthonormal in extended precision. K·felt is zero up to rounding, which
-    matters if bodies move far; see `harness.verify.certificate`.
+    Constrained motions change contact gaps. Columns are orthonormal in extended
+    precision. K·constrained is zero up to rounding, which matters if bodies move far;
+    see `harness.verify.certificate`.
     """
 
-    felt: Any  #: (n, p) sparse; motions that open or close contact rows
+    constrained: Any  #: (n, p) sparse; motions that open or close contact rows
     free: Any  #: (n, q) sparse; gaps change by rounding only
-    G: Extended  #: (m, p)  B·felt
-    largest: (
-        Any  #: (n, p) sparse: the pattern of felt with each column's largest |entry|
-    )
-    KR: Extended  #: (n, p)  K·felt, zero on prescribed components
+    G: Extended  #: (m, p)  B·constrained
+    largest: Any  #: (n, p) sparse: the pattern of constrained with each column's largest |entry|
+    KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
 #: Meshio's names of first-order cells, by dimension and number of corners.
@@ -598,20 +597,20 @@ class Mechanics:
 
     @cached_property
     def motions(self) -> RigidMotions:
-        """The same motions, split into those that contact feels and free ones."""
+        """The same motions, split into constrained and free ones."""
         exact, B, R = self.exact, self.rows, self.inverse.kernel
-        turn, p = felt_first(B, R)
+        turn, p = constrained_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
-        felt = turned[:, :p]
-        KR = np.zeros(felt.shape, dtype=Real)
+        constrained = turned[:, :p]
+        KR = np.zeros(constrained.shape, dtype=Real)
         if p:
-            KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
+            KR = cancelling(csr_array(self.primal.P), np.asarray(constrained.toarray()))
             KR[exact.fixed] = 0
         return RigidMotions(
-            felt=felt,
+            constrained=constrained,
             free=turned[:, p:],
-            G=np.asarray((exact.B @ felt).toarray()),
-            largest=_largest(felt),
+            G=np.asarray((exact.B @ constrained).toarray()),
+            largest=_largest(constrained),
             KR=KR,
         )
 
@@ -677,12 +676,14 @@ def _leading(v: Any, size: Any, bits: int) -> Any:
     return np.round(v / unit) * unit
 
 
-def felt_first(B: Matrix, R: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Return a rotation V (r, r) and p: B feels the first p columns of RV only."""
+def constrained_first(
+    B: Matrix, R: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], int]:
+    """Return a rotation V (r, r) and p, the number of nonzero columns of BRV."""
     r = R.shape[1]
     length = np.sqrt(np.asarray(B.multiply(B).sum(axis=1)).ravel())
     per = 1 / np.where(length > 0, length, np.inf)
     G, terms = per[:, None] * (B @ R), per[:, None] * (abs(B) @ np.abs(R))
     _, sizes, Vt = np.linalg.svd(G, full_matrices=len(per) < r)
-    felt = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
-    return Vt.T, felt
+    constrained = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
+    return Vt.T, constrained

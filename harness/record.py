@@ -96,7 +96,7 @@ class Record(Measurement):
     """A single run of one solver on one case at one tolerance; one JSON line.
 
     It contains the measurement, the task, the claims of the solver and the verdict.
-    None stands for values that were not, or cannot be, measured (JSON has no NaN).
+    Values that were not, or cannot be, measured are None, since JSON has no NaN.
     """
 
     schema: int = SCHEMA

@@ -7,7 +7,7 @@ from typing import Any
 
 from mortarbench.harness.errors import shortened
 
-Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
+Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 
 _MAX_VALUE_CHARACTERS = 48
 _MAX_LISTED = 3  #: number of differences that are spelt out

@@ -80,7 +80,7 @@ def fork(
 ) -> Fork:
     """Fork a worker; the caller has checked that this `is_safe`.
 
-    cpu, pipes : as for `reaper.supervise`; `serve` is called with the pipes
+    cpu, pipes : see `reaper.supervise`; `serve` is called with the pipes
     log : file descriptor of its standard output and error
     environment : variables to set in the worker
     """

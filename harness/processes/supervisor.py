@@ -664,7 +664,7 @@ class _WorkerEndError(Exception):
     """End of a worker before an expected event.
 
     event : the expected one
-    verdict : on the solver, if the solve had started
+    verdict : verdict on the solver, if the solve had started
     number : signal that ended it, or 0
     stage : prefix of the message
     """

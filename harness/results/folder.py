@@ -324,7 +324,7 @@ def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
 def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
     """Refuse a folder of another suite or environment.
 
-    environment : as for `claim`
+    environment : see `claim`
 
     Returns
     -------

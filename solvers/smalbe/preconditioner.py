@@ -44,7 +44,7 @@ Preconditioner = Literal[
     "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
 PRECONDITIONERS = get_args(Preconditioner)
-#: preconditioners with a matrix M of their own
+#: Preconditioners with an explicit matrix M.
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
 #: takes them one by one. Meshes of more than 24³ trilinear elements have more than two,
