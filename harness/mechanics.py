@@ -263,7 +263,7 @@ def friction_multipliers(
 
 @dataclass(frozen=True, eq=False)
 class AdmissibleForces:
-    """Set of the multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction vectors."""
+    """Set Λ of admissible multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction."""
 
     rows: int  #: m
     discs: Discs  #: discs of the friction rows, which are the last rows
@@ -373,7 +373,9 @@ class RigidMotions(NamedTuple):
     constrained: Any  #: (n, p) sparse; motions that open or close contact rows
     free: Any  #: (n, q) sparse; gaps change by rounding only
     G: Extended  #: (m, p)  B·constrained
-    largest: Any  #: (n, p) sparse: the pattern of constrained with each column's largest |entry|
+    largest: (
+        Any  #: (n, p) each column's largest |entry|, in the pattern of `constrained`
+    )
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
@@ -443,7 +445,7 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 
 
 def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
-    """Return the boundary facets (k, m): those of exactly one cell, body on the left.
+    """Return the facets (k, m) that belong to one cell only, which is on their left.
 
     In the plane facets are edges, sorted by their lower node, then by the other one.
     """

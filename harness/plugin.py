@@ -232,10 +232,9 @@ class Case:
     #: time of forming a dual, with the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: needed to certify errors
-    remarks: tuple[str, ...] = ()  #: doubts about the input, a line each
-    #: relative distance of the QP from the fixed point of the iteration to which it
-    #: belongs; no solution of this QP can reduce it. 0 at the fixed point, or without
-    #: an iteration
+    remarks: tuple[str, ...] = ()  #: warnings about the input, a line each
+    #: relative distance of the QP from the fixed point of its iteration, such as that
+    #: of Coulomb's law; no solution of this QP can reduce it. 0 without an iteration
     unsettled: float = 0.0
 
 

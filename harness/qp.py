@@ -24,10 +24,11 @@ Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 SYMMETRY_TOLERANCE = 1e-12
 #: Rows of the largest P that is checked by a Cholesky factor, which takes 0.25 s.
 _MAX_FACTORED_ROWS = 2000
-#: Least eigenvalue of the scaled P: text formats may store no more than six digits.
+#: Least eigenvalue of the scaled P. Text formats may store only six digits, and this
+#: rounding can make eigenvalues negative.
 _MIN_CURVATURE = -1e-6
-#: Least diagonal entry for scaling, relative to the largest entry of P: smaller ones
-#: may be mostly rounding.
+#: Least diagonal entry used for scaling, relative to the largest entry of P, since
+#: smaller entries may be mostly rounding.
 _MIN_DIAGONAL = 1e-4
 _STRIP_ROWS = 256  #: rows of a dense matrix that are compared at a time, to save memory
 

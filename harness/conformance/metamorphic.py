@@ -42,7 +42,7 @@ class Equivalent(NamedTuple):
     """A transformed QP, and the map of its points back to the original QP."""
 
     qp: QP
-    recover: Callable[[Solution], Solution]  #: point of the new QP → of the old one
+    recover: Callable[[Solution], Solution]  #: maps a point of the new QP to the old QP
     scale: float = 1.0  #: old objective = scale·new objective + constant, at all points
     constant: float = 0.0
 

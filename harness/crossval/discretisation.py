@@ -49,10 +49,10 @@ MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is solved
 GROWTH = 4.0
 #: Assumed exponent p of the time of a reference solve, unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: fewest meshes that determine a rate
+MAX_LEVELS = 3  #: number of meshes, the least that determines a rate
 MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
-#: Least relative error of u that is assumed where certificates prove less: rounding of
-#: slender bodies in double precision.
+#: Least assumed relative error of u, even if certificates prove a smaller one: rounding
+#: of slender bodies in double precision.
 ROUNDING = 1e-8
 
 
@@ -313,7 +313,7 @@ class _Halving:
         )
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
-        """Return ‖u − u_{2h}‖ on this mesh, None on the first; store u for the next."""
+        """Return ‖u − u_{2h}‖, or None on the first mesh; store u for the next mesh."""
         whole = u + grid.lift
         before, self._coarse = self._coarse, (grid, whole)
         if before is None:

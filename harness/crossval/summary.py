@@ -33,7 +33,7 @@ class Row:
     worst_case: str  #: case of `error_worst`
     penetration: float | None  #: largest, over the mesh size
     balance: float | None  #: largest unbalanced force or moment on a body
-    contradicted_rows: int  #: closed in the reference and open here, or vice versa
+    contradicted_rows: int  #: rows whose state differs from the reference
     primal_dual: float | None  #: largest distance between its primal and dual answers
     from_ours: float | None  #: largest distance of its answers from those of `ours`
 

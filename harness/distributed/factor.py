@@ -39,14 +39,14 @@ from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
-#: Largest pivot, of rows of length one, that counts as rounding of zero.
+#: A pivot up to this value counts as zero, for rows scaled to length one.
 DEPENDENCE_TOLERANCE = 1e-13
-#: Added to a diagonal of ones: a pivot of exactly zero would end the factorisation.
+#: Added to a diagonal of ones, since a pivot of zero would end the factorisation.
 PIVOT_SHIFT = 1e-15
 #: Largest size of the dense factor of the shared rows, in entries per row of A.
 MAX_FILL = 8
-#: Largest size of a sparse matrix that is factorised in an array, which takes less time
-#: than the calls of a library for sparse ones; with 500 it takes more.
+#: Largest size of a sparse matrix that is factorised as a dense one, which takes less
+#: time than the calls of a sparse library; with 500 it takes more.
 MAX_ARRAY_ROWS = 256
 
 

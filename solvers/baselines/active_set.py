@@ -158,8 +158,8 @@ def _newton(
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
     """Drop constraints with a multiplier of the wrong sign; add violated ones.
 
-    at : x, the gradient (in place of y) without the multipliers of bounds, and the
-        trial multipliers of all inequality rows. Errors are measured in √D·x, whose
+    at : x (n,); in place of y, the gradient without the multipliers of bounds; in
+        place of z, the trial multipliers of all inequality rows. Errors are measured in √D·x, whose
         unit is √energy, so that they do not depend on the units of the variables
     """
     qp, size = problem.qp, np.sqrt(problem.D)

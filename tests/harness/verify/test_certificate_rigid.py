@@ -237,7 +237,7 @@ def test_a_load_that_contact_would_have_to_pull_is_another_cause():
 
 
 def test_contact_feels_no_sliding_but_all_else():
-    """Two bodies, three motions each; along the plates neither is constrained, however tilted.
+    """Two bodies, three motions each; along the plates both are free, however tilted.
 
     The disc as master of pointwise rows is a polygon, which feels them all.
     """
