@@ -158,9 +158,11 @@ def _newton(
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
     """Drop constraints with a multiplier of the wrong sign; add violated ones.
 
+    Errors are measured in √D·x, whose unit is √energy, so that they do not depend on
+    the units of the variables.
+
     at : x (n,); in place of y, the gradient without the multipliers of bounds; in
-        place of z, the trial multipliers of all inequality rows. Errors are measured in √D·x, whose
-        unit is √energy, so that they do not depend on the units of the variables
+        place of z, the trial multipliers of all inequality rows
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)

@@ -27,7 +27,7 @@ NEGLIGIBLE = 1e-14
 #: convex sets that have rows in second-order cones
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: ‖x‖∞ of a claimed solution beyond which it counts as diverged: the terms of the
-#: residuals then are so large that every relative residual is small
+#: residuals are then so large that every relative residual is small
 DIVERGED = 1e12
 #: ‖q‖∞ for solvers that compare with max(1, size): with sizes of about 1e4 the 1 has no
 #: effect, and their tests are relative as those of the harness
