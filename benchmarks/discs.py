@@ -42,7 +42,7 @@ TOL = 1e-8
 CELLS = (12, 24, 36, 48)  #: per side: 88, 376, 820 and 1468 discs
 PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm, or of the load
 LARGE = (256, 512)  #: cells per side, P an operator
-ROUNDS = 3  #: of the measurement of times
+ROUNDS = 5  #: number of alternating rounds in the measurement of times
 CONIC = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
 METHODS: dict[str, Solver] = {
     **{

@@ -3,10 +3,10 @@
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/emission.py [CASE]
     .venv/bin/python benchmarks/emission.py whole [CASE]
 
-Each rank assembles its share. Printed after each stage are the peaks of resident memory
-without imports, largest and mean of all ranks, and the seconds of the slowest rank.
-`whole` builds the case in one process, including the data for certificates and
-pictures. Nothing is asserted: machines differ.
+Each rank assembles its share. After each stage, the script prints the peaks of resident
+memory without imports (largest and mean over the ranks) and the seconds of the slowest
+rank. `whole` builds the case in one process, including the data for certificates and
+pictures. The script asserts nothing, since machines differ.
 """
 
 import sys

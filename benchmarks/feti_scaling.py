@@ -3,11 +3,11 @@
     python benchmarks/feti_scaling.py [--cells H/h] [--ways feti,whole] [Nr ...]
     python benchmarks/feti_scaling.py --family cube-wall [--cells H/h] [n ...]
 
-The beam on its half ring in one load step, Nh = Nr/2, or the cube of n³ hexahedra
-beside a wall. `feti` decomposes it into subdomains, `whole` is the dual of undivided
-bodies; both go from the mesh to an answer with a certified error below 1e-6, which
-needs different tolerances. Each runs in a separate process, so that its peak memory is
-measured. `cpu` is processor time, for comparisons on a busy machine.
+The problem is the beam on its half ring in one load step, Nh = Nr/2, or the cube of n³
+hexahedra beside a wall. `feti` decomposes it into subdomains; `whole` is the dual of
+undivided bodies. Both are timed from the mesh to an answer with a certified error below
+1e-6, which requires different tolerances. Each runs in a separate process, so that its
+peak memory is measured. `cpu` is processor time, for comparisons on a busy machine.
 
 For `feti` the quantities of the theory are measured without the search for the active
 set:

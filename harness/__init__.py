@@ -1,10 +1,10 @@
-"""The contract between problems, solvers and reports; measuring and judging.
+"""Interfaces between problems, solvers and reports; measurement and verification.
 
-Names are imported at their first access, so that commands that only read names of cases
-and solvers do not load NumPy and SciPy. They are listed in `__init__.pyi`.
+Names are imported at their first access, so that commands that only list cases and
+solvers do not load NumPy and SciPy. `__init__.pyi` lists the names.
 """
 
 from lazy_loader import attach_stub
 
-# the full name, also if Python runs the folder as `python -m harness`
+# the full package name, also for `python -m harness` in a checkout
 __getattr__, __dir__, __all__ = attach_stub("mortarbench.harness", __file__)

@@ -88,9 +88,9 @@ def filled_list(where: str, value: object) -> list[Any]:
 
 
 def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
-    """Return a table.
+    """Return a table; raise for other values.
 
-    instead : description of the expected value, for the message
+    instead : description of the expected value for the error message
     """
     if not isinstance(value, dict):
         raise InputError(f"{where} = {shown(value)}; expected {instead}")

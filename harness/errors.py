@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 
-MAX_SHOWN = 200  #: characters of a user's input that a message repeats
-_MAX_MESSAGE = 600  #: characters of a message, not counting paths
-#: quotations and words; possessive quantifiers, since input may be adversarial
+MAX_SHOWN = 200  #: number of characters of the user's input that a message repeats
+_MAX_MESSAGE = 600  #: largest number of characters of a message, without paths
+#: Quotations and words. Possessive quantifiers bound the time for adversarial input.
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 
 
@@ -26,9 +26,9 @@ class InputError(Exception):
 
 
 class PastEndError(InputError):
-    """A step beyond the end of a sequence, such as a fixed point that has converged.
+    """Error for a step beyond the end of a sequence, such as a converged fixed point.
 
-    A sequence with more steps ends at the last existing one.
+    A sequence with more steps is truncated at the last existing step.
     """
 
 

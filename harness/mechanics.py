@@ -34,8 +34,8 @@ from mortarbench.harness.solution import Solution
 #: the size of double rounding have some correct digits.
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
-#: Change of the gaps by a rigid motion, or load along it, that counts as rounding of
-#: coordinates, normals and tractions, relative to the sum of its absolute terms.
+#: Change of the gaps by a rigid motion, or load along it, that counts as rounding (of
+#: coordinates, normals and tractions), relative to the sum of its absolute terms.
 MOTION_ROUNDING = 1e-10
 
 
@@ -100,15 +100,15 @@ class Friction:
 
     T u is the tangential motion of the slave relative to the master, and s its initial
     value: zero for a single static load, and T u of the previous step for slip
-    increments. A contact row i with friction has d consecutive rows Tᵢ, one for each
-    tangential direction, of equal bound: d = 1 in the plane, where ‖·‖ is |·|, and 2
-    in space.
+    increments. A contact row i with friction has d consecutive rows Tᵢ of equal bound,
+    one for each tangential direction. In the plane d = 1, and ‖·‖ is |·|; in space d =
+    2.
 
-    By the law of friction the bound should be g = cohesion + mu·λ_n, with the
-    multiplier λ_n of the contact row: mu = 0 for Tresca, cohesion = 0 for Coulomb.
+    The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
+    the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
     """
 
-    T: csr_array  #: (k, n) tangential rows, d of each contact row in turn
+    T: csr_array  #: (k, n) tangential rows, d consecutive ones per contact row
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
@@ -118,7 +118,7 @@ class Friction:
 
     @property
     def tangents(self) -> int:
-        """Number d of tangential directions: of rows per contact row with friction."""
+        """Number d of tangential directions, or friction rows per contact row."""
         return int(np.bincount(self.row).max(initial=1))
 
     @property
@@ -127,7 +127,7 @@ class Friction:
         return np.arange(self.row.size).reshape(-1, self.tangents)
 
     def discs(self, first: int) -> Discs:
-        """Return the sets of the multipliers λ_t, of which `first` is the first."""
+        """Return the sets of the multipliers λ_t, which begin at variable `first`."""
         return friction_discs(self.bound, self.tangents, first)
 
     def slip(self, u: NDArray[Any]) -> NDArray[Any]:
@@ -263,10 +263,10 @@ def friction_multipliers(
 
 @dataclass(frozen=True, eq=False)
 class AdmissibleForces:
-    """Set of the multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction vectors."""
+    """Set Λ of admissible multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction."""
 
     rows: int  #: m
-    discs: Discs  #: of the friction rows, the last ones
+    discs: Discs  #: discs of the friction rows, which are the last rows
 
     @cached_property
     def contact(self) -> NDArray[np.bool_]:
@@ -285,10 +285,10 @@ class AdmissibleForces:
         return np.where(self.contact, np.maximum(nearest, 0), nearest)
 
     def room(self, multipliers: Extended) -> Extended:
-        """Return g − ‖λ‖ of each friction vector, zero if it is extended rounding.
+        """Return g − ‖λ‖ of each friction vector; rounding is set to zero.
 
-        Projected multipliers are on their circle up to rounding, and stand for the
-        nearest point on it: √ of 1e-19 in the work would dominate certificates.
+        Projected multipliers are on their circle up to rounding in extended precision,
+        about 1e-19. In the work, √1e-19 would dominate certificates.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -302,7 +302,7 @@ class AdmissibleForces:
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return the bounds (m,) of each λᵢ where the others keep their values."""
+        """Return the bounds (m,) of each λᵢ, with the other components fixed."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -363,19 +363,20 @@ class Exact(NamedTuple):
 
 
 class RigidMotions(NamedTuple):
-    """Rigid motions that the supports allow: felt by contact, or free.
+    """Rigid motions that the supports allow, split into constrained and free ones.
 
-    Columns are orthonormal in extended precision. K·felt is zero up to rounding, which
-    matters if bodies move far; see `harness.verify.certificate`.
+    Constrained motions change contact gaps. Columns are orthonormal in extended
+    precision. K·constrained is zero up to rounding, which matters if bodies move far;
+    see `harness.verify.certificate`.
     """
 
-    felt: Any  #: (n, p) sparse; contact rows open or close along these
+    constrained: Any  #: (n, p) sparse; motions that open or close contact rows
     free: Any  #: (n, q) sparse; gaps change by rounding only
-    G: Extended  #: (m, p)  B·felt
+    G: Extended  #: (m, p)  B·constrained
     largest: (
-        Any  #: (n, p) sparse: the pattern of felt with each column's largest |entry|
+        Any  #: (n, p) each column's largest |entry|, in the pattern of `constrained`
     )
-    KR: Extended  #: (n, p)  K·felt, zero on prescribed components
+    KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
 #: Meshio's names of first-order cells, by dimension and number of corners.
@@ -390,8 +391,9 @@ KINDS = {
 }
 
 
-#: Corners of the facets of each kind, the cell on their left: in space anticlockwise
-#: from outside, and triangles repeat their last corner.
+#: Corners of the facets of each kind. In the plane the cell is on the left of an edge;
+#: in space the corners are anticlockwise from outside, and triangles repeat the last
+#: one.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),
@@ -443,7 +445,7 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 
 
 def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
-    """Return the boundary facets (k, m): those of exactly one cell, body on the left.
+    """Return the facets (k, m) that belong to one cell only, which is on their left.
 
     In the plane facets are edges, sorted by their lower node, then by the other one.
     """
@@ -597,20 +599,20 @@ class Mechanics:
 
     @cached_property
     def motions(self) -> RigidMotions:
-        """The same motions, split into those that contact feels and free ones."""
+        """The same motions, split into constrained and free ones."""
         exact, B, R = self.exact, self.rows, self.inverse.kernel
-        turn, p = felt_first(B, R)
+        turn, p = constrained_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
-        felt = turned[:, :p]
-        KR = np.zeros(felt.shape, dtype=Real)
+        constrained = turned[:, :p]
+        KR = np.zeros(constrained.shape, dtype=Real)
         if p:
-            KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
+            KR = cancelling(csr_array(self.primal.P), np.asarray(constrained.toarray()))
             KR[exact.fixed] = 0
         return RigidMotions(
-            felt=felt,
+            constrained=constrained,
             free=turned[:, p:],
-            G=np.asarray((exact.B @ felt).toarray()),
-            largest=_largest(felt),
+            G=np.asarray((exact.B @ constrained).toarray()),
+            largest=_largest(constrained),
             KR=KR,
         )
 
@@ -676,12 +678,14 @@ def _leading(v: Any, size: Any, bits: int) -> Any:
     return np.round(v / unit) * unit
 
 
-def felt_first(B: Matrix, R: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Return a rotation V (r, r) and p: B feels the first p columns of RV only."""
+def constrained_first(
+    B: Matrix, R: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], int]:
+    """Return a rotation V (r, r) and p, the number of nonzero columns of BRV."""
     r = R.shape[1]
     length = np.sqrt(np.asarray(B.multiply(B).sum(axis=1)).ravel())
     per = 1 / np.where(length > 0, length, np.inf)
     G, terms = per[:, None] * (B @ R), per[:, None] * (abs(B) @ np.abs(R))
     _, sizes, Vt = np.linalg.svd(G, full_matrices=len(per) < r)
-    felt = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
-    return Vt.T, felt
+    constrained = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
+    return Vt.T, constrained

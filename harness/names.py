@@ -71,8 +71,8 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     Raises
     ------
     InputError
-        For an unknown family, key or form, a key set twice, a part that is not
-        key=value, a value of the wrong type, and values that ``family.check`` refuses.
+        When a family, key or form is unknown, a key is set twice, a part is not
+        key=value, a value has the wrong type, or ``family.check`` refuses a value.
 
     Examples
     --------

@@ -88,11 +88,11 @@ class Chained(Solver, Protocol):
     """A solver that can reuse work from one QP to the next, such as load steps."""
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Begin a sequence: return the `prepare` for its QPs, called in their order.
+        """Begin a sequence; return the `prepare` for its QPs, called in their order.
 
         Each call may reuse results of earlier ones (points, multipliers, factors,
-        norms). The solver has to check that they still apply: the QPs of a sequence
-        need not have a single coefficient in common. Sequences are independent.
+        norms). The solver must check that they still apply: the QPs of a sequence may
+        differ in every coefficient. Sequences are independent of each other.
         """
 
 
@@ -102,8 +102,8 @@ class Tightening(Chained, Protocol):
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Begin a sequence: return the `prepare` for its QPs and their tolerances.
 
-        It differs from `chain` in the tolerances: the early QPs of a fixed point
-        iteration need not be solved as accurately as the last.
+        The early QPs of a fixed point iteration need not be solved as accurately as the
+        last one, so that `prepare` also takes a tolerance.
         """
 
 
@@ -136,7 +136,8 @@ class About:
         return f"not installed: {module} (pip install {self.package})"
 
 
-#: State of a node without pressure that carries shear by the bound of Tresca's law.
+#: State of a node without pressure that transmits shear up to the bound of Tresca's
+#: law.
 SLIDING = "sliding without contact"
 
 
@@ -154,7 +155,7 @@ class ContactSide:
     push: Vector | None = None
     #: (s,) tangential traction on the side, Pa; in space its size
     shear: Vector | None = None
-    #: (s,) "open", "stick", "slip" or `SLIDING`; old files have "open" for the last
+    #: (s,) "open", "stick", "slip" or `SLIDING`; older files have "open" for `SLIDING`
     friction: NDArray[Any] | None = None
     friction_force: NDArray[Any] | None = None  #: (s, dim) part of `force`, tangential
     #: (k, 3) exact solution, if known: distance along the side from its middle, m,
@@ -164,10 +165,10 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Return the mask (s,) of the nodes in contact.
 
-        With friction, these stick or slip: under Tresca's law, forces also act without
-        contact. Without friction, they have a `push`, or if that is unknown a force,
-        of more than `least`, N/m. Forces alone are misleading: a mortar row of a curved
-        side also has tangential forces at the neighbours of its node.
+        With friction, these nodes stick or slip; under Tresca's law, forces also act
+        without contact. Without friction, their `push` exceeds `least` (N/m), or their
+        force if `push` is unknown. Forces alone are misleading: a mortar row of a
+        curved side also has tangential forces at the neighbours of its node.
         """
         mask: NDArray[Any]
         if self.friction is not None:
@@ -231,10 +232,9 @@ class Case:
     #: time of forming a dual, with the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: needed to certify errors
-    remarks: tuple[str, ...] = ()  #: doubts about the input, a line each
-    #: relative distance of the QP from the fixed point of the iteration to which it
-    #: belongs; no solution of this QP can reduce it. 0 at the fixed point, or without
-    #: an iteration
+    remarks: tuple[str, ...] = ()  #: warnings about the input, a line each
+    #: relative distance of the QP from the fixed point of its iteration, such as that
+    #: of Coulomb's law; no solution of this QP can reduce it. 0 without an iteration
     unsettled: float = 0.0
 
 

@@ -22,12 +22,13 @@ NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: Largest entry of P − Pᵀ, relative to that of P, that counts as rounding.
 SYMMETRY_TOLERANCE = 1e-12
-#: rows of the largest P that is checked by a Cholesky factor (0.25 s)
+#: Rows of the largest P that is checked by a Cholesky factor, which takes 0.25 s.
 _MAX_FACTORED_ROWS = 2000
-#: Least eigenvalue of the scaled P: text formats may store no more than six digits.
+#: Least eigenvalue of the scaled P. Text formats may store only six digits, and this
+#: rounding can make eigenvalues negative.
 _MIN_CURVATURE = -1e-6
-#: Least diagonal entry for scaling, relative to the largest entry of P: smaller ones
-#: may be mostly rounding.
+#: Least diagonal entry used for scaling, relative to the largest entry of P, since
+#: smaller entries may be mostly rounding.
 _MIN_DIAGONAL = 1e-4
 _STRIP_ROWS = 256  #: rows of a dense matrix that are compared at a time, to save memory
 
@@ -56,8 +57,8 @@ class QP:
     Blocks of variables may have further convex sets, to which z_box is normal.
 
     Absent constraints have zero rows, absent bounds are ±inf; nothing is None. All
-    arrays become read-only, so that a solver that scales its input in place raises.
-    `from_arrays` accepts more kinds of input, and copies it.
+    arrays become read-only, so that a solver that scales its input in place raises an
+    exception. `from_arrays` accepts more kinds of input, and copies them.
 
     Parameters
     ----------
@@ -343,7 +344,7 @@ def needs_matrices(qp: QP) -> str | None:
 def check_symmetric(P: Matrix) -> None:
     """Raise unless P is symmetric up to rounding.
 
-    Solvers that read one triangle would solve another problem than the others.
+    For an asymmetric P, solvers that read one triangle would solve different problems.
 
     Raises
     ------
@@ -432,7 +433,7 @@ def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
 def canonical(M: Matrix) -> Matrix:
     """Return a sparse matrix with sorted indices and without duplicate entries.
 
-    It has to happen before the arrays become read-only, since SciPy sorts in place.
+    The caller sorts before the arrays become read-only, since SciPy sorts in place.
     """
     if M.has_canonical_format:
         return M

@@ -74,9 +74,9 @@ class Verdict(StrEnum):
 class Measurement:
     """Costs of preparing and solving; None if not measured.
 
-    Every field is also a field of the journal. A field that is added here, and set by
-    `harness.verify.measure`, is transferred from the worker to the record unchanged.
-    Values must not be negative.
+    Every field is also a field of the journal. A new field that
+    `harness.verify.measure` sets is transferred from the worker to the record without
+    further code. Values must not be negative.
     """
 
     prepare_seconds: float | None = None
@@ -96,7 +96,7 @@ class Record(Measurement):
     """A single run of one solver on one case at one tolerance; one JSON line.
 
     It contains the measurement, the task, the claims of the solver and the verdict.
-    None stands for values that were not, or cannot be, measured (JSON has no NaN).
+    Values that were not, or cannot be, measured are None, since JSON has no NaN.
     """
 
     schema: int = SCHEMA

@@ -2,13 +2,13 @@
 
 A registry maps names to solvers. An entry ``"PREFIX:*"`` stands for all backends of a
 generic adapter: the text after the last colon is the value of the adapter's field
-``backend``, and ``backends()``, if the adapter has it, lists those installed.
+``backend``. If the adapter has a method ``backends()``, it lists the installed ones.
 
-A plug-in file is loaded as a Python package of its own, whose path is the folder of the
-file. It can import the modules and packages in that folder, its neighbours, and two
+A plug-in file is loaded as a separate Python package, whose path is the folder of the
+file. It can import the modules and packages in that folder, its neighbours. Two
 plug-ins may have different neighbours of the same name: when the code is compiled,
 ``import helper`` is replaced by an import of the submodule ``helper`` of the package.
-In the same way, ``from harness import QP`` refers to `mortarbench.harness`.
+Similarly, ``from harness import QP`` refers to `mortarbench.harness`.
 """
 
 from __future__ import annotations

@@ -60,10 +60,11 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.crossval.discretisation import Discretisation
 
-#: certified relative error above which a verified answer has a remark
+#: Certified relative error above which a verified answer gets a remark.
 MAX_CERTIFIED_ERROR = 0.01
-#: largest sum of contact forces, relative to the sum of loads, without contact:
-#: interior-point methods leave forces of about 1e-8, closed contacts have far more
+#: Largest sum of contact forces, relative to the sum of loads, that counts as no
+#: contact. Interior-point methods leave forces of about 1e-8; closed contacts have far
+#: larger ones.
 MAX_OPEN_FORCE = 1e-6
 
 

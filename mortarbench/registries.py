@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.results.work_unit import Commands
     from mortarbench.harness.solution import Solution
 
-#: lock of the thread that loads plug-ins, builds, solves, runs or validates: these
-#: operations set numbers of threads, standard output and modules of the whole process
+#: Lock that allows one thread at a time to load plug-ins, build, solve, run or validate:
+#: these operations set thread numbers, standard output and modules of the whole process.
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
@@ -340,7 +340,7 @@ class Registries:
         if str(text) in suites:
             return suites[str(text)]
         if path.exists():
-            return path  # not a file: reading it raises the fitting error
+            return path  # not a file: reading it raises the appropriate error
         if len(path.parts) > 1 or path.suffix:
             raise InputError(f"{text}: no such file; expected a suite in TOML")
         raise unknown("suite", str(text), suites)

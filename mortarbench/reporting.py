@@ -73,7 +73,7 @@ def report(
     folder : result folder; its report is written to DIR/report
     others : if given, the changes from `folder` to each of these folders are reported
         instead, in the folder ``report`` of each of them
-    formats : among html, md, tex, csv, parquet
+    formats : any of html, md, tex, csv, parquet
     factor : verified means that every residual is within factor·tol
     fail_on : conditions listed in `Report.failed_on` if they are met: ``worse``, a
         verdict became worse; ``slower``, the interval of a ratio of times lies above

@@ -1,8 +1,8 @@
 """Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
-The name of each check is a statement about the solver. A check passes, fails with a
-description of the violation, or is declined with the solver's reason if the solver
-declines the QP. If an equivalent formulation changes the answer, that is reported as a
+The name of each check is a statement about the solver. A check passes, or fails with a
+description of the violation. If the solver declines the QP, the check is declined with
+the same reason. An answer that changes under an equivalent formulation is reported as a
 weakness, which most solvers have.
 """
 
@@ -67,10 +67,10 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-#: rounding of a gradient relative to its largest term, as in dual residuals
+#: Rounding of a gradient relative to its largest term, as in dual residuals.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
-#: neglected difference between repeats: the alignment of arrays in memory determines
-#: the order of sums
+#: Difference between repeats that is ignored. The order of sums, and hence rounding,
+#: depends on the alignment of arrays in memory.
 REPEAT_ROUNDING = 1e-12
 
 
@@ -84,18 +84,18 @@ class Grade(StrEnum):
 
 
 class Result(NamedTuple):
-    """Result of a check: its grade, and the reason for it or a remark."""
+    """Result of a check: its grade, and a reason or remark."""
 
     grade: Grade
     message: str = ""
-    work: float | None = None  #: iterations relative to those before a change
+    work: float | None = None  #: iterations relative to the unchanged formulation
 
 
 class ContractError(Exception):
     """Violation of the contract by a solver."""
 
 
-#: raises ContractError, DeclinedError or WeaknessError; may return a result with remark
+#: Raises ContractError, DeclinedError or WeaknessError; may return a result or None.
 Check = Callable[[Solver], Result | None]
 
 
@@ -112,7 +112,7 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by `measure`, and require a point, right or wrong."""
+    """Solve by `measure`; require a finite point, verified or not."""
     s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
@@ -120,7 +120,7 @@ def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
 
 
 def _end(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by `measure`, which turns exceptions of the solver into a status."""
+    """Solve by `measure`, which converts exceptions of the solver to a status."""
     s = measure(solver, qp, tol).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -157,9 +157,9 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 def _solves_over_sets(shape: str, solver: Solver) -> Result:
     """Require a relative accuracy of 1e-8 of the objective; report the error in x.
 
-    An error δ in x increases the objective by at least 0.05 δ², since the eigenvalues
-    of P exceed 0.1. The points of interior-point methods may therefore have errors of
-    up to √(20·1e-8·|f|).
+    The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective by
+    at least 0.05 δ². Points of interior-point methods may therefore have errors of up
+    to √(20·1e-8·|f|).
     """
     qp, expected = manufactured_over_sets(shape)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
@@ -171,7 +171,7 @@ def _solves_over_sets(shape: str, solver: Solver) -> Result:
 
 
 def _solves_the_degenerate_cone(solver: Solver) -> Result:
-    """Require verified answers, and report their errors in x, of the order of √tol."""
+    """Require verified answers; report their errors in x, which are of order √tol."""
     qp, x = degenerate_cone()
     errors = [
         float(np.abs(_solved(solver, qp, tol, VERIFIED_FACTOR).x - x).max())
@@ -229,7 +229,7 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
-    # the arrays are read-only, which a solver can undo: both are checked
+    # solvers can make the read-only arrays writable, so their values are compared too
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
             raise ContractError("changed the QP that it was given")
@@ -266,18 +266,19 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Require a solution where some solvers claim that their first point is optimal.
+    """Require a correct solution of a QP with bounds only.
 
-    They do so for QPs without rows.
+    Some solvers claim that their first iterate is optimal if a QP has no rows.
     """
     _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Require that one thread computes: its CPU time cannot exceed the wall time."""
+    """Require that one thread computes, so that CPU time does not exceed wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
-    # on all CPUs: two threads on a single CPU would alternate and escape notice
+    # on all CPUs: on a single CPU, the CPU time of two threads would not exceed wall
+    # time
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()
@@ -294,7 +295,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Require solutions of two QPs with equal matrices, and of two other QPs."""
+    """Require solutions of two QPs with equal matrices, then of two other QPs."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
@@ -318,7 +319,7 @@ def _a_sequence_is_solved(solver: Solver) -> None:
 
 def _sequence() -> list[QP]:
     qp, point = manufactured("everything")
-    # a translation of the solution and all constraints: the active set stays
+    # a translation of the solution and all constraints does not change the active set
     shift = 0.1 * np.cos(np.arange(qp.q.size))
     moved = shift_unknowns(qp, -shift).qp
     softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))

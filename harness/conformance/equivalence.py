@@ -1,10 +1,9 @@
 """Invariance of a solver's answer under equivalent formulations of a contact problem.
 
-Two strings in contact, in each form of `harness.conformance.manufactured.strings`, are
-solved unchanged and after every change of `CHANGES`. Verdict and answer must be the
-same. For two verified points x and x₀ of one QP, the difference of the objectives and
-the energy ½‖x − x₀‖²_P of the difference are bounded by the residuals, relative to the
-energies.
+Two strings in contact (`harness.conformance.manufactured.strings`) are solved in each
+form, unchanged and after every change of `CHANGES`. Verdict and answer must not change.
+For two verified points x and x₀ of one QP, the residuals bound the difference of the
+objectives and the energy ½‖x − x₀‖²_P of the difference, both relative to the energies.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8  #: tolerance of all solves of the strings
-#: largest difference relative to the energies; a factor of 10 for residuals that add up
-#: over rows
+#: Largest difference relative to the energies. The factor of 10 allows for residuals
+#: that add up over rows.
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
-#: load and length of beam-ring (10⁸ N/m and 2 m) in each system of units, as powers of
-#: two. Forces are per thickness, so the stiffness is in Pa, MPa and GPa
+#: Load (10⁸ N/m) and length (2 m) of beam-ring in each system of units, as powers of
+#: two. Forces are per unit thickness, so that the stiffness is in Pa, MPa and GPa.
 UNITS: Mapping[str, tuple[float, float]] = {
     "N, m": (2.0**27, 2.0**1),
     "N, mm": (2.0**17, 2.0**11),
@@ -48,7 +47,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Change of verdict or answer by an equivalent formulation."""
+    """Change of the verdict or the answer under an equivalent formulation."""
 
 
 class DeclinedError(Exception):
@@ -65,7 +64,7 @@ def same_answer(
 
     Returns
     -------
-    the numbers of iterations of both solves; None where the solver reports none
+    numbers of iterations of both solves; None if the solver does not report them
 
     Raises
     ------
@@ -141,7 +140,7 @@ def _rows_scaled(qp: QP, form: str) -> Equivalent:
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: shift for each form: about half of the largest deflection, or contact force
+#: Shift for each form, about half of the largest deflection or contact force.
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
 #: function of the strings and the form that returns an equivalent QP

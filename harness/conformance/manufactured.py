@@ -13,8 +13,8 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
 
-#: keys: m equality rows, p inequality rows, finite lower and upper bounds (of some
-#: variables), redundant rows, fixed variables, rank of P
+#: Keys: m equality rows, p inequality rows, numbers of finite lower and upper bounds,
+#: redundant rows, fixed variables, rank of P.
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
@@ -35,9 +35,9 @@ def manufactured(
 ) -> tuple[QP, Solution]:
     """Return a random QP with a known KKT point.
 
-    Draw x*, the multipliers and the active set, and solve the stationarity condition
-    for q. The matrices are of order one. Every kind of constraint that the shape
-    contains is active, and the minimiser is unique except for "singular".
+    x*, the multipliers and the active set are drawn, and stationarity determines q. The
+    matrices are of order one. Every kind of constraint in the shape is active, and the
+    minimiser is unique except for "singular".
 
     shape : a key of `SHAPES`
 
@@ -197,9 +197,9 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
 
 
 def membrane(k: int) -> QP:
-    """Return the QP of a membrane of k·k nodes, fixed at its rim, on a paraboloid.
+    """Return the QP of a k × k membrane over a paraboloid, with its rim fixed.
 
-    It has bounds only. Its solution is not known, but its KKT residuals are computable.
+    It has bounds only. Its solution is not known, but KKT residuals verify answers.
     """
     second = diags_array(
         [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]
@@ -226,9 +226,9 @@ def strings(form: str) -> QP:
     """Return a small frictionless contact problem: a loaded string above a softer one.
 
     The strings have 24 and 16 cells. The unknown is the deflection u (25 + 17 nodes), K
-    is the stiffness:  min ½uᵀKu − fᵀu.  The ends are fixed by A u = 0. A row of
-    G u ≤ h keeps each inner node of the upper string above the lower string: −1 at the
-    node, and the weights of the two lower nodes around it.
+    is the stiffness:  min ½uᵀKu − fᵀu.  The ends are fixed by A u = 0. Each row of
+    G u ≤ h keeps an inner node of the upper string above the lower string. Its entries
+    are −1 at the node and the interpolation weights of two lower nodes.
 
     form : "primal" is that QP. "dual", with B = [A; G], c = [0; h] and an orthonormal
         basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  λ_I ≥ 0.
@@ -276,7 +276,7 @@ def strings(form: str) -> QP:
 
 
 def _two_strings() -> tuple[Vector, Vector, Vector]:
-    """Assemble stiffness (42, 42), load (42,) on the upper string, kernel (42, 2)."""
+    """Return stiffness (42, 42), load (42,) on the upper string, and kernel (42, 2)."""
     K, R = np.zeros((42, 42)), np.zeros((42, 2))
     for body, (tension, cells, nodes) in enumerate(
         [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]

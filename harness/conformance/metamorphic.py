@@ -1,18 +1,18 @@
 """Equivalent formulations of a QP, each with the map back to the original solution.
 
-Physically equivalent problems must have the same answer: after a change of units, of
-the order of unknowns or rows, or of the origin or sign of unknowns, and with rows
-scaled or duplicated (metamorphic relations: T. Y. Chen et al., ACM Computing Surveys 51
-(2018) 4). All of these are one of two substitutions:
+Physically equivalent problems must have the same answer. Changes are: other units,
+another order of unknowns or rows, another origin or sign of unknowns, and scaled or
+duplicated rows (metamorphic relations: T. Y. Chen et al., ACM Computing Surveys 51
+(2018) 4). Each change is one of two substitutions:
 
-* of unknowns,  x = T x' + a  with one entry in each row and column of T, and the
-  objective times t:
+* of unknowns,  x = T x' + a,  where T has one entry in each row and column, with the
+  objective multiplied by t:
 
       P' = t TᵀPT,  q' = t Tᵀ(Pa + q),  A' = AT,  b' = b − Aa,  G' = GT,  h' = h − Ga;
       y = y'/t,  z = z'/t,  z_box = T⁻ᵀz_box'/t,  objective = objective'/t + aᵀ(½Pa + q)
 
-* of rows,  A' = MA, b' = Mb  or  G' = NG, h' = Nh,  with one entry in each row of M
-  and N, positive in N, and at least one in each column:
+* of rows,  A' = MA, b' = Mb  or  G' = NG, h' = Nh.  M and N have one entry in each row
+  and at least one in each column; the entries of N are positive:
 
       y = Mᵀy',  z = Nᵀz'
 
@@ -42,7 +42,7 @@ class Equivalent(NamedTuple):
     """A transformed QP, and the map of its points back to the original QP."""
 
     qp: QP
-    recover: Callable[[Solution], Solution]  #: point of the new QP → of the old one
+    recover: Callable[[Solution], Solution]  #: maps a point of the new QP to the old QP
     scale: float = 1.0  #: old objective = scale·new objective + constant, at all points
     constant: float = 0.0
 
@@ -91,12 +91,12 @@ def permute_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
 
 
 def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
-    """Multiply each row by a positive factor; its multiplier is divided by it."""
+    """Multiply each row by a positive factor, which divides its multiplier."""
     return _rows(qp, diags_array(equalities), diags_array(inequalities))
 
 
 def duplicate_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
-    """Append copies of the selected rows below the others.
+    """Append copies of the selected rows.
 
     The multiplier of a row is the sum of those of its copies, which are not unique.
     """

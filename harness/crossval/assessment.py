@@ -1,18 +1,19 @@
 """Errors of one answer against the reference solution.
 
-The errors allowed follow from the claim. An answer at tolerance t is verified if its
-KKT residuals are at most 10t, and the residual of the gap is g/E with the energy
+An answer may deviate from the reference by an error that follows from its claim. At
+tolerance t it is verified if its KKT residuals are at most 10t; the residual of the gap
+is g/E with the energy
 E = ‖u*‖². With the identity of Prager and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
-so that neither the displacement nor the equilibrium u_λ under the contact forces may be
-farther off than √(20t)‖u*‖. The second distance is that of the contact forces in the
-dual norm, ‖Bᵀ(λ − λ*)‖: multipliers themselves need not be unique.
+so that the errors of the displacement and of the equilibrium u_λ under the contact
+forces are at most √(20t)‖u*‖. The second error is that of the contact forces in the
+dual norm, ‖Bᵀ(λ − λ*)‖; the multipliers themselves need not be unique.
 
-A row with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. An error of that energy moves
-λᵢDᵢ or gapᵢ by sᵢ = √(20t Dᵢ)‖u*‖. Truth and answer therefore contradict each other on
-a row only if max(λᵢDᵢ, gapᵢ) > sᵢ in both.
+A row with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. An error of that energy
+changes λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
+contradict each other on a row only if max(λᵢDᵢ, gapᵢ) > sᵢ in both.
 """
 
 from __future__ import annotations
@@ -36,24 +37,24 @@ from mortarbench.harness.verify.references import ReferencePoint
 
 @dataclass(frozen=True, kw_only=True)
 class Assessment:
-    """Errors of one answer; None where the problem has no such quantity.
+    """Errors of one answer; None if a quantity does not exist for the problem.
 
-    Energies are relative to ½‖u*‖², lengths in the energy norm to ‖u*‖.
+    Energies are relative to ½‖u*‖². Lengths in the energy norm are relative to ‖u*‖.
     """
 
     error: float  #: ‖u − u*‖
     equilibrium_error: float | None  #: ‖u_λ − u*‖
     energy: float  #: J(u) − J(u*)
     penetration: float | None  #: max (Bu − c)₊ over the mesh size
-    balance: float | None  #: largest unbalanced force or moment on a body, relative
+    balance: float | None  #: largest unbalanced relative force or moment on a body
     active: int | None  #: number of closed contact rows
-    rows: tuple[int, ...] = ()  #: closed in the reference and open here, or vice versa
-    #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ, or exceeds the friction bound by as much
+    rows: tuple[int, ...] = ()  #: rows whose state contradicts that of the reference
+    #: rows with a tensile multiplier, λᵢDᵢ < −sᵢ, or one above the friction bound by sᵢ
     pulls: tuple[int, ...] = ()
 
 
 class Deviation(NamedTuple):
-    """Difference of an answer from the reference, over ‖u*‖; see `distances`."""
+    """Difference of an answer from the reference, divided by ‖u*‖; see `distances`."""
 
     u: Vector  #: (n,)
     equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
@@ -136,10 +137,10 @@ def point_norm(qp: QP, s: Solution) -> float:
 def distances(
     P: Matrix, kernel: NDArray[np.float64], points: Sequence[Vector]
 ) -> NDArray[np.float64]:
-    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf where one is not finite.
+    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf if one of them is not finite.
 
-    They are computed from the Gram matrix, whose cancellation hides distances below
-    1e-8 of the norm of the longer vector. So the points have to be deviations from a
+    Cancellation in the Gram matrix hides distances below 1e-8 of the norm of the longer
+    vector. The points must therefore be deviations from a common reference.
     common reference.
 
     kernel : (n, r) orthonormal rigid motions, which are projected out
@@ -150,14 +151,14 @@ def distances(
     norms = np.diag(gram)  # squared
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
     lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
-    np.fill_diagonal(lengths, 0)  # inf − inf = NaN otherwise
+    np.fill_diagonal(lengths, 0)  # inf − inf would be NaN
     return np.asarray(lengths)
 
 
 def _closed(
     exact: Exact, lam: Extended, gap: Extended, small: Extended
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Mark the closed rows (m,), and those that are clearly closed or clearly open."""
+    """Return masks (m,) of closed rows, and of rows that are clearly closed or open."""
     force = lam * exact.compliance
     return force > gap, np.maximum(force, gap) > small
 
@@ -185,7 +186,7 @@ def _numbers(rows: NDArray[np.bool_]) -> tuple[int, ...]:
 
 
 def _over(value: float, scale: float) -> float:
-    """Divide with 0/0 = 0; a NaN, which overflow leaves, becomes inf."""
+    """Divide with 0/0 = 0; NaN, which results from overflow, becomes inf."""
     if value == 0:
         return 0.0
     ratio = value / scale if scale else np.inf

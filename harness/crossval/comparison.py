@@ -1,11 +1,11 @@
 """Comparison of all answers to one problem with a reference and with each other.
 
-The reference is a point with a proven error (`harness.verify.references`), computed by
-none of the solvers under test. An answer is refuted by its own residuals, or if its
-distance to the reference, minus the error of the reference, exceeds what the claim
-allows (`harness.crossval.assessment`). Which answer is wrong therefore does not depend
-on a majority. Distances between answers need no reference: two answers that differ by
-more than both claims allow, neither of them refuted, are an unresolved disagreement.
+The reference is a point with a proven error (`harness.verify.references`), computed
+independently of the solvers under test. An answer is refuted by its residuals, or if
+its distance to the reference, minus the error of the reference, exceeds what the claim
+allows (`harness.crossval.assessment`). No majority of answers is needed. Distances
+between answers need no reference: if two answers differ by more than both claims allow,
+and neither is refuted, the disagreement is unresolved.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from mortarbench.harness.verify.kkt import allowed, verdict
 from mortarbench.harness.verify.optimum import Proves, decided, proves
 from mortarbench.harness.verify.verdicts import note_of
 
-#: Error of an outlier, relative to the median error of the other solvers.
+#: Least error of an outlier, relative to the median error of the other solvers.
 OUTLIER_RATIO = 100
-MIN_PEERS = 3  #: fewest answers of other solvers that have a meaningful median
+MIN_PEERS = 3  #: least number of other solvers' answers for a meaningful median
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """The judgement of one answer; plain data."""
+    """Judgement of one answer; plain data."""
 
     run_id: str
     repeats: int
@@ -56,19 +56,19 @@ class Answer:
     tol: float
     claimed: str
     stored: Verdict  #: verdict of the run
-    verdict: Verdict  #: verdict on the stored point now, at 10·tol
+    verdict: Verdict  #: verdict on the stored point, evaluated again at 10·tol
     residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
     optimum_error: (
         float | None
-    )  #: decides in place of the residuals, see `harness.verify.optimum`
+    )  #: error against a proven optimum; decides in place of the residuals
     allowed: float  #: largest residual of a verified answer
     energy_allowed: float  #: largest relative error in the energy norm that is allowed
     energy_bound: float | None  #: certificate stored by the run
-    doubt: float | None  #: uncertainty ± of the errors in `assessment`
+    doubt: float | None  #: bound of the uncertainty of the errors in `assessment`
     assessment: Assessment | None
     refuted: tuple[str, ...] = ()  #: reasons why the claim is false
-    #: contradiction between the run's certificate and the reference: an error of this
-    #: program
+    #: contradiction between the certificate of the run and the reference, which
+    #: indicates a defect of this program
     contradiction: str = ""
     remarks: tuple[str, ...] = ()
 
@@ -97,8 +97,8 @@ class Problem:
     """All answers to one problem, of every solver and form; plain data."""
 
     name: str  #: the case without its form
-    truth: str  #: "reference", or the answer in its place; empty without either
-    doubt: float | None  #: bound of its relative error in the energy norm
+    truth: str  #: "reference", or the name of the best answer; empty without either
+    doubt: float | None  #: bound of the relative error of the truth in the energy norm
     closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
     pairs: tuple[Pair, ...]  #: pairs of answers at one tolerance
@@ -115,8 +115,7 @@ def compare_answers(
 ) -> Problem:
     """Judge all answers to one problem.
 
-    answers : answers to one problem: equal ``mechanics.program``, or one QP without
-        mechanics
+    answers : answers with equal ``mechanics.program``, or to one QP without mechanics
     solve : the reference solve
     references : folder in which reference points are cached; None for no cache
     """
@@ -138,7 +137,7 @@ def compare_answers(
     for g in answers:
         try:
             assessment, deviation = truth.assess(g)
-        except Exception as e:  # to_primal is the family's code
+        except Exception as e:  # code of the family may raise anything
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
             judged.append(_answer(g, None, None, prove))
             continue
@@ -202,10 +201,10 @@ def _answer(
 
 
 def _contradiction(a: Answer) -> str:
-    """Return how an error exceeds the certificate of the run, or "".
+    """Describe an error that exceeds the certificate of the run; "" without one.
 
-    A point with remarks, or with another verdict than in the run, may not be the one
-    that was certified, and is skipped.
+    A point with remarks, or with another verdict than in the run, is skipped: it may
+    not be the point that was certified.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
@@ -246,7 +245,7 @@ def _refutations(a: Answer) -> Iterable[str]:
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Add a remark to answers that keep their claim but are far less accurate."""
+    """Add a remark to answers with a valid claim that are far less accurate."""
     groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
     for a in answers:
         if not a.refuted and a.error is not None:

@@ -1,25 +1,24 @@
 """Estimate of the discretisation error, which bounds the useful accuracy of a solver.
 
-Successive halving of all cells gives solutions u_h, u_{h/2}, u_{h/4}. Their distances
-in the energy norm, with u_h interpolated on the finer mesh, determine the rate of
+Successive halving of all cells gives solutions u_h, u_{h/2}, u_{h/4}, where u_h is
+interpolated on the finer mesh. Their distances in the energy norm determine the rate of
 convergence and the remaining error (Richardson extrapolation of squares):
 
     2^q = ‖u_h − u_{h/2}‖² / ‖u_{h/2} − u_{h/4}‖²
     ‖u_h − u‖² = ‖u_h − u_{h/2}‖² / (1 − 2^−q)                                       (1)
 
-with q = 2 for linear and bilinear elements where u is smooth. Without contact, (1) is
-Galerkin orthogonality in nested spaces; contact adds the work of its pressure on the
+with q = 2 for linear and bilinear elements if u is smooth. Without contact, (1) is
+Galerkin orthogonality in nested spaces. Contact adds the work of its pressure on the
 gaps between the solutions, which is of higher order if few nodes change state.
-Estimates are relative to ‖û‖, as are the bounds of `harness.verify.certificate`, so
-that both can be compared.
+Estimates are relative to ‖û‖, and so are the bounds of `harness.verify.certificate`.
 
-Differences of energies, ‖u_h − u‖² ≤ 2(J_h − J), would be simpler, but they contain
-terms of the same order in h that are not errors of u: each mesh has another polygon for
-a curved side, and other boundary values. On the membrane they give 1.5 times the true
-error, on a cylinder with four cells per contact half-width a an eighth of it. Load
-steps are linearised at the solution of each mesh, which is part of the error. Under a
-point load there is no limit, since the energy decreases like log h: only the distance
-to the next mesh is reported.
+Differences of energies, ‖u_h − u‖² ≤ 2(J_h − J), would be simpler. But they contain
+terms of the same order in h that are not errors of u: each mesh approximates a curved
+side by another polygon and has other boundary values. They give 1.5 times the true
+error on the membrane, and an eighth of it on a cylinder with four cells per contact
+half-width. Load steps are linearised at the solution of each mesh, which is part of the
+error. Under a point load the energy decreases like log h without a limit; then only the
+distance to the next mesh is reported.
 """
 
 from __future__ import annotations
@@ -45,15 +44,15 @@ from mortarbench.harness.verify.references import UnsolvedError, reference_point
 FILE = "discretisation.json"  #: name of the file in the result folder
 SCHEMA = 1  #: version of the format of the file
 MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is solved
-#: factor by which the first halving multiplies the unknowns; later ones use the
-#: observed ratio
+#: Assumed growth of the number of unknowns by the first halving; later halvings use the
+#: observed ratio.
 GROWTH = 4.0
-#: exponent p in the growth of the time of a reference solve, unknowns^p
+#: Assumed exponent p of the time of a reference solve, unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: fewest meshes that determine a rate
+MAX_LEVELS = 3  #: number of meshes, the least that determines a rate
 MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
-#: Least relative error of u that is assumed where certificates prove less: rounding of
-#: slender bodies in double precision.
+#: Least assumed relative error of u, even if certificates prove a smaller one: rounding
+#: of slender bodies in double precision.
 ROUNDING = 1e-8
 
 
@@ -76,7 +75,7 @@ class Discretisation:
 
     kind : "limit": `error` is relative to the limit of fine meshes; "change": it is the
         difference from the next mesh; "rounding": the error is below `error`, the level
-        of rounding; "unknown": there is no estimate, see `note`
+        of rounding; "unknown": `note` states why there is no estimate
     """
 
     case: str  #: canonical name without the form
@@ -84,10 +83,10 @@ class Discretisation:
     error: float | None = None  #: relative to ‖û‖, energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
     rate: float | None = None  #: q of the squared error, observed
-    #: reason for a kind other than "limit"; for a limit, the geometry to which it
-    #: applies
+    #: reason for a kind other than "limit"; for a limit, the geometry that is converged
+    #: to
     note: str = ""
-    levels: tuple[Level, ...] = ()  #: coarsest first, which is the case itself
+    levels: tuple[Level, ...] = ()  #: coarsest first; the first is the case itself
     params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
 
     def __str__(self) -> str:
@@ -107,7 +106,7 @@ def estimate_error(
     """Estimate the error of the first of one to three levels.
 
     singular : reason why energies have no limit; empty if they have one
-    note : reason why there are no more levels
+    note : reason why there are no further levels
     """
     nothing = Discretisation(case=case, kind="unknown", note=note, levels=tuple(levels))
     if len(levels) < 2:
@@ -145,12 +144,13 @@ def discretisation_errors(
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
-    An earlier estimate from more meshes is kept if this call runs out of time.
+    If this call runs out of time, an earlier estimate from more meshes is kept.
 
-    cases : cases; the forms of one physical case count once
+    cases : cases; all forms of a physical case are one case
     folder : result folder, with the cache of reference points in ``references``
-    budget : seconds; a mesh that is expected to take longer than the rest is skipped
-    tell : called with a message before each case
+    budget : seconds; meshes are skipped if their expected time exceeds the remaining
+    one
+    tell : progress callback, called with a message before each case
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
     earlier: dict[str, Discretisation] = {}
@@ -199,7 +199,7 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
 
 
 def _continues(old: Discretisation, new: Discretisation) -> bool:
-    """Return True if `old` has the meshes of `new` and finer ones."""
+    """Return True if `old` contains the meshes of `new` and finer ones."""
     common = [
         (a.case, a.unknowns) == (b.case, b.unknowns)
         for a, b in zip(old.levels, new.levels, strict=False)
@@ -293,7 +293,7 @@ class _Halving:
                 return None
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):
-                return None  # no rate without a second mesh: do not solve the first
+                return None  # a single mesh determines no rate: skip its solve
             point = reference_point(mechanics, self.reference, self.references)
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
@@ -313,7 +313,7 @@ class _Halving:
         )
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
-        """Return ‖u − u_{2h}‖ on this mesh, None on the first; store u for the next."""
+        """Return ‖u − u_{2h}‖, or None on the first mesh; store u for the next mesh."""
         whole = u + grid.lift
         before, self._coarse = self._coarse, (grid, whole)
         if before is None:

@@ -1,8 +1,7 @@
-"""Reference point that the answers to one problem are compared with.
+"""Reference point with which the answers to one problem are compared.
 
-It is the point of the reference solve if that succeeds, and otherwise the answer with
-the smallest certified error, which the page then states. It is never decided by a
-majority of answers.
+It is the point of the reference solve. If that solve fails, it is the answer with the
+smallest certified error, and the page states this. A majority of answers never decides.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ MAX_REFERENCE_RESIDUAL = 1e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredAnswer:
-    """A stored answer, and the case as rebuilt for its judgement."""
+    """A stored answer, and its case, rebuilt."""
 
     record: Record
-    label: str  #: label of the solver; sequences have a label of their own
+    label: str  #: label of the solver; sequences have a separate label
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
@@ -54,7 +53,7 @@ class StoredAnswer:
 
 
 class GroundTruth(NamedTuple):
-    """A reference point, and the norm of distances."""
+    """A reference point, and the norm in which distances to it are measured."""
 
     name: str  #: "reference", or the solver and form of the answer in its place
     doubt: float  #: bound of its relative error in the energy norm
@@ -63,7 +62,7 @@ class GroundTruth(NamedTuple):
     assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
     P: Matrix  #: (n, n) matrix of the norm
     kernel: NDArray[np.float64]  #: (n, r) rigid motions, which have no norm
-    note: str = ""  #: reason why it is not the reference solution
+    note: str = ""  #: reason why the point is not the reference solution
 
 
 def ground_truth_of(
@@ -114,7 +113,7 @@ def _elastic_truth(
 def _best_certified(
     mechanics: Mechanics, answers: Sequence[StoredAnswer]
 ) -> tuple[ReferencePoint, str] | None:
-    """Return the answer with the smallest certified error, and its solver and form."""
+    """Return the answer with the smallest certified error, and its label."""
     certified = []
     for g in answers:
         try:
@@ -141,9 +140,9 @@ def _best_certified(
 def _plain_truth(
     answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
-    """Find the reference of a QP without mechanics.
+    """Return the reference of a QP without mechanics.
 
-    Its doubt is the error √(2·residual) that its residuals allow, as for claims.
+    The bound of its error is √(2·residual), which also bounds the errors of claims.
     """
     qp, why = answers[0].case.qp, ""
     try:

@@ -1,9 +1,8 @@
 """Interpolation from a mesh to its refinement, by adjacency.
 
-Only the nodes that both meshes share are matched by position. New nodes cannot be
-identified by position: on a curved side they are not on the chord, and their distance
-from it exceeds the size of a thin cell. A new node is therefore identified as the only
-common neighbour of two old ones.
+Nodes of the coarse mesh are identified by position. New nodes cannot be: on a curved
+side they do not lie on the chord, and their distance from it exceeds the size of a thin
+cell. A new node is identified as the only common neighbour of two coarse nodes.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ Nodes = NDArray[np.int64]
 
 #: Largest distance between shared nodes, relative to the extent of the body.
 MAX_NODE_DISTANCE = 1e-9
-#: Corners of the edges of a hexahedron. The midpoints of two opposite edges of a face
-#: have the centre of the face as a common neighbour; the centres of two opposite faces
-#: have the centre of the cell.
+#: Corners of the edges of a hexahedron. The centre of a face is the common neighbour of
+#: the midpoints of two opposite edges, and the centre of the cell is that of the
+#: centres of two opposite faces.
 EDGES = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5),
     (2, 6), (3, 7),

@@ -1,6 +1,6 @@
 """Summary of a cross-validation: counts, one row per solver, lists of disagreements.
 
-The result is plain data, which the page, the terminal and ``--json`` share.
+The result is plain data for the page, the terminal and ``--json``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Row:
     worst_case: str  #: case of `error_worst`
     penetration: float | None  #: largest, over the mesh size
     balance: float | None  #: largest unbalanced force or moment on a body
-    contradicted_rows: int  #: closed in the reference and open here, or vice versa
+    contradicted_rows: int  #: rows whose state differs from the reference
     primal_dual: float | None  #: largest distance between its primal and dual answers
     from_ours: float | None  #: largest distance of its answers from those of `ours`
 
@@ -41,7 +41,7 @@ class Row:
 def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
     """Return a cross-validation as plain data, summary first.
 
-    ours : label of the solver that all others are compared with, if it took part
+    ours : label of the solver with which all others are compared, if it took part
     """
     answers = [a for p in validation.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]

@@ -1,8 +1,8 @@
 """Cross-validation of a result folder, case by case.
 
-No conclusion of the run is reused: cases are rebuilt, stored points are read, and
-residuals, errors and distances are computed from these. Answers that cannot be judged
-are listed with the reason.
+No conclusion of the run is reused: cases are rebuilt, and residuals, errors and
+distances are computed from the stored points. Answers that cannot be judged are listed
+with the reason.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
-#: largest relative difference between contact forces that count as equal
+#: Relative difference up to which contact forces count as equal.
 MAX_FORCE_DIFFERENCE = 1e-3
-#: Largest error bound of a solution that refutes a claim of infeasibility.
+#: Largest error bound of a solution that can refute a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
 
 
@@ -83,7 +83,7 @@ class Validation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Folder:
-    """A result folder, and the families and the reference solve to judge it with."""
+    """A result folder, with the families and the reference solve that judge it."""
 
     path: Path
     families: Mapping[str, Family]
@@ -179,7 +179,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     lost += damaged
     claims = [r for r in records if _is_proven(r) and r.case in cases]
     contradictory = set()
-    for r in claims:  # the solver's certificate is not stored: search for another
+    for r in claims:  # certificates of solvers are not stored: search for another one
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status.INFEASIBLE)
         if infeasibility_margin(qp, claim) is not None:
@@ -285,7 +285,7 @@ def _stored_answers(
 
 
 def _is_proven(r: Record) -> bool:
-    """Return True if the run proved a claim of infeasibility."""
+    """Return True if the run has proven a claim of infeasibility."""
     return r.verdict is Verdict.VERIFIED_INFEASIBLE
 
 
@@ -305,7 +305,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _apart(r: Record) -> Record:
-    """Append its mode to the label of a solver that ran as a sequence."""
+    """Return a record whose label includes the mode, for a solver run as a sequence."""
     return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
 
 
@@ -368,10 +368,10 @@ def _with_mix_ups(
 
 
 def _nearest_problem(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
-    """Return the name of the problem whose contact forces are nearest.
+    """Return the name of the problem with the nearest contact forces.
 
-    Empty if no forces are equal, or if those of its own problem `own` are: the answer
-    then fails for another reason.
+    Returns "" if no forces are equal up to MAX_FORCE_DIFFERENCE, or if those of the
+    problem `own` are: the answer is then wrong for another reason.
     """
     differences = {
         name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))

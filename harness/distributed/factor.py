@@ -1,18 +1,18 @@
 """Cholesky factor of a sum of matrices over ranks, A = Σ_p A_p = LLᵀ.
 
-Rank p has a symmetric, positive semidefinite A_p on the rows that it *touches*. Rows
-that a single rank touches are its *inner* rows. No entry couples inner rows of
-different ranks, so each rank eliminates its inner rows by itself. The Schur complements
-on the *shared* rows are summed over the ranks, and every rank factorises the sum
+Rank p stores a symmetric, positive semidefinite A_p on the rows that it *touches*. Rows
+of a single rank are its *inner* rows. No entry couples inner rows of different ranks,
+so each rank eliminates its inner rows independently. The Schur complements on the
+*shared* rows are summed over the ranks, and every rank factorises the sum
 (substructuring; Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A
-solve needs one reduction, of shared rows; all other work is local.
+solve needs one reduction of shared rows; all other work is local.
 
 A vector of rows has one of three representations, each a `DistributedVector`:
 
-* additive: the vector is the sum over ranks, as for G_p v with the local columns G_p
+* additive: the vector is the sum over ranks, such as G_p v with the local columns G_p
 * consistent: each rank has the entries of the rows that it touches
-* orthonormal: in the order of L, inner rows on their rank; each of the P ranks has 1/√P
-  times the shared entries
+* orthonormal: in the order of L, with inner rows on their rank, and with the shared
+  entries divided by √P on each of the P ranks
 
 The product of an additive and a consistent vector, or of two orthonormal ones, summed
 over ranks, is the inner product of the vectors represented.
@@ -39,14 +39,14 @@ from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
-#: Largest pivot, of rows of length one, that counts as rounding of zero.
+#: A pivot up to this value counts as zero, for rows scaled to length one.
 DEPENDENCE_TOLERANCE = 1e-13
-#: Added to a diagonal of ones: a pivot of exactly zero would end the factorisation.
+#: Added to a diagonal of ones, since a pivot of zero would end the factorisation.
 PIVOT_SHIFT = 1e-15
 #: Largest size of the dense factor of the shared rows, in entries per row of A.
 MAX_FILL = 8
-#: Largest size of a sparse matrix that is factorised in an array, which takes less time
-#: than the calls of a library for sparse ones; with 500 it takes more.
+#: Largest size of a sparse matrix that is factorised as a dense one, which takes less
+#: time than the calls of a sparse library; with 500 it takes more.
 MAX_ARRAY_ROWS = 256
 
 
@@ -116,12 +116,12 @@ class LocalFactor:
     def complement(self) -> Dense:
         """Schur complement (b, b) of A_p on the border."""
         T = self.factor.complement
-        # less the 1 added to the diagonal of shared rows
+        # subtract the 1 added to the diagonal of shared rows
         T[np.arange(self.changing, len(T)), np.arange(self.changing, len(T))] -= 1
         return T
 
     def reduced(self, t: Dense) -> tuple[Dense, Dense]:
-        """Eliminate an additive t (k,): L_aa⁻¹t_a, and t_b − L_baL_aa⁻¹t_a."""
+        """Eliminate an additive t (k,); return L_aa⁻¹t_a and t_b − L_baL_aa⁻¹t_a."""
         u = self.factor.reduced(t)
         first = u.size - len(self.complement)
         return u[:first], u[first:]
@@ -145,13 +145,13 @@ class LocalFactor:
             L_cc = _cholesky(L_cc)
         except np.linalg.LinAlgError:
             fails = 1.0
-        if ranks.extreme(fails, np.max):  # raised by all ranks alike
-            raise DependentRowsError("the rows depend on each other")
+        if ranks.extreme(fails, np.max):  # all ranks raise
+            raise DependentRowsError("the rows are linearly dependent")
         L_sc, S = self._onto_shared(self.complement, L_cc)
         try:
             return SummedFactor(self, 1.0, L_cc, L_sc, _cholesky(S))
         except np.linalg.LinAlgError:
-            raise DependentRowsError("the rows depend on each other") from None
+            raise DependentRowsError("the rows are linearly dependent") from None
 
     def _onto_shared(self, T: Dense, L_cc: Dense) -> tuple[Dense, Dense]:
         """Eliminate changing rows of T (b, b); return L_sc and the sum S (s, s)."""
@@ -267,7 +267,7 @@ def local_factor(
     except DependentRowsError:
         fails = 1.0
     if at.ranks.extreme(fails, np.max) or factor is None:
-        raise DependentRowsError("the rows depend on each other")
+        raise DependentRowsError("the rows are linearly dependent")
     return LocalFactor(at, changing_rows.size, factor)
 
 
@@ -289,7 +289,7 @@ def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
         try:
             return BorderedFactor.of_array(entries, border)
         except np.linalg.LinAlgError:
-            raise DependentRowsError("the rows depend on each other") from None
+            raise DependentRowsError("the rows are linearly dependent") from None
     inner = np.setdiff1d(np.arange(A.shape[0]), border)
     A = csc_array(A)
     if inner.size:
@@ -301,7 +301,7 @@ def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
         factor.cholesky_inplace(ordered)
         L = csc_array(factor.L())
     except CholmodNotPositiveDefiniteError:
-        raise DependentRowsError("the rows depend on each other") from None
+        raise DependentRowsError("the rows are linearly dependent") from None
     L.sort_indices()
     corner = L[inner.size :, inner.size :].toarray()
     return BorderedFactor(order, L[:, : inner.size], corner)
@@ -311,8 +311,8 @@ def independent_rows(gram: Matrix) -> Rows:
     """Return a maximal set of independent rows of a matrix G, from GGᵀ (r, r).
 
     The pivot of a row is the square of its distance from the span of the previous rows.
-    The row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times the square
-    of its length. Only the first such row is dropped before all pivots are computed
+    A row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times its squared
+    length. Only the first dependent row is dropped before the pivots are computed
     again, since the pivots after it are rounding errors.
 
     Returns

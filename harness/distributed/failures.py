@@ -2,9 +2,9 @@
 
 If one rank raised an exception while others wait for its messages, they would wait for
 ever. Ranks therefore exchange the outcome of each piece of work (`run_collectively`),
-on a communicator that is used for nothing else. A rank that failed waits there for the
-others. If they do not arrive, they are blocked in a message that it will never send,
-and all processes are ended (`abort`).
+on a communicator that is used only for this purpose. A rank that failed waits there for
+the others. If they do not arrive in time, they are waiting for its messages, and the
+failed rank ends all processes (`abort`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ T = TypeVar("T")
 
 PEER_TIMEOUT = 5.0  #: time that a failed rank waits for the others, s
 #: Environment variable with the file descriptor on which `harness.processes.ranks`
-#: reads failures of ranks. The output of a solver is not searched for them.
+#: reads failures of ranks, separately from the output of solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
 _POLL_SECONDS = 1e-3  #: time between two tests whether the other ranks have arrived
-_MESSAGE_BYTES = 500  #: length to which the description of a failure is cut
+_MESSAGE_BYTES = 500  #: longer descriptions of a failure are truncated
 
 
 class RankFailedError(Exception):
@@ -76,7 +76,7 @@ def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
 
 
 def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
-    """Record which rank failed and how, and end all ranks."""
+    """Record the failure of this rank, and end all ranks."""
     record(ranks.rank, _named(ranks.rank, ranks, in_a_line(failure)))
     with suppress(OSError, ValueError):  # a solver may have closed stderr
         traceback.print_exception(failure)

@@ -25,14 +25,14 @@ def mpiexec() -> str | None:
 
 
 def ranks_asked(count: object, where: str) -> int:
-    """Check a number of ranks, and that MPI is available if there are several.
+    """Check a number of ranks; if it exceeds one, check also that MPI is available.
 
     where : option or key, for the message
 
     Raises
     ------
     InputError
-        When it is not an integer from 1 to MAX_RANKS, or MPI is missing.
+        When `count` is not an integer from 1 to MAX_RANKS, or MPI is missing.
 
     """
     if type(count) is not int or not 1 <= count <= MAX_RANKS:

@@ -19,7 +19,7 @@ _BATCHES = 5  #: number of batches of timed calls; the first one warms up
 def network(comm: Comm) -> dict[str, float]:
     """Time reductions and messages; called by all ranks. Takes a few milliseconds.
 
-    All ranks send around a ring at the same time, like neighbours in a product. The
+    All ranks send around a ring simultaneously, as in the exchange of a product. The
     times are medians over batches.
 
     Returns

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: Arrays of up to this size are gathered and added in the order of the ranks, so that
-#: all ranks round alike. Longer ones go through Allreduce.
+#: rounding is the same on all ranks. Allreduce sums longer arrays.
 MAX_ORDERED_SUM = 64
 
 #: Parts of the time of a solve: products with local operators; packing and unpacking of
@@ -146,7 +146,7 @@ class Ranks:
     def clocked(self, part: str) -> _Clock:
         """Return a context that adds its time to one of the `PARTS`.
 
-        The time of contexts nested in it counts for their parts only.
+        The time of nested contexts counts only for their own parts.
         """
         return _Clock(self.seconds, part)
 
@@ -162,7 +162,7 @@ def single_process() -> Ranks:
 
 
 class _SingleProcess:
-    """The communicator of a single process, which has no other rank."""
+    """Communicator of a single process without other ranks."""
 
     size = 1
     rank = 0
@@ -191,7 +191,7 @@ class _SingleProcess:
 class _Clock:
     """Timer of a block for one part, without the time of nested blocks.
 
-    It is a class because a generator context costs a few times as much.
+    It is a class because a generator-based context is a few times slower.
     """
 
     __slots__ = ("before", "part", "seconds", "start")
@@ -200,7 +200,7 @@ class _Clock:
         self.seconds, self.part = seconds, part
 
     def __enter__(self) -> None:
-        # nested blocks add their time to the same table: it is subtracted at the end
+        # nested blocks add to the same table; their time is subtracted at the end
         self.before = sum(self.seconds.values())
         self.start = perf_counter()
 

@@ -16,7 +16,7 @@ from mortarbench.harness.environment.noise import NoiseFloor
 MIN_MEMORY_MIB = 2048
 MAX_QUIET_LOAD = 0.5  #: largest load of other programs: one-minute average, in cores
 MAX_CLOCK_STEP_SECONDS = 1e-6
-#: difference that 95 % of the pairs of equal measurements do not exceed
+#: Difference that 95 % of the pairs of equal measurements may have at most.
 MAX_PAIR_SCATTER = 0.10
 MAX_RATIO_BIAS = 0.01  #: deviation of an A/A ratio from 1 that is ignored
 ONE_THREAD = (
@@ -49,7 +49,7 @@ class Check:
 
 
 def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
-    """Check everything that measured times depend on.
+    """Check everything on which measured times depend.
 
     environment : result of `harness.environment.environment.capture`
     """

@@ -1,7 +1,7 @@
 """Environment of a measurement: machine, versions, source, threads and BLAS.
 
-It is plain data without host names, user names and absolute paths, so that a result
-folder can be passed on to others.
+The result is plain data without host names, user names and absolute paths, so that
+result folders can be shared.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.registry import PluginFile
 
-#: packages that every measurement depends on, whatever the solver
+#: Packages that affect every measurement, whatever the solver.
 PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
 
 THREAD_VARIABLES = (
@@ -36,8 +36,8 @@ THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
 )  # fmt: skip
 
-#: libraries that contain a BLAS. The plain name comes last: shells around an optimised
-#: BLAS have the same one
+#: Libraries that contain a BLAS. The plain name is last: wrappers of an optimised BLAS
+#: have that name as well.
 BLAS_LIBRARIES = (
     ("libopenblas", "OpenBLAS"), ("libmkl", "MKL"), ("libblis", "BLIS"),
     ("libflexiblas", "FlexiBLAS"), ("libatlas", "ATLAS"), ("libsatlas", "ATLAS"),
@@ -73,7 +73,7 @@ def capture(
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
-    # libraries of plug-ins, or of a notebook, may be loaded as well: filtered by owner
+    # plug-ins or a notebook may have loaded other libraries: filter by owner
     pools = sorted(
         (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
         key=lambda p: (p["library"], p["owner"]),
@@ -126,7 +126,7 @@ def capture_in(
     plugins: Iterable[str | Path | PluginFile] = (),
     packages: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Describe the environment of a new process with some variables set, like workers.
+    """Describe the environment of a new process, with environment variables set.
 
     A new process is needed because libraries read their thread variables once, when
     they are loaded.
@@ -187,7 +187,7 @@ def source(root: Path) -> dict[str, Any] | None:
         commit = git("rev-parse", "HEAD").decode().strip()
         if not git("status", "--porcelain", "--", *_CODE):
             return {"commit": commit, "dirty": False, "changes": None}
-        # an external diff tool of the user's would change the digest
+        # an external diff tool configured by the user would change the digest
         changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]
         listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
         for name in sorted(listed.split(b"\0")):
@@ -209,10 +209,10 @@ def system_blas(
 ) -> str | None:
     """Return the BLAS that CHOLMOD uses, such as "OpenBLAS 0.3.21 (pthreads)".
 
-    Wheels contain a BLAS of their own, which CHOLMOD does not call: libraries in
-    site-packages are ignored, except those of scikit-sparse. A system library libblas
-    is the reference BLAS only if no optimised one is loaded: in Debian's alternatives
-    system, libblas.so.3 can be a thin shell around OpenBLAS or MKL.
+    CHOLMOD does not call the BLAS in other packages' wheels: libraries in site-packages
+    are ignored, except those of scikit-sparse. A system library libblas is the
+    reference BLAS only if no optimised one is loaded: in Debian's alternatives system,
+    libblas.so.3 can be a wrapper of OpenBLAS or MKL.
 
     mapped : absolute paths, as in /proc/self/maps
     pools : entries ``threads.pools`` of `capture`

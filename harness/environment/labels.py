@@ -7,7 +7,7 @@ from typing import Any
 
 from mortarbench.harness.errors import shortened
 
-Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
+Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 
 _MAX_VALUE_CHARACTERS = 48
 _MAX_LISTED = 3  #: number of differences that are spelt out
@@ -58,7 +58,7 @@ def named(key: str) -> str:
 
 
 def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
-    """Return a list of differences in words; the first few, and the number of others.
+    """Describe the first few differences in words, and count the others.
 
     one, other : words that distinguish the two values, such as "then" and "now"
 

@@ -1,7 +1,7 @@
 """Noise floor of a machine, by an A/A comparison.
 
-A fixed kernel is timed against itself in pairs, in the same way as solvers are compared
-in blocks. Smaller differences between two solvers are noise.
+A fixed kernel is timed against itself in pairs, just as solvers are compared in blocks.
+A difference between two solvers that is smaller than this noise is not significant.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class NoiseFloor:
     clock_seconds: float  #: smallest observed step of the clock
     kernel_seconds: float  #: median time of the kernel
     pairs: int  #: number of pairs
-    ratio: float  #: exp of the median log ratio of pairs; 1 except for noise
+    ratio: float  #: exp of the median log ratio of pairs; 1 without noise
     low: float  #: lower end of the ratio's 95 % bootstrap interval
     high: float  #: upper end
     one_pair: float  #: relative difference that 95 % of the single pairs do not exceed
@@ -59,7 +59,7 @@ def noise_floor(
                 v /= np.abs(v).max()
             return clock() - start
 
-        timed()  # discarded: it finds cold caches
+        timed()  # discarded, since caches are cold
         arms: tuple[list[float], list[float]] = ([], [])
         end = clock() + seconds
         while clock() < end or not arms[0]:

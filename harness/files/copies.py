@@ -1,9 +1,9 @@
 """Copies of the files that cases are read from: ``FOLDER/files/DIGEST.SUFFIX``.
 
-Result folders are self-contained: they have copies of the files of QPs, one per
-content, unless these are too large. ``files/copies.json`` lists the paths in the names
-of cases, including files that were too large. These texts are only compared with names
-of cases, and never opened as paths.
+A result folder is self-contained: it has a copy of each file that defines a QP, one per
+content, unless the files are too large. ``files/copies.json`` lists the paths in the
+names of cases, including files that were too large. These paths are only compared with
+the names of cases, and never opened.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def content_digest(*paths: Path) -> str:
     Raises
     ------
     InputError
-        When one cannot be read, is not a regular file, or is larger than
+        When a file cannot be read, is not a regular file, or is larger than
         `harness.files.datafile` allows.
 
     """
@@ -76,7 +76,7 @@ class Copies:
         self._folder = folder / FOLDER
 
     def locate(self, source: SourceFile) -> Path:
-        """Return the original if its content has the digest, and otherwise the copy.
+        """Return the path of the original if it has the digest, otherwise of the copy.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class Copies:
         if here == source.sha256:
             return Path(source.path)
         name = f"{source.sha256}{source.suffix}"
-        if not _COPY.fullmatch(name):  # it could lead out of the folder
+        if not _COPY.fullmatch(name):  # a path separator could lead out of the folder
             raise InputError(
                 f"{shortened(source.path)}: {shortened(source.sha256)!r} is not a "
                 f"digest; expected {_DIGITS} hex digits"

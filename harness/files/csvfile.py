@@ -1,8 +1,8 @@
 """CSV tables that are safe to open in spreadsheets.
 
 Spreadsheets interpret a cell that begins with ``=``, ``+``, ``-`` or ``@`` as a
-formula, and control characters may end a cell or change its direction. Numbers are
-written as they are; a text that would be a formula is prefixed with an apostrophe.
+formula. Control characters may end a cell or change its direction. Numbers are written
+unchanged; a text that would be a formula is prefixed with an apostrophe.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Put an apostrophe before a text that a spreadsheet would evaluate.
+    """Prefix a text that a spreadsheet would evaluate with an apostrophe.
 
-    Characters that programs may skip before the sign are skipped here as well.
+    Characters that programs may skip before the sign are skipped here too.
     """
     for char in text:
         if char in _FORMULA:

@@ -1,8 +1,8 @@
 """Atomic replacement of files, and messages for full disks.
 
 A process may be killed, and a disk may become full, at any time. A file that is being
-replaced has either its old or its complete new content. For files that grow line by
-line see `harness.files.lines`.
+replaced contains either its old or its complete new content. For files that grow line
+by line, see `harness.files.lines`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _MIB = 2**20
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a new file that replaces `path` at the end of the block.
 
-    The new file is first flushed to the disk. After a crash, `path` is either the old
-    file or the complete new one. Processes that have opened or mapped the old file keep
-    it.
+    The new file is flushed to the disk before it is renamed. After a crash, `path` is
+    either the old file or the complete new one. Processes that have opened or mapped
+    the old file keep it.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:

@@ -49,11 +49,11 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
 
 
 class Lines:
-    """The only writer of a file of lines.
+    """Sole writer of a file of lines.
 
-    It keeps a digest of the content, to detect edits by other programs. The digest is
-    compared whenever the times of the file are not those of the last write here, and at
-    the end. It is in memory only: lines may be edited between two runs.
+    It keeps a digest of the content in memory to detect edits by other programs. The
+    digest is compared at the end, and whenever the file has other time stamps than the
+    last write left. Edits between two runs are allowed.
 
     restored : called with a message when the file had to be written again
     """
@@ -92,8 +92,8 @@ class Lines:
     def restore(self) -> None:
         """Write the file again if it was deleted or replaced since it was opened.
 
-        The file that is held open still has the content, whatever its name refers to.
-        Lines of a file that has replaced it are kept.
+        The open descriptor still refers to the old content. Lines of a replacement file
+        are kept.
 
         Raises
         ------

@@ -41,8 +41,8 @@ class _PickledError(ValueError):
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a file that can be mapped.
 
-    An existing file is replaced, not overwritten: truncating a file would kill the
-    processes that have mapped it by SIGBUS.
+    An existing file is replaced, not truncated: truncation would end the processes that
+    have mapped it, with SIGBUS.
     """
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
@@ -139,7 +139,7 @@ def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one member, and not a byte more than it declared."""
+    """Read one member, and no more bytes than its header declares."""
     with archive.open(member) as file:
         shape, fortran, dtype = _header(file)
         count = _count(shape, dtype, member.file_size - file.tell())

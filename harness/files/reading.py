@@ -1,9 +1,9 @@
 """Reading of text files from untrusted sources, within limits.
 
-A file has to be regular (a device or a pipe may have no end), to have the size that it
-declares (files in /proc declare none), to be UTF-8 and not larger than a limit that
-users can raise, and data must not be nested too deeply. All functions raise
-`InputError` with the place and the expected content.
+A file must be regular (a device or a pipe may not end), have the size that it declares
+(files in /proc declare none), be UTF-8, and not exceed a limit that users can raise.
+Its data must not be nested too deeply. All functions raise `InputError` with the place
+and the expected content.
 """
 
 from __future__ import annotations

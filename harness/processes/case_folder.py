@@ -1,8 +1,8 @@
 """Cache of built cases on disk, shared by the processes of a run.
 
 ``FOLDER/DIGEST.npz`` contains a QP and is named after the digest of its content.
-``FOLDER/KEY.json`` maps a case to such a file; the key is a digest of the case and of
-the environment it was built in, so another version of the code builds its own. Every
+``FOLDER/KEY.json`` maps a case to such a file. The key is a digest of the case and of
+the environment of its build, so that each version of the code has its own entry. Every
 file is stored with a digest, and a case whose file is damaged is built again. Digests
 are not signatures: anyone who can write to the folder can store another QP under the
 name of a case (docs/security.md).

@@ -54,10 +54,11 @@ from mortarbench.harness.verify.measure import memory_mib, reset_peak
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
 MAX_STORED_BOUNDS = 10_000  #: number of points whose error bounds are cached
-#: s. The first dual case of a process is built twice if its first build took less:
-#: first calls (page faults, caches, late imports) took 12 of the 14 ms of dualising the
-#: smallest demo case, and would be charged to its form; imports alone may take a
-#: second. Relative to ten seconds these costs are negligible, a second build is not.
+#: The first dual case of a process is built again if its build took less than this
+#: time, in s. First calls (page faults, caches, late imports) took 12 of the 14 ms of
+#: dualising the smallest demo case; imports alone may take a second. Without a second
+#: build they would be charged to the dual form. Relative to ten seconds, they are
+#: negligible, whereas a second build is not.
 MAX_WARM_UP_SECONDS = 10.0
 
 

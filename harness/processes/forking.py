@@ -1,10 +1,11 @@
 """Workers forked from the parent, instead of started as new interpreters.
 
-Loading numpy and scipy takes half a second of CPU time, which a fork saves. Like a
-worker started by its command, a forked one runs below a sub-reaper
+A fork saves half a second of CPU time for loading numpy and scipy. Like a worker
+started by its command, a forked one runs below a sub-reaper
 (`harness.processes.reaper`), in its own session, on one CPU, with no open files except
-its log and its two pipes. It starts with a copy of the parent's memory; so it is forked
-before anything is read or built, and only by a parent with one thread (`is_safe`).
+its log and its two pipes. Since it starts with a copy of the parent's memory, it is
+forked before anything is read or built, and only by a parent with one thread
+(`is_safe`).
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ def fork(
 ) -> Fork:
     """Fork a worker; the caller has checked that this `is_safe`.
 
-    cpu, pipes : as for `reaper.supervise`; `serve` is called with the pipes
+    cpu, pipes : see `reaper.supervise`; `serve` is called with the pipes
     log : file descriptor of its standard output and error
     environment : variables to set in the worker
     """

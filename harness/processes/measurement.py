@@ -43,13 +43,14 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-#: CPU time of the harness between "start" and "timed" that the worker's clock excludes
+#: Largest CPU time of the harness between "start" and "timed" that the worker's clock
+#: excludes.
 HARNESS_SECONDS = 0.005
-#: the same per repeat; 0.12 ms were seen on a busy machine, and no solver is to be
-#: suspected because of it
+#: The same, per repeat. On a busy machine 0.12 ms were measured; the margin avoids
+#: false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor and also by the time below: the ratio of two tiny times alone proves nothing.
+#: factor, and also by one of the times below, since a ratio of tiny times is noise.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
 MIN_GAIN_SECONDS = 1e-3  #: smallest gain between the solves of one measurement
 MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: smallest gain between two measurements

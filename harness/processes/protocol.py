@@ -5,13 +5,12 @@ events. It ends when the pipe of requests is closed.
 
 * ``{"event": "ready"}`` is sent once, when the process accepts requests.
 * ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
-* Every other request is answered by ``{"event": "start"}``, from which on the parent
-  times it, and ``{"event": "done", …}`` with the answer. In a measurement,
-  ``{"event": "timed"}`` comes between them when the worker's clock has stopped; the
-  worker then waits for a line, so that the parent can read its CPU time before it does
-  anything else. Ranks that emit the QP of a case send ``{"event": "emitted", …}``
-  before "start", and ``{"event": "measured"}`` after "timed", before they judge the
-  answer.
+* Every other request is answered by ``{"event": "start"}``, at which the parent starts
+  its clock, and by ``{"event": "done", …}`` with the answer. In a measurement,
+  ``{"event": "timed"}`` comes between the two events, when the worker's clock has
+  stopped. The worker then waits for a line, so that the parent can read its CPU time.
+  Ranks that emit the QP of a case send ``{"event": "emitted", …}`` before "start". They
+  send ``{"event": "measured"}`` after "timed", before they evaluate the answer.
 * ``{"event": "fault", "what": …}`` replaces any of these if our own code fails.
 
 A library that writes to the wrong file descriptor can mix other bytes into the replies;

@@ -2,16 +2,18 @@
 
 Runs start `launch` in place of a worker: it calls `mpiexec`, which starts the worker's
 command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
-of `harness.processes.worker` and communicates with the parent; the others follow its
-orders. Each rank has a CPU to itself while there are enough. The memory limit holds for
-the sum over all ranks, and all end when one ends.
+command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
+of `harness.processes.worker` and communicates with the parent; the others execute its
+orders. Each rank has its own CPU if there are enough. The memory limit applies to the
+sum over all ranks, and all ranks end when one of them ends.
 
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
 each rank returns its slice of the same solution.
 
-Copies are the baseline for ranks: each rank solves the entire QP independently, at the
-same time as the others. The slowest determines the measured time.
+As a baseline, ranks can also solve copies: each rank solves the entire QP
+independently, at the same time as the others. The slowest rank determines the measured
+time.
 """
 
 from __future__ import annotations
@@ -132,8 +134,8 @@ class _RankExits:
     def first(self, mpiexec: int) -> str:
         """Wait until mpiexec has ended; describe the exit of the first rank that ended.
 
-        After it the others have `PEER_TIMEOUT` to end, whatever its exit code. Return
-        "" if mpiexec was the first to end.
+        The other ranks then have `PEER_TIMEOUT` to end, whatever the exit code of the
+        first. Returns "" if mpiexec was the first to end.
         """
         mpi, deadline = os.pidfd_open(mpiexec), np.inf
         self._events.register(mpi, EPOLLIN)
@@ -254,8 +256,8 @@ def follow(
             elif run is not None and share is not None:
                 solution, _ = _solve_on_ranks(run, share, ranks)
         except BaseException as e:
-            # If rank 0 failed as well, it reports that and sends its next order. If no
-            # order comes, it still waits for this rank.
+            # If rank 0 failed too, it reports the failure and sends its next order. If
+            # no order comes, rank 0 still waits for this rank.
             if _wait_for_order(ranks, PEER_TIMEOUT):
                 continue
             abort(ranks, e)

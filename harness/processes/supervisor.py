@@ -537,9 +537,9 @@ class WorkerProcess:
     def _stays_busy(self) -> bool:
         """Return True if threads of the worker continue to compute after its answer.
 
-        Threads of pools spin for a while before they sleep, for which `SETTLE_SECONDS`
-        are allowed. State "R" alone is no evidence: on a busy machine, a thread that
-        waits for a CPU has it too. So CPU time decides.
+        Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`. Only
+        CPU time decides, not state "R": on a busy machine, a thread that waits for a
+        CPU has this state too.
         """
         deadline = time.monotonic() + SETTLE_SECONDS
         pause, used = POLL_SECONDS / 100, self._cpu_seconds()
@@ -664,7 +664,7 @@ class _WorkerEndError(Exception):
     """End of a worker before an expected event.
 
     event : the expected one
-    verdict : on the solver, if the solve had started
+    verdict : verdict on the solver, if the solve had started
     number : signal that ended it, or 0
     stage : prefix of the message
     """
@@ -707,9 +707,9 @@ _ALLOCATION_FAILURE = re.compile(
 def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     """Return True if a failure is due to lack of memory.
 
-    Solvers react to it by an exception, an abort, a segmentation fault, a hang or a
-    wrong result. It shows in their peak memory or, if a single allocation was refused,
-    in the message of the library.
+    A solver that lacks memory raises, aborts, crashes, hangs or returns a wrong result.
+    The evidence is its peak memory or, if a single allocation was refused, the message
+    of the library.
 
     message : message of the failure, including the last line of output
     limit : MiB

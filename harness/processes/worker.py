@@ -10,14 +10,14 @@ requests:
   ``sample_seconds``, see `harness.verify.measure`. ``step`` 0, 1, … of a sequence.
   ``tightens``: true if each step of the sequence has its own tolerance
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks that emit
-  the QP of a case themselves (`harness.plugin.Family.emission`), after that of
-  ``first``, another case, if the request has this entry; and, if ``source`` is
-  "ranks", evaluate the answer together. The event ``emitted`` contains the ``sizes``
-  and the ``digest`` of the QP; ``measured`` follows when the point is written
+  the QP of a case themselves (`harness.plugin.Family.emission`). If the request has the
+  entry ``first``, the ranks emit that case before. If ``source`` is "ranks", they also
+  evaluate the answer together. The event ``emitted`` contains the ``sizes`` and the
+  ``digest`` of the QP; ``measured`` follows when the point is written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads its QP again, so that changes which a solver made to its arrays
-cannot carry over.
+Every measurement loads its QP again, so that a solver that modifies its arrays does not
+affect later measurements.
 """
 
 from __future__ import annotations
@@ -100,8 +100,7 @@ class _SolverHost:
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
         self._last_step = -1  # last step of the sequence
-        # inode, size and time of the file, by the digest that its content was found to
-        # have
+        # inode, size and time of each verified file, by the digest of its content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
         self.parallel: ParallelSolver | None = (
@@ -137,11 +136,11 @@ class _SolverHost:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        # Move the arrays between measurements. Their alignment to cache lines is random
-        # but would stay the same as long as the process runs: times of two processes of
+        # Move the arrays between measurements. Their alignment to cache lines is
+        # random, but fixed as long as the process runs: the times of two processes of
         # one solver then differ by 10 % and more, however often they are measured
-        # (Mytkowicz et al., ASPLOS 2009). Varied, this bias becomes scatter, which
-        # confidence intervals contain.
+        # (Mytkowicz et al., ASPLOS 2009). With varied alignment this bias becomes
+        # scatter, which confidence intervals include.
         self._ballast = np.empty(0)
         with suppress(AttributeError):  # glibc only
             # otherwise the allocator reuses freed blocks at their old addresses

@@ -1,8 +1,9 @@
 """Faults of the harness or the machine, in ``FOLDER/faults.jsonl``.
 
-A fault prevents a measurement and implies nothing about the solver, so it is not in the
-journal. Each is one line, written like those of the journal. The measurement counts as
-missing until the journal contains it, and the same command retries it.
+A fault prevents a measurement and implies nothing about the solver, so it is not
+written to the journal. Each fault is one line, in the format of the journal. The
+measurement counts as missing until the journal contains it, and the same command
+retries it.
 """
 
 from __future__ import annotations

@@ -253,7 +253,7 @@ def _open_lock(folder: Path) -> int:
     The content of the lock file marks the folder as one of ours: a run that was killed
     at once leaves nothing else by which it could be recognised.
     """
-    # a link in place of the lock would have a file elsewhere written
+    # if the lock were a link, a file elsewhere would be overwritten
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     while True:  # until the locked file is the one at the path
         fd = os.open(folder / _LOCK, flags, 0o666)
@@ -324,7 +324,7 @@ def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
 def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
     """Refuse a folder of another suite or environment.
 
-    environment : as for `claim`
+    environment : see `claim`
 
     Returns
     -------

@@ -1,11 +1,11 @@
 """Merging of result folders: every measurement once, environments kept apart.
 
 A measurement is identified by its run_id and its environment. If two folders contain
-the same one, that of the first folder is kept. Measurements of one run_id in different
-environments are all kept; the later ones get a new run_id, a digest of both.
+the same measurement, that of the first folder is kept. Measurements with one run_id in
+different environments are all kept; later ones get a new run_id, a digest of both.
 
-The journal of the new folder is written last and as a whole, and nothing counts as a
-part of the folder before that: the same command repeats a merge that was killed.
+The journal of the new folder is written last, as a whole. Until then nothing counts as
+part of the folder, so that the same command repeats a merge that was killed.
 """
 
 from __future__ import annotations

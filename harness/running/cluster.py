@@ -401,8 +401,8 @@ def _delay_interrupt() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     received = []
 
-    # The mask holds for this thread only: the kernel may deliver the signal to another
-    # thread, and Python then runs its handler in this one.
+    # The mask holds for this thread only. The kernel may deliver the signal to another
+    # thread, and Python then runs the handler in this one.
     def delay(*_: object) -> None:
         received.append(signal.SIGINT)
         signal.signal(signal.SIGINT, before)

@@ -100,7 +100,7 @@ class Executor:
                 yield BuildFailure(block=block, reason=e.reason, trace=e.trace)
 
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
-        """Measure one solver; after a fault that is not its own, retry once.
+        """Measure one solver; retry once after a fault that the solver did not cause.
 
         All steps of a sequence are repeated, because the data that the solver carried
         are lost; no result is yielded twice.

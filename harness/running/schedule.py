@@ -3,10 +3,10 @@
 The design consists of complete randomised blocks. A block is every solver once on one
 case (or one sequence) at one tolerance, in random order; every second block has the
 reverse order of the previous one. If the suite sets a precision, blocks continue beyond
-its repeats until the interval of every verified solver's ratio to the fastest
-(`harness.running.pairs`) is that narrow, or a limit is reached. The rule is fixed in
-the suite before the first measurement and depends on the journal alone, so a resumed
-run stops where an uninterrupted one does.
+its repeats until every confidence interval of a ratio between a verified solver and the
+fastest one (`harness.running.pairs`) is narrow enough, or a limit is reached. The rule
+is fixed in the suite before the first measurement and depends only on the journal, so a
+resumed run stops where an uninterrupted one does.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class Blocks:
 
 
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
-    """Return the Euclidean norm (k,) of each row of (k, d), in the precision of it."""
+    """Return the Euclidean norm (k,) of each row of (k, d), in its precision."""
     return np.asarray(np.linalg.norm(blocks, axis=1))
 
 

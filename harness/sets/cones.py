@@ -96,7 +96,7 @@ class Cones(Blocks):
         return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the distances of z to polar cones at apices, to rays elsewhere.
+        """Return the distances of z to normal cones: polar cones at apices, else rays.
 
         A block shorter than `tol` times the longest block counts as the apex.
         """

@@ -6,9 +6,9 @@ residuals, verdicts, transforms and files use the operations below, and do not d
 the kind of a set.
 
 A vector z is normal to S at x ∈ S if zᵀ(y − x) ≤ 0 for all y ∈ S. With the support
-function σ(z) = sup zᵀy over y ∈ S, this is  σ(z) − zᵀx = 0,  where the left-hand side,
-the support gap, is nonnegative for x ∈ S (Rockafellar 1970, Theorem 23.5). For a box it
-is the sum of the complementarity terms, multiplier times distance to the bound.
+function σ(z) = sup zᵀy over y ∈ S, this means  σ(z) − zᵀx = 0.  The left-hand side, the
+support gap, is nonnegative for x ∈ S (Rockafellar 1970, Theorem 23.5). For a box it is
+the sum of the complementarity terms, multiplier times distance to the bound.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ S = TypeVar("S", bound="ConvexSet")
 
 
 class Limits(NamedTuple):
-    """Scalar constraints at a point; the slack is nonnegative where they hold."""
+    """Scalar constraints at a point; the slack is nonnegative if they are satisfied."""
 
     slack: Vector  #: distance to the limit, negative outside
     size: Vector  #: absolute value of the limit

@@ -1,9 +1,9 @@
 """Permitted changes of a suite with a result folder, and unions of suites.
 
-A suite may only ask for more: solvers, cases and tolerances may be added, repeats
+A suite may only be extended: solvers, cases and tolerances may be added, repeats
 raised, and a precision set or tightened. Limits, accuracy and the solver behind a label
-must stay, because the stored measurements depend on them. Suites that agree in these
-can be united.
+must not change, because the stored measurements depend on them. Suites that agree in
+these settings can be united.
 """
 
 from __future__ import annotations

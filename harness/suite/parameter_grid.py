@@ -33,7 +33,7 @@ class Problems:
 
     cold: tuple[CaseId, ...]
     sequences: tuple[tuple[CaseId, ...], ...]
-    growing: Mapping[str, Growth]  #: by name of the case; only those of growing series
+    growing: Mapping[str, Growth]  #: position of each case of a growing series, by name
 
 
 def expand_problems(

@@ -175,7 +175,7 @@ def _next(
 def _solved(mechanics: Mechanics, active: ActiveSet) -> tuple[Extended, Extended]:
     """Solve with equality on the closed rows; return u (n,) and multipliers (m,)."""
     exact, motions, closed = mechanics.exact, mechanics.motions, active.closed
-    R = motions.felt
+    R = motions.constrained
     close = closing(mechanics, closed)
     lam = active.at_bounds(np.zeros(exact.c.size, dtype=Real))
     alpha = np.zeros(R.shape[1], dtype=Real)

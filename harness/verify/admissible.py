@@ -30,7 +30,7 @@ from mortarbench.harness.mechanics import (
     Extended,
     Mechanics,
     Real,
-    felt_first,
+    constrained_first,
 )
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.sets.blocks import norms
@@ -146,11 +146,11 @@ def _nearest(
     """Return the map from t (v,) to the δ of least energy norm with B_V δ = −t."""
     B_V = mechanics.rows[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
-    felt = mechanics.motions.felt.astype(np.float64)
+    constrained = mechanics.motions.constrained.astype(np.float64)
 
     def step(t: Vector) -> Vector:
-        mu, alpha = solve(t, np.zeros(mechanics.motions.felt.shape[1]))
-        return np.asarray(felt @ alpha - inverse(B_V.T @ mu))
+        mu, alpha = solve(t, np.zeros(mechanics.motions.constrained.shape[1]))
+        return np.asarray(constrained @ alpha - inverse(B_V.T @ mu))
 
     return step
 
@@ -232,8 +232,8 @@ def closing(
     compliance = exact.compliance[V].astype(np.float64)
     scale = 1 / np.sqrt(np.where(compliance > 0, compliance, 1.0))
     B_V = csr_array(diags_array(scale) @ mechanics.rows[V])
-    R = motions.felt.toarray().astype(np.float64)
-    turn, p = felt_first(B_V, R)
+    R = motions.constrained.toarray().astype(np.float64)
+    turn, p = constrained_first(B_V, R)
     U, T = np.linalg.qr((B_V @ R) @ turn[:, :p])
     F = _compliance(mechanics, B_V, U)
     FU = np.stack([F(g) for g in U.T], axis=1) if p else U
@@ -299,7 +299,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
     return Balance(
         motions.G,
         np.asarray((abs(exact.B) @ motions.largest).toarray()),
-        motions.felt.T @ f,
+        motions.constrained.T @ f,
         motions.largest.T @ np.abs(f),
         motions.KR.T @ u,
         exact.forces,
@@ -348,8 +348,8 @@ def supported_and_floating(
     """Split the space of rigid motions (p,) into supported and floating ones.
 
     A motion ν is supported if the rows with weights w ≤ 1 resist it. Returns
-    orthonormal bases (p, h) of supported and (p, p − h) of floating motions. On the
-    latter space, ‖√w Gν‖ is at most SUPPORT_THRESHOLD times its maximum.
+    orthonormal bases (p, h) of supported and (p, p − h) of floating motions. On
+    floating motions, ‖√w Gν‖ is at most SUPPORT_THRESHOLD times its maximum.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])

@@ -305,7 +305,7 @@ def sharpest(
     Raises
     ------
     UncertifiableError
-            When no pair proves a bound; the message contains the first reason.
+        When no pair proves a bound; the message contains the first reason.
 
     """
     outcomes = list(tried)

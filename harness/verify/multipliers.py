@@ -232,7 +232,7 @@ def _fitted(
             z[rows] = pull[: rows.size]
     r = g + qp.A.T @ (y - s.y) + qp.G.T @ (z - s.z)
     z_box = s.z_box
-    if "z_box" in unknown:  # each component by itself
+    if "z_box" in unknown:  # each component separately
         balanced = _share(np.maximum(r, 0), lower, scales)
         z_box = _share(np.maximum(-r, 0), upper, scales) - balanced
         z_box[is_fixed] = -r[is_fixed]

@@ -34,7 +34,7 @@ from mortarbench.harness.mechanics import (
     Real,
     Substructures,
     cancelling,
-    felt_first,
+    constrained_first,
     friction_discs,
 )
 from mortarbench.harness.qp import Vector
@@ -83,9 +83,7 @@ class FloatingBodies:
     of all ranks.
     """
 
-    motions: (
-        csr_array  #: (n, k) rigid motions of each body in turn, regardless of supports
-    )
+    motions: csr_array  #: (n, k) rigid motions, body by body, regardless of supports
     #: (k, r) coefficients of motions that do not move prescribed components
     combinations: NDArray[np.float64]
     names: tuple[str, ...]  #: names of these bodies
@@ -401,7 +399,7 @@ def _rigid_motions(
     R = csr_array(
         diags_array(free) @ floating.motions @ csr_array(floating.combinations)
     )
-    turn, p = felt_first(local.contact.rows[:, at], at_components(R))
+    turn, p = constrained_first(local.contact.rows[:, at], at_components(R))
     R = _orthonormal(local, csr_array(R @ csr_array(turn)))
     largest, R_at = _largest(local, R), at_components(R)
     f = reduction.completed(parts.spread.T @ local.f.astype(Real))
@@ -413,14 +411,14 @@ def _rigid_motions(
         why = driven(reduction.along(floating.motions, R @ along_free), floating.names)
     local_motions = csr_array(parts.kernel.T @ (parts.spread @ R.astype(np.float64)))
     together = [reduction.gathered(column) for column in local_motions.toarray().T]
-    felt = R_at[:, :p]
+    constrained = R_at[:, :p]
     return _RigidMotions(
         R,
-        felt.astype(np.float64),
+        constrained.astype(np.float64),
         np.stack(together, axis=1),
         Balance(
-            np.asarray(exact.B @ felt),
-            np.asarray(abs(exact.B) @ np.where(felt, largest[:p], 0)),
+            np.asarray(exact.B @ constrained),
+            np.asarray(abs(exact.B) @ np.where(constrained, largest[:p], 0)),
             along[:p],
             (reduction.along(R != 0, size) * largest)[:p],
             np.zeros(p, dtype=Real),

@@ -72,7 +72,7 @@ def reference_point(
     Raises
     ------
     UnsolvedError
-            When no admissible pair is found, or `solve` fails.
+        When no admissible pair is found, or `solve` fails.
 
     """
     mechanics = mechanics.whole
@@ -139,7 +139,10 @@ def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
     displacement without contact.
     """
     inverse = mechanics.inverse
-    R, exact = mechanics.motions.felt.toarray().astype(np.float64), mechanics.exact
+    R, exact = (
+        mechanics.motions.constrained.toarray().astype(np.float64),
+        mechanics.exact,
+    )
     f, B = -mechanics.primal.q, mechanics.rows
     m = exact.c.size
     if not m or (m > MAX_DENSE_ROWS and not R.shape[1]):

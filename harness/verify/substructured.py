@@ -218,7 +218,7 @@ class _Stored(ABC):
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
         motions = mechanics.motions
-        self.R = csr_array(hstack([motions.felt, motions.free]))
+        self.R = csr_array(hstack([motions.constrained, motions.free]))
 
     @abstractmethod
     def spread(self, u: Extended) -> Extended: ...
@@ -252,7 +252,7 @@ class _Stored(ABC):
         Ku = times_columns(K.data, K.indices, K.indptr, deformed, u.size)
         square = float(deformed @ Ku)
         if motions.KR.shape[1]:
-            Ku += motions.KR @ (motions.felt.T @ u)
+            Ku += motions.KR @ (motions.constrained.T @ u)
         return self.free(Ku), square, deformed
 
     def pulled(self, multipliers: Extended) -> Extended:
@@ -320,7 +320,7 @@ class Undivided(_Stored):
         """Return bounds of ER, which is KR up to the projection P."""
         motions = self.mechanics.motions
         along = np.abs(
-            supported.T @ np.asarray(motions.felt.T @ motions.KR) @ supported
+            supported.T @ np.asarray(motions.constrained.T @ motions.KR) @ supported
         )
         strain = [length(self, motions.KR @ k) for k in supported.T]
         return Rounding(np.array(strain), along.astype(np.float64))

@@ -22,7 +22,7 @@ from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000  #: bootstrap resamples; a tail of 2.5 % then consists of 50 of them
-ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] around 1 counts as "no change seen"
+ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
 
@@ -78,7 +78,7 @@ class Pair:
 
     @property
     def turn(self) -> int:
-        """1: the verdict became worse, -1: better, 0: it did not change."""
+        """1: the verdict became worse, -1: it became better, 0: it did not change."""
         a, b = (SEVERITY.index(o.verdict) for o in (self.after, self.before))
         return (a < b) - (a > b)
 
@@ -236,10 +236,10 @@ def _over_cells(changes: Iterable[tuple[Pair, float | None]]) -> Mean | None:
 def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     """Average logarithms of ratios over cells, with a bootstrap interval over cells.
 
-    A cell is resampled as a pair, before with after. Percentile intervals of n values
-    are too narrow by the factor √((n−1)/n), and because they have normal instead of
-    Student's tails; the distances of their ends from the mean are multiplied by both
-    factors [1]_. The names of the cells seed the generator. Below three cells the
+    A cell is resampled as a pair of the times before and after. Percentile intervals of
+    n values are too narrow, by the factor √((n−1)/n) and because their tails are normal
+    instead of Student's. The distances of their ends from the mean are multiplied by
+    both factors [1]_. The names of the cells seed the generator. Below three cells the
     interval is unbounded.
 
     References

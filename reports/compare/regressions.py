@@ -1,10 +1,10 @@
 """Solvers that became slower, with enough certainty to fail a CI job.
 
-Two runs of the same code differ, because the speed of the machine varies in time and
-not equally for every case. A slowdown is therefore reported only if two intervals lie
-entirely above 1: that of the ratio after / before, and that of the ratio relative to
-the other solvers of the same blocks, in which a common slowdown cancels. Both are
-unpaired between the folders, which are different sessions.
+Two runs of the same code differ, because the speed of the machine varies in time, and
+differently for each case. A slowdown is therefore reported only if two intervals lie
+entirely above 1: that of the ratio after / before, and that of this ratio relative to
+the other solvers in the same blocks, which cancels a common slowdown. Both intervals
+are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases, at least three, with Student's interval
   over them. Their scatter includes the differences between runs on one case.

@@ -24,8 +24,9 @@ def write_comparison(
 ) -> tuple[list[str], list[Path]]:
     """Write AFTER/report/against-NAME, where NAME is the name of the folder `before`.
 
-    html: index.html. md: report.md. tex: tables/. csv, parquet: tables/changes, a row
-    per cell. The same journals give the same bytes.
+    The files are index.html for the format html, report.md for md, tables/ for tex, and
+    tables/changes with a row per cell for csv and parquet. Equal journals give files of
+    equal bytes.
 
     factor : verdicts are those at factor·tol, in both folders
 

@@ -21,7 +21,7 @@ def source(*outcomes: Outcome) -> str:
 
 
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
-    """Return a cell of a verdict, with the number of repeats that have it.
+    """Return a cell of a verdict, with the number of repeats with this verdict.
 
     message : message of the solver, shown on hovering
     """

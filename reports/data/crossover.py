@@ -2,8 +2,8 @@
 
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
 fastest of the solvers that were measured on it; the primal form with multigrid is a
-route of its own. Cases of a growing series are built anew for each repeat, so that
-everything between the mesh and the recovered displacements is charged:
+separate route. Cases of a growing series are built anew for each repeat, so that all
+work between the mesh and the recovered displacements is charged:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
 """
@@ -21,7 +21,7 @@ from mortarbench.reports.data.rank_series import base_label
 from mortarbench.reports.data.size_series import SIZES, SeriesKey, fixed_keys
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
-MULTIGRID = "pdas-amg"  #: solver that is a route of its own
+MULTIGRID = "pdas-amg"  #: solver that forms a separate route
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
 #: routes that a complete map contains, on one rank
@@ -30,7 +30,7 @@ PRIMAL = KINDS[:2]
 
 
 class Route(NamedTuple):
-    """A way from the mesh to the answer, whatever the solver."""
+    """A way from the mesh to the answer, independent of the solver."""
 
     kind: str  #: one of `KINDS`
     layout: str  #: keys of the decomposition, "feti=16"; empty without
@@ -47,7 +47,7 @@ class Stop(NamedTuple):
     """End of a route: the first size without a verified answer."""
 
     dofs: int | None  #: None if every size was verified
-    verdict: Verdict | None  #: of the solver that came farthest; None: not measured
+    verdict: Verdict | None  #: verdict of the best solver; None: not measured
     outcomes: tuple[Outcome, ...]  #: answers of all solvers at that size
 
 
@@ -100,7 +100,7 @@ class Crossover(NamedTuple):
     largest: int
     ratio: Ratio  #: time of the primal route relative to the dual one, at `largest`
     beyond: bool  #: True if the dual route reached larger sizes
-    answers: tuple[Outcome, Outcome]  #: at `largest`
+    answers: tuple[Outcome, Outcome]  #: answers of both routes at the size `largest`
 
 
 def charged_seconds(r: Record) -> float | None:
@@ -170,7 +170,7 @@ def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:
 
 
 def _inapplicable(answers: Mapping[int, Iterable[Outcome]]) -> bool:
-    """Return True if all solvers declined, such as undivided bodies on two ranks."""
+    """Return True if all solvers declined, as for undivided bodies on two ranks."""
     every = [o for of in answers.values() for o in of]
     return all(o.verdict is Verdict.DECLINED for o in every)
 
@@ -185,7 +185,7 @@ def _stop(
     if beyond is None:
         return Stop(None, None, ())
     ends = answers.get(beyond, ())
-    # repeats that ended differently have the worst verdict; solvers, the mildest
+    # among repeats, the worst verdict counts; among solvers, the mildest
     verdict = max(
         (o.verdict for o in ends if not o.verified), key=SEVERITY.index, default=None
     )

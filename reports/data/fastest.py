@@ -7,9 +7,9 @@ fastest only if every other competitor is significantly slower:
 - over at least `CASES` cases, if the interval of the ratio over the cases excludes 1;
 - over fewer cases, if on each of them the interval of the ratio within blocks does.
 
-Every interval has 95 % coverage by itself. If some competitor is not slower, its own
-interval must be wrong before the first is called the fastest; this intersection-union
-test needs no correction for the number of solvers [1]_.
+Every interval separately has 95 % coverage. If some competitor is not slower, its own
+interval must be wrong before the first solver is called the fastest; this
+intersection-union test needs no correction for the number of solvers [1]_.
 
 References
 ----------

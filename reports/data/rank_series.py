@@ -2,8 +2,8 @@
 
 Strong scaling is one case on more ranks. Weak scaling is a case that grows with the
 ranks, so that the work of each rank stays the same. Both are reported separately for
-preparation and solve, and compared with copies: as many simultaneous independent solves
-on the same machine, which share its memory as ranks do.
+preparation and solve, and compared with copies: the same number of simultaneous
+independent solves on the same machine, which share its memory as ranks do.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time at equal error: the time of a solver for an answer of given certified accuracy.
 
-The solves of a solver at several tolerances yield points (certified error, time).
+A solver is run at several tolerances, which yields points (certified error, time).
 Between these points the time is interpolated linearly in the logarithms, after isotonic
 regression, because a better answer does not take less time [1]_. Nothing is
 extrapolated.

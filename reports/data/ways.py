@@ -47,7 +47,7 @@ class Ways:
 def compare_ways(evidence: Evidence) -> Ways:
     """Compare the ways to solve the same problems, including dualisation.
 
-    A problem takes part if it was measured in several forms, or if its only form has a
+    A problem is included if it was measured in several forms, or if its only form has a
     time of dualisation; for others the comparison of solvers is equivalent.
     """
     problems: dict[str, list[Record]] = {}

@@ -25,7 +25,7 @@ from mortarbench.harness.plugin import SLIDING
 IN_CONTACT = 1e-6
 #: states of friction, numbered in VTU files
 STATES = ("open", "stick", "slip", SLIDING)
-#: by increasing priority, for nodes on several contact sides
+#: States by increasing priority, for nodes on several contact sides.
 _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
 

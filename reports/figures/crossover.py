@@ -40,7 +40,7 @@ LETTERS = {
 }
 FAILED = "f"  #: letter of all other verdicts
 UNMEASURED = "?"
-_HEIGHT = 2.75  #: of a row of panels, inches
+_HEIGHT = 2.75  #: height of a row of panels, inches
 _LIMIT = Look(colour=INK, width=0.7, dash=DOTTED)
 _BARS = {"cap": 2.2, "width": 0.9}
 

@@ -36,7 +36,8 @@ from mortarbench.reports.figures.projection import (
     visible_faces,
 )
 
-#: quantile of the nodal stresses at which colours end: stresses are singular at corners
+#: Quantile of the nodal stresses at the end of the colour scale, since stresses are
+#: singular at corners.
 PERCENTILE = 99.5
 SCALE = 1.0  #: factor of the displacement in figures drawn to scale
 #: Displacements below `SEEN` times the size of the bodies are not visible. They are

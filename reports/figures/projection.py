@@ -69,8 +69,8 @@ def visible_faces(
 ) -> Faces:
     """Return the faces (k, 4) towards the camera in tiles, back to front.
 
-    Faces may be large compared with the distance between bodies, tiles are not: the
-    order of faces would draw the part of one that lies behind another body over it.
+    Tiles are sorted by depth instead of faces. A face may be large compared with the
+    distance between bodies, so that sorting faces would draw hidden parts on top.
 
     values : (N,) colours at the nodes, bilinear within faces
     mesh : also outline each face

@@ -199,7 +199,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
 
 def _axis(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     """Set label and ticks."""
-    if axis.bare:  # a strip: its label stands at the side
+    if axis.bare:  # a strip: its label is at the side
         ticked.set_label_text(axis.label, rotation=0, ha="right", va="center", size=8.5)
     else:
         ticked.set_label_text(axis.label)

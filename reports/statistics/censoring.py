@@ -33,11 +33,11 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     """Estimate the mean of min(t, horizon): ∫ S dt from 0 to the horizon.
 
     S is the Kaplan-Meier estimate [1]_ of the share of cases that are unsolved at t. A
-    case that reached the time limit is censored: its t is known to be later. A refuted
+    case that reached the time limit is censored: its t exceeds the limit. A refuted
     answer, a crash and an iteration limit do not depend on time, so t is infinite. If
     every time limit is at the horizon, this is the plain mean of min(t, horizon). The
-    variance is that of [2]_, Σ (∫ₜᵢ S)²·dᵢ/(nᵢ(nᵢ − dᵢ)), times n/(n − 1); the interval
-    is Student's with n − 1 degrees of freedom, truncated at 0 and at the horizon.
+    variance is Σ (∫ₜᵢ S)²·dᵢ/(nᵢ(nᵢ − dᵢ)) [2]_, times n/(n − 1). The interval is
+    Student's with n − 1 degrees of freedom, truncated at 0 and at the horizon.
 
     Parameters
     ----------

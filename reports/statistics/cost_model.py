@@ -2,12 +2,13 @@
 
     t(N) = s(N)·(W/N + C) + R·α_R(N) + M(N)·α + b·β
 
-W is the work that the ranks share, in seconds of one rank, and C the work that each
-rank repeats or waits for (Amdahl [1]_). s is the slowdown of a rank while the others
-are busy: the time of simultaneous copies of the job on one rank over that of a single
-job. A rank of a shared job uses less memory than a copy, and may disturb the others
-less; therefore s is limited to the largest value that leaves C ≥ 0, but is at least 1.
-The rest is communication [2]_: R reductions over all ranks, M messages and b bytes to
+W is the work that the ranks share, in seconds of one rank. C is the work that each rank
+repeats or waits for (Amdahl [1]_). s is the slowdown of a rank while the others are
+busy: the time of simultaneous copies of the job, one per rank, divided by the time of a
+single job. A rank of a shared job uses less memory than a copy, and may disturb the
+others less; therefore s is limited to the largest value that leaves C ≥ 0, but is at
+least 1. The rest is communication [2]_: R reductions over all ranks, M messages and b
+bytes to
 neighbours, with the latencies α_R and α of a reduction and of a message, and β seconds
 per byte.
 

@@ -33,9 +33,9 @@ def median_interval(samples: Sequence[float]) -> Interval:
     """Return the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
 
     The interval misses the true median only if fewer than k of the n independent
-    samples fall on one side of it, so it covers with probability 1 − 2·P(X < k) where
-    X ~ Bin(n, ½), whatever the distribution [1]_. k is the largest with at least 95 %;
-    below six samples k = 1, from the smallest to the largest, with 1 − 2¹⁻ⁿ.
+    samples lie on one side of it. So it covers with probability 1 − 2·P(X < k) for
+    X ~ Bin(n, ½), for every distribution [1]_. k is the largest number with at least
+    95 %; below six samples k = 1, from the smallest to the largest, with 1 − 2¹⁻ⁿ.
 
     References
     ----------

@@ -37,7 +37,7 @@ class Share(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """Step function: `share` holds from each `at` to the next."""
+    """Step function: the value is `share` from each `at` to the next."""
 
     at: Array
     share: Share

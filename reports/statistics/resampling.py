@@ -65,8 +65,9 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     statistics of each pair are compared with the maxima over all pairs in every flip
     [3]_. There are two statistics: Σd/√Σd², which is equivalent to Student's t, and the
     same expression for signed ranks, which a few failures with a large penalty do not
-    distort. The latter counts only if its sign agrees with that of the mean. The more
-    significant statistic is used, also for the flips. Therefore, among any number of
+    distort. The rank statistic counts only if its sign agrees with that of the mean.
+    The more significant statistic is used, also for the flips. Therefore, among any
+    number of
     equal solvers, at most one set of cases in twenty has a significant pair. With fewer
     than six cases no pair is significant: the signs of five cases agree in 2 of 2⁵
     flips.

@@ -76,7 +76,7 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class CVXPY:
-    """One backend of cvxpy; compilation counts as preparing, its setup as solving.
+    """One backend of cvxpy, whose setup is timed as solving; compilation as preparing.
 
     The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
     where a test adds an absolute and a relative tolerance. A backend that is not listed

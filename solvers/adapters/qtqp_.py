@@ -35,9 +35,9 @@ LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 class QTQP:
     """https://github.com/google-deepmind/qtqp.
 
-    QTQP compares its residuals with max(1, size of their terms) and accepts a gap below
-    tol, absolute or relative to max(1, |objective|), like Clarabel. So tol is passed on
-    and the objective scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
+    QTQP compares its residuals with max(1, size of their terms), and accepts a gap
+    below tol that is absolute or relative to max(1, |objective|). The objective is
+    therefore scaled to ‖q‖∞ = 1e4, where the 1 has no effect, and tol is passed on.
 
     In sequences it starts from the last point. QTQP moves that point into the interior
     and falls back to a cold start if the residuals there are too large. The count
@@ -124,7 +124,8 @@ class QTQP:
 
         def start_at(s: Solution) -> None:
             nonlocal start
-            # the slack of this QP, not of the last: if x is feasible, Rx + s = r
+            # use the slack of this QP, not of the previous one: if x is feasible, Rx +
+            # s = r
             x, y, slack = form.point(s)
             start = x, y * scale, slack
 

@@ -16,7 +16,8 @@ from mortarbench.solvers.common.conversion import csc, dense
 
 DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
 KAPPA = 1e4  #: ρ·aD⁻¹aᵀ, penalty of a row a relative to the curvature along it
-#: changes of the active set, without fewer wrong constraints, before single exchanges
+#: Number of changes of the active set without fewer wrong constraints after which
+#: constraints are exchanged one at a time.
 PATIENCE = 10
 SIGN_ROUNDING = 1e-13  #: relative errors of signs and bounds below this are rounding
 
@@ -157,9 +158,11 @@ def _newton(
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
     """Drop constraints with a multiplier of the wrong sign; add violated ones.
 
-    at : x, the gradient (in place of y) without the multipliers of bounds, and the
-        trial multipliers of all inequality rows. Errors are measured in √D·x, whose
-        unit is √energy, so that they do not depend on the units of the variables
+    Errors are measured in √D·x, whose unit is √energy, so that they do not depend on
+    the units of the variables.
+
+    at : x (n,); in place of y, the gradient without the multipliers of bounds; in
+        place of z, the trial multipliers of all inequality rows
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)

@@ -7,8 +7,8 @@ With the projection Π on the product of sets and a curvature L,
 with Nesterov's weights β, which are restarted when the objective would rise. L grows
 until it bounds the curvature along the step, and shrinks after each step (Mazhar, Heyn,
 Negrut and Tasora, Using Nesterov's method to accelerate multibody dynamics with
-friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Products with y are
-combined from those with x: a step takes one product, and another for each growth of L.
+friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a combination of
+two products with x, so that a step takes one product, plus one for each growth of L.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class AcceleratedGradient:
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
     shrink: float = 0.9  #: factor of L after each step; 1 for a fixed step
-    #: factor by which L grows at least; it grows to the curvature along the step, if
-    #: that is larger
+    #: least factor by which L grows; L grows to the curvature along the step if that is
+    #: larger
     growth: float = 2.0
     max_iter: int = 50_000
 

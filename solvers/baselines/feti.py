@@ -115,7 +115,7 @@ class FETI:
         try:
             coarse = _coarse(qp, apply if self.Q == "preconditioner" else None)
         except (CholmodNotPositiveDefiniteError, np.linalg.LinAlgError):
-            message = "the equality rows depend on each other"
+            message = "the equality rows are linearly dependent"
             return lambda: Solution.without_point(qp, Status.FAILED, message)
         return lambda: _solve(_Task(qp, coarse, apply, counts), tol, self.max_iter)
 

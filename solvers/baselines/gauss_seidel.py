@@ -1,11 +1,11 @@
 """Projected Gauss–Seidel by discs and cones, a baseline of granular dynamics.
 
-A sweep minimises the objective over one block of variables after the other, all others
-fixed: a disc, a cone, or a single variable of the box. Known as NSGS (nonsmooth
-Gauss–Seidel: Jourdan, Alart and Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998,
-31–47; Acary and Brogliato 2008, Chapter 13). A block problem is solved by
-projected gradient steps of length 1/λ until they settle, with the largest eigenvalue λ
-of its part of P.
+A sweep minimises the objective over one block of variables after the other, with all
+others fixed. A block is a disc, a cone, or a single variable of the box. The method is
+known as NSGS (nonsmooth Gauss–Seidel: Jourdan, Alart and Jean, Comput. Methods Appl.
+Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008, Chapter 13). A block problem is
+solved by projected gradient steps of length 1/λ until they become short, where λ is the
+largest eigenvalue of its diagonal block of P.
 
 The gradient is updated after each change of a block by the columns of P, so that a
 sweep over all blocks costs as much as a product.
@@ -28,8 +28,8 @@ from mortarbench.harness.qp import NEEDS_MATRICES
 from mortarbench.solvers.baselines.natural_map import Problem
 from mortarbench.solvers.common.conversion import check_positive
 
-#: A block is settled when a step is this short, relative to the first. With 1, where
-#: one step is taken, 30 QPs on cones take 70 sweeps on average; with this value and
+#: Length of a step, relative to the first, at which the steps in a block end. With 1,
+#: which takes one step, 30 QPs on cones take 70 sweeps on average; with this value and
 #: with 1e-6 they take 34.
 SETTLED = 1e-3
 MAX_LOCAL = 100  #: steps in a block

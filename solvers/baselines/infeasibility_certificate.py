@@ -1,8 +1,8 @@
 """Certificates that a QP has no solution, checked on the data of the QP.
 
-If there is one, differences of successive proximal iterates converge to it (Banjac et
-al., Infeasibility detection in the alternating direction method of multipliers for
-convex optimization, JOTA 183, 2019, for a method of the same family).
+If a QP has such a certificate, differences of successive proximal iterates converge to
+it (Banjac et al., Infeasibility detection in the alternating direction method of
+multipliers for convex optimization, JOTA 183, 2019, for a method of the same family).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Matrix, Vector
 
-ROUNDING = 1e-10  #: a sum is zero below this times the sum of its |terms|
+ROUNDING = 1e-10  #: a sum below this times the sum of its absolute terms is zero
 
 
 @np.errstate(over="ignore", invalid="ignore")  # iterates of such problems diverge

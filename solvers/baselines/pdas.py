@@ -64,8 +64,8 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 )
 from mortarbench.solvers.common.conversion import check_positive
 
-#: factor of ρ when two moves of the centre have not halved the residuals. Without it
-#: 522 instead of 600 of 600 random QPs were solved
+#: Factor of ρ if two moves of the centre have not halved the residuals. With this
+#: growth all of 600 random QPs were solved, without it 522.
 RHO_GROWTH = 100.0
 MAX_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ beyond which ρ no longer grows
 PATIENCE = 10  #: moves of the centre without halved residuals before the solve gives up

@@ -30,11 +30,12 @@ from mortarbench.solvers.baselines.face import (
 from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
 KERNEL_ROUNDING = 1e-8  #: |P t| of a translation t, relative to the row sums of |P|
-#: Residual of conjugate gradients relative to the tolerance. With 1e-3, the solves were
-#: as many (13 on beam-ring, 6 on cube-wall/n=16) and took 17 to 34 % more steps.
+#: Residual of conjugate gradients relative to the tolerance. With 1e-3, the number of
+#: solves was the same (13 on beam-ring, 6 on cube-wall/n=16), with 17 to 34 % more
+#: steps.
 CG_SHARE = 0.1
-MAX_CG = 1000  #: steps per solve; 9 to 80 on small beam-ring and cube-wall
-COARSEST = 100  #: unknowns that are factorised; pyamg's pseudo-inverse took seconds
+MAX_CG = 1000  #: steps per solve; small beam-ring and cube-wall cases take 9 to 80
+COARSEST = 100  #: factorised unknowns; pyamg's default pseudo-inverse took seconds
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ NEGLIGIBLE = 1e-14
 #: convex sets that have rows in second-order cones
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: ‖x‖∞ of a claimed solution beyond which it counts as diverged: the terms of the
-#: residuals then are so large that every relative residual is small
+#: residuals are then so large that every relative residual is small
 DIVERGED = 1e12
 #: ‖q‖∞ for solvers that compare with max(1, size): with sizes of about 1e4 the 1 has no
 #: effect, and their tests are relative as those of the harness
@@ -49,7 +49,7 @@ def needs_independent_rows(qp: QP) -> str | None:
     gram = dense(csc(qp.A) @ csc(qp.A).T)
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
-    return "the equality rows depend on each other"
+    return "the equality rows are linearly dependent"
 
 
 def csc(M: Matrix) -> csc_matrix:

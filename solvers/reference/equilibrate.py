@@ -3,7 +3,7 @@
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
 largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). One factor of x
 relative to y and z remains free; it is chosen so that the largest entry of P is about
-one, whatever the unit of the objective. All factors are powers of two, so no entry is
+one, for every unit of the objective. All factors are powers of two, so no entry is
 rounded, and a point of the scaled QP equals a point of the original one to the last
 digit.
 """

@@ -8,8 +8,8 @@ Trans. Math. Softw. 29), with C the rows of G and of the finite bounds. A step s
     [A      −δ      ] [dy] = [−(Ax − b)              ],  ds = −(Cx + s − d) − C dx,
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
-for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). The step goes 0.995
-of the way to the boundary, with a common length for x, y, z and s. A disc is the smooth
+for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). A step covers 0.995
+of the distance to the boundary, with a common length for x, y, z and s. A disc is the smooth
 constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the current x, and its
 multiplier adds z/r to the diagonal of P. δ is the parameter
 of a proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio
@@ -46,7 +46,7 @@ DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
 STOP_RESIDUAL = 1e-11
 MAX_ITERATIONS = 100
 PATIENCE = 12  #: iterations without a halved residual after which it ends
-BOUNDARY_FRACTION = 0.995  #: share of the way to the boundary that a step goes
+BOUNDARY_FRACTION = 0.995  #: share of the distance to the boundary that a step covers
 
 
 class Iterate(NamedTuple):
@@ -70,7 +70,7 @@ class _Problem:
     fixed: NDArray[np.int64]
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
-    discs: tuple[Discs, ...]  #: of positive radius
+    discs: tuple[Discs, ...]  #: discs of positive radius
     #: factorises [P + D Bᵀ; B −W], B = [A; rows of discs; G]
     saddle: Callable[[Matrix], Factorise]
     delta: float
@@ -86,7 +86,7 @@ class _Problem:
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs and G at x, and what discs add to P's diagonal."""
+        """Return the rows of discs and G at x, and the terms of discs in P's diagonal."""
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:
@@ -136,7 +136,7 @@ class _Problem:
         """Return the iterate as a point of the QP."""
         m, p = self.qp.b.size, self.rows
         _, curvature = self.at(at.x, at.z)
-        z_box = curvature * at.x  # of discs
+        z_box = curvature * at.x  # multipliers of discs
         z_box[self.fixed] = at.y[m:]
         z_box[self.upper] += at.z[p : p + self.upper.size]
         z_box[self.lower] -= at.z[p + self.upper.size :]
@@ -234,7 +234,9 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    for one in problem.discs:  # far outside, slacks would shrink before x arrives
+    for (
+        one
+    ) in problem.discs:  # far outside, slacks would shrink before x is near the disc
         x = one.project(x)
     return Iterate(x, y, z, s)
 

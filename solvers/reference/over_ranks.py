@@ -42,8 +42,8 @@ MAX_CG_ROUNDS = 3  #: rounds of CG on a face
 MAX_CG_STEPS = 300  #: steps of CG in a round
 #: projected residual, relative to the projected q, that is not refined further
 ROUNDING_RESIDUAL = 1e-14
-#: multipliers of the wrong sign and violations of bounds below this, relative to the
-#: largest multiplier or component, are rounding
+#: Multipliers of the wrong sign and violations of bounds count as rounding below this
+#: value, relative to the largest multiplier or component.
 SIGN_ROUNDING = 1e-12
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 

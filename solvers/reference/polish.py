@@ -9,7 +9,7 @@ Accuracy and Stability of Numerical Algorithms, ch. 12) and one factor of
 
 δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
 are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1),
-and if solutions or multipliers are not unique they converge to some near the start.
+and if solutions or multipliers are not unique they converge to ones near the start.
 Then violated constraints enter the active set and constraints with a multiplier of the
 wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13), until it no
 longer changes.
@@ -34,8 +34,8 @@ MAX_REFINEMENTS = 40  #: steps of refinement with one active set
 MAX_STEP_RATIO = 0.9  #: refinement ends at a step longer than this times the last one
 MAX_ACTIVE_SETS = 30
 FULL_CHANGES = 10  #: updates of the active set before only the worst constraint changes
-#: multipliers of the wrong sign and violations below this, relative to the largest
-#: component, are rounding
+#: Multipliers of the wrong sign and violations count as rounding below this value,
+#: relative to the largest component.
 SIGN_ROUNDING = 4 * float(np.finfo(float).eps)
 
 

@@ -7,7 +7,7 @@ conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, comes near this
+1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches this
    zero from any start. Anderson's acceleration with a safeguard (Zhang, O'Donoghue and
    Boyd 2020, SIAM J. Optim. 30) is needed for a singular P.
 2. Newton's method converges to it, with Π' by difference quotients and residuals in
@@ -29,7 +29,7 @@ from mortarbench.harness import QP, Solution, Status, Vector
 ROUNDS = 12  #: rounds of ADMM and Newton's method, each with another penalty
 ADMM_STEPS = 400  #: ADMM steps in the first round; each further round adds as many
 NEWTON_STEPS = 30  #: largest number of Newton steps per round
-MEMORY = 10  #: iterates that an acceleration combines, and between two of them
+MEMORY = 10  #: number of iterates per acceleration, and between two accelerations
 #: shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP

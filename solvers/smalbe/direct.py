@@ -10,9 +10,9 @@ k = 0, 1, …:
    exactly, from one face to the next (`solvers.smalbe.faces`).
 2. a ← a + ρC(x − x̃), x_{k+1} = x.
 
-This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) where every
-inner run is exact, M = 0. The proximal term makes P + ρCᵀC + δD positive definite where
-P is singular on a face; at the solution, where x = x_k, it is zero.
+This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with exact
+inner runs, M = 0. If P is singular on a face, the proximal term makes P + ρCᵀC + δD
+positive definite; the term vanishes at the solution, where x = x_k.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: limit of unknowns: a face costs O(n³), and `smalbe` is faster long before
+#: Largest number of unknowns; a face costs O(n³), and `smalbe` is faster long before.
 MAX_UNKNOWNS = 2000
 INITIAL_RHO = 1e3  #: initial ρ/‖P‖, Frobenius norm
 MAX_RHO = 1e9  #: limit of ρ/‖P‖, which grows if ‖Cν‖ falls slowly
@@ -103,7 +103,7 @@ class _Task:
     def point(self, *, fitted: bool) -> _Point:
         """Return the current x with its multipliers.
 
-        fitted : whether to fit a to the gradient on the free components, by least
+        fitted : True to fit a to the gradient on the free components, by least
             squares; the rounding of a is ρ times that of Cν, and may be too large
         """
         qp, faces, a = self.qp, self.faces, self.faces.a

@@ -48,9 +48,10 @@ STEPS = {
 }
 #: "solved" is claimed if the KKT residuals are within this factor of the tolerance
 CLAIM_FACTOR = 5.0
-#: Factors by which the tolerance is tightened if a residual exceeds it, smaller than
-#: the excess suggests. The first one suffices for four of five bodies whose residual
-#: exceeds the tolerance: the residual decreases with ‖g^P‖, though not in proportion.
+#: Factors by which the tolerance is tightened if a residual exceeds it. They are
+#: smaller than the excess suggests, since the residual decreases more slowly than
+#: ‖g^P‖. The first one suffices for four of five bodies whose residual exceeds the
+#: tolerance.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
 #: rounding of ‖x_I‖, relative to the radius and x̃; twice that of feasible_set.pxi.
@@ -106,7 +107,7 @@ def prepared(
 ) -> Solve:
     """Prepare a run: eliminate free variables, project the QP, estimate its spectrum.
 
-    in_sequence : whether further QPs take over the results; a factor of the free block
+    in_sequence : True if further QPs take over the results; a factor of the free block
         and a good spectrum then pay off several times
     """
     has_discs = len(qp.sets) > 1
@@ -146,10 +147,10 @@ def prepared(
 
 
 def _on_discs(qp: QP, options: Options) -> Options:
-    """Replace the options that are for bounds alone.
+    """Replace the options that are valid for bounds only.
 
-    Models can be minimised only over boxes, and a step along −β leaves a disc to which
-    it is tangent.
+    Models can be minimised only over boxes. A step along −β would leave a disc, since
+    it is tangent to it.
     """
     kind = resolved_preconditioner(qp, options.preconditioner)
     return replace(
@@ -172,7 +173,7 @@ def _eliminated(
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (
         kind == "incomplete" and options.preconditioner == "auto"
     )
-    # the functions of a subclass expect the variables of the QP as given
+    # the functions of a subclass expect all variables of the original QP
     if options.is_extended or not may_follow or len(qp.sets) > 1:
         return None
     if options.eliminate == "always" or carry is None:
@@ -261,7 +262,7 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 def _start(task: _Task, tol: float) -> Iterate:
     """Start from zero, or from the solution of the previous problem.
 
-    A component at a bound there starts at that bound here, even if the bound has moved:
+    A component that was at a bound starts at that bound, even if the bound has moved:
     rows that slip continue to slip when the bound of friction changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
@@ -494,7 +495,7 @@ def recovered(
 
 
 def _on_boundary(discs: Discs, x: Vector, shift: Vector) -> NDArray[np.bool_]:
-    """Return which discs (k,) have x (n,) on their boundary.
+    """Return a mask (k,) of the discs that have x (n,) on their boundary.
 
     shift : x̃ (n,), whose rounding is part of x
     """

@@ -31,9 +31,9 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
-#: Singular values of orthonormal rows, restricted to E: values below the first count as
-#: zero, values above the second are accepted. Values between them would enter the
-#: reduced matrix by their reciprocals, and its rounding would exceed the tolerance
+#: Bounds for singular values of orthonormal rows, restricted to E: values below the
+#: first count as zero, values above the second are accepted. The reciprocals of values
+#: in between would enter the reduced matrix, and its rounding exceed the tolerance.
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]

@@ -51,7 +51,7 @@ StepRule: TypeAlias = Callable[[Step], Vector]
 def checked(M: Operator) -> Operator:
     """Return M with a test of each product: vᵀMv must be positive.
 
-    Along a direction for which it is not, conjugate gradients would increase the cost.
+    Conjugate gradients would increase the cost along a direction with vᵀMv < 0.
 
     Raises
     ------

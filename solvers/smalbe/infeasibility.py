@@ -7,8 +7,8 @@ import numpy as np
 from mortarbench.harness import Vector
 from mortarbench.solvers.smalbe.rows import Rows
 
-#: radius that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof excludes
-#: points within it
+#: Radius that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof holds for
+#: points within it.
 SEARCH_RADIUS = 1e6
 PRODUCT_ROUNDING = 1e-12  #: rounding of a sum of products, relative to its terms
 

@@ -22,7 +22,7 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: spectral: a step to the boundary and, unless it is most of the CG step, a projected
 #: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
 #: replace every proportioning, and CG where it would leave the set at once (1). With
-#: discs, model, whose steps are for bounds, stands for spectral
+#: discs, the value model selects spectral, since model steps require bounds
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
 #: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
@@ -114,8 +114,8 @@ class Options:
     def step_rule_for(self, qp: QP) -> StepRule | None:
         """Return a rule for this QP, or None for the option `expansion`.
 
-        For subclasses (`solvers.smalbe.extension`). The rule is asked for a trial point
-        wherever a CG step would leave the box.
+        For subclasses (`solvers.smalbe.extension`). The rule is called for a trial
+        point whenever a CG step would leave the box.
         """
         return None
 

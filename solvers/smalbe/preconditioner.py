@@ -44,7 +44,7 @@ Preconditioner = Literal[
     "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
 PRECONDITIONERS = get_args(Preconditioner)
-#: preconditioners with a matrix M of their own
+#: Preconditioners with an explicit matrix M.
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
 #: takes them one by one. Meshes of more than 24³ trilinear elements have more than two,
@@ -95,7 +95,7 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
 
 
 def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
-    """Return the preconditioner that `kind` stands for, and whether to scale variables.
+    """Return the preconditioner for `kind`, and True if variables are to be scaled.
 
     A step with an incomplete factor costs four to seven times as much as one without:
     it saves time if CG without it takes more than about 150 steps. The number of these
@@ -118,7 +118,7 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 
 
 def has_sparse_factor(qp: QP) -> bool:
-    """Return whether an incomplete factor of the free part of P costs little.
+    """Return True if an incomplete factor of the free part of P is cheap.
 
     This requires a sparse P with a positive diagonal, stored by this process, and
     bounds only, since a factor of P would not include the penalty of rows. The columns

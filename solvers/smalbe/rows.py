@@ -380,7 +380,7 @@ def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
     kept = independent_rows(gram)
     rows = _factored(G[kept], e[kept], bounded)
     if rows is None:
-        raise ValueError("the equality rows nearly depend on each other")
+        raise ValueError("the equality rows are nearly linearly dependent")
     size = np.sqrt(gram.diagonal())
     size[size == 0] = 1.0
     of_kept = rows.multipliers

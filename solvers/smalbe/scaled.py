@@ -34,7 +34,7 @@ class Scaled:
     norm: float  #: upper bound of the norm of its matrix: the largest row sum Σⱼ|Hᵢⱼ|
     weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
     has_weights: bool
-    with_factor: bool  #: whether to precondition by a factor
+    with_factor: bool  #: True to precondition by an incomplete factor
 
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> Scaled:

@@ -78,7 +78,7 @@ class SMALBE(Options):
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Start a sequence in which each QP passes its results on to the next.
 
-        Passed on are the point, multipliers, Ritz pairs and the factor of the free
+        These are the point, the multipliers, the Ritz pairs and the factor of the free
         block.
         """
         carry: Carry | None = None

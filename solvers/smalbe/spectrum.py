@@ -29,7 +29,7 @@ class Ritz(NamedTuple):
 
 @lru_cache(maxsize=8)
 def random_start(n: int) -> Vector:
-    """Return a fixed random vector (n,): results must be reproducible."""
+    """Return a random vector (n,) with a fixed seed, for reproducible results."""
     start = np.random.default_rng(19640229).standard_normal(n)
     start.flags.writeable = False
     return start

@@ -322,7 +322,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
     of_block = mechanics.kernel @ (mechanics.kernel.T @ along)
     certify(mechanics, replace(s, x=s.x + of_block.astype(np.float64)))
     held, allowed = seen[0]  # by the pair that has slid as far
-    off = np.abs(held.T @ (mechanics.motions.felt.T @ of_block))
+    off = np.abs(held.T @ (mechanics.motions.constrained.T @ of_block))
 
     assert off.max() > 0
     assert (off <= allowed.gaps * (1 + 1e-6)).all()

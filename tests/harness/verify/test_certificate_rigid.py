@@ -237,15 +237,15 @@ def test_a_load_that_contact_would_have_to_pull_is_another_cause():
 
 
 def test_contact_feels_no_sliding_but_all_else():
-    """Two bodies, three motions each; along the plates neither is felt, however tilted.
+    """Two bodies, three motions each; along the plates both are free, however tilted.
 
     The disc as master of pointwise rows is a polygon, which feels them all.
     """
     for tilt in (0.0, 0.5, 1.0):
         motions = disc_between_plates(tilt=tilt).mechanics.motions
-        assert (motions.felt.shape[1], motions.free.shape[1]) == (4, 2)
+        assert (motions.constrained.shape[1], motions.free.shape[1]) == (4, 2)
     motions = disc_between_plates(disc_is_slave=False).mechanics.motions
-    assert (motions.felt.shape[1], motions.free.shape[1]) == (6, 0)
+    assert (motions.constrained.shape[1], motions.free.shape[1]) == (6, 0)
 
 
 def test_what_rigid_motions_do_to_a_stored_matrix_is_known_to_its_last_digits():
@@ -331,7 +331,9 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
         start = np.maximum(lam * (1 + size * rng.standard_normal(lam.size)), 0)
         found = balanced(mechanics, start, u)
         left = (
-            motions.felt.T @ mechanics.exact.f - motions.KR.T @ u - motions.G.T @ found
+            motions.constrained.T @ mechanics.exact.f
+            - motions.KR.T @ u
+            - motions.G.T @ found
         )
         terms = motions.largest.T @ np.abs(mechanics.exact.f)
         assert (found >= 0).all()
@@ -496,7 +498,7 @@ def test_rounding_counts_as_far_as_the_answer_moves_rigidly(monkeypatch):
     """Beside a pair that is where the solution is: γ = 0."""
     mechanics = named("hertz-cylinder/n=2/m=2").mechanics
     point = reference_point(mechanics, reference_solution)
-    R, far = mechanics.motions.felt.toarray()[:, 0], 1e3 * np.abs(point.u).max()
+    R, far = mechanics.motions.constrained.toarray()[:, 0], 1e3 * np.abs(point.u).max()
     s = answer(point.u - far * R, point.multipliers)
     monkeypatch.setattr(certificate, "_reach", lambda *args: _Reach(*np.zeros((3, 1))))
 
