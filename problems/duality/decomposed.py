@@ -18,7 +18,6 @@ from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from mortarbench.harness import (
     QP,
     Friction,
-    InputError,
     ReferenceOverRanks,
     Solution,
     Status,
@@ -91,8 +90,8 @@ class DecomposedLinearisation:
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the distributed dual with the given friction bounds."""
-        limits = self.dual.bounds(friction.bound)
-        return self.reference(self._qp.with_bounds(*limits), start)
+        qp = replace(self._qp, sets=self.dual.sets(friction.bound))
+        return self.reference(qp, start)
 
     def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
@@ -152,14 +151,9 @@ def distributed_qp_of(
     InputError
         If there are fewer subdomains than ranks, ranks have cut the bodies differently,
         or the fixed point of Coulomb's law does not converge or has fewer iterates than
-        selected. Also for friction in space, whose discs ranks do not support.
+        selected.
 
     """
-    laws = [law for stage in problem.stages for law in stage.laws]
-    if problem.bodies.shape.dim > 2 and any(law.acts for law in laws):
-        raise InputError(
-            "friction in space on several ranks is not built; expected one rank"
-        )
     path = decomposed_path(problem, choice, ranks, reference)
     chosen = path.problem(choice.step, choice.iterate)
     last = path.last_of(choice.step)
