@@ -221,8 +221,8 @@ class _Task:
         x : start
         """
         moving, origin = self.moving(face)
-        curvature = np.zeros(x.size)
-        curvature[self.discs.index] = (face.curvature * self.on_disc(face))[:, None]
+        curvature, on_disc = np.zeros(x.size), self.on_disc(face)
+        curvature[self.discs.index] = (face.curvature * on_disc)[:, None]
         columns = DistributedColumns(csr_array(self.G.part @ moving), self.G.ranks)
         try:
             coarse = cholesky(csc_matrix(columns.gram()))
@@ -244,6 +244,16 @@ class _Task:
             """Return the curvature of the boundary of discs times v."""
             return np.asarray(curvature * (moving @ v))
 
+        # M ≈ F⁻¹ is too large where the curvature exceeds F, as on small discs, and it
+        # is zero along redundant rows (friction on supported nodes), which bend as well
+        length = np.zeros(x.size)
+        length[self.discs.index] = (self.length * on_disc)[:, None]
+        soft = 1 / np.sqrt(1 + length * curvature)
+
+        def precondition(v: Vector) -> Vector:
+            """Return an approximation of (F + bent)⁻¹v in the face."""
+            return project(soft * (self.M(soft * v) + length * (soft * v)))
+
         x = origin + moving @ x
         x += spread(self.e - self.G @ x)
         size = self.norm(project(self.q))
@@ -252,23 +262,24 @@ class _Task:
             w = project(project(-self.gradient(x) - bent(x)))
             if self.norm(w) <= ROUNDING_RESIDUAL * size:
                 break
-            x += self._correction(w, project, bent)
+            x += self._correction(w, project, precondition, bent)
             x += spread(self.e - self.G @ x)
         r = -self.gradient(x)
         y = coarse(columns @ (r - bent(x)))
         is_free = face.state[: x.size] == 0
-        is_free[self.discs.index[self.on_disc(face) | (self.discs.radius == 0)]] = False
+        is_free[self.discs.index[on_disc | (self.discs.radius == 0)]] = False
         return _Point(x, y, np.where(is_free, 0.0, r - np.asarray(self.G.T @ y)))
 
     def _correction(
         self,
         w: Vector,
         project: Callable[[Vector], Vector],
+        precondition: Callable[[Vector], Vector],
         bent: Callable[[Vector], Vector],
     ) -> Vector:
         """Return d in the face with 𝒫(w − Fd − bent(d)) small, by CG."""
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
-        p = y = project(self.M(w))
+        p = y = precondition(w)
         wy = self.total(float(w @ y))
         for _ in range(MAX_CG_STEPS):
             Fp = self.F(p) + bent(p)
@@ -281,7 +292,7 @@ class _Task:
             w = w - alpha * project(Fp)
             if self.norm(w) <= enough:
                 break
-            y = project(self.M(w))
+            y = precondition(w)
             wy, before = self.total(float(w @ y)), wy
             p = y + (wy / before) * p
         return d
