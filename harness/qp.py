@@ -296,7 +296,7 @@ def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ..
     for one in sets[1:]:
         if isinstance(one, Discs) and one.index.shape[1] == 1:
             box = Box(*hull((box, one), n))
-        elif one.block.size:
+        elif one.block.size or (isinstance(one, Blocks) and one.may_be_empty):
             others.append(one)
     return box, *others
 

@@ -213,6 +213,9 @@ class _Clock:
 class DistributedVector(np.ndarray):
     """The local slice (n_rank,) of a vector; reductions run over all ranks.
 
+    Selected components may form rows (k, d), each of them on one rank: sums and norms
+    along axis 1 need no other rank.
+
     Raises
     ------
     TypeError
@@ -243,6 +246,8 @@ class DistributedVector(np.ndarray):
         plain = [_slice(i) for i in inputs]
         if ufunc is np.matmul:
             return _contracted(self.ranks, *plain)
+        if method == "reduce" and how.get("axis") == 1:  # within rows (k, d)
+            return _rewrap(self.ranks, ufunc.reduce(*plain, **how))
         if method == "__call__":
             if "out" in how:
                 how["out"] = tuple(_slice(out) for out in how["out"])
@@ -255,6 +260,8 @@ class DistributedVector(np.ndarray):
         self, function: Any, types: Any, args: Any, kwargs: Any
     ) -> Any:
         plain = [_slice(a) for a in args]
+        if function is np.linalg.norm and len(args) == 1 and kwargs == {"axis": 1}:
+            return _rewrap(self.ranks, np.linalg.norm(plain[0], axis=1))
         if function is np.linalg.norm and len(args) == 1 and not kwargs:
             return np.sqrt(float(_contracted(self.ranks, plain[0], plain[0])))
         if function is np.count_nonzero:
@@ -278,7 +285,7 @@ def _slice(value: Any) -> Any:
 def _rewrap(ranks: Ranks, result: Any) -> Any:
     if isinstance(result, tuple):
         return tuple(_rewrap(ranks, r) for r in result)
-    return distributed(result, ranks) if np.ndim(result) == 1 else result
+    return distributed(result, ranks) if np.ndim(result) else result
 
 
 def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
@@ -380,16 +387,18 @@ class DistributedQP(NamedTuple):
     digest: Callable[[], str]
     #: evaluates a solution from its local slice. Collective.
     answer: Callable[[Solution], Evaluation]
+    discs: int = 0  #: total number
 
     @property
     def sizes(self) -> dict[str, int]:
         """Sizes of the whole QP, as in `harness.qp.QP.sizes`."""
-        return {
+        sizes = {
             "variables": self.variables,
             "equalities": self.equality_rows,
             "inequalities": 0,
             "bounds": self.bounds,
         }
+        return {**sizes, "discs": self.discs} if self.discs else sizes
 
 
 #: Assembles a case, given by family, params and form, on all ranks. Collective.

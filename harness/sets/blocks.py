@@ -21,6 +21,8 @@ class Blocks:
     prefix: ClassVar[str]  #: prefix of the names of arrays in files
     least: ClassVar[int]  #: smallest d
     columns: ClassVar[str]  #: meaning of the d columns, for messages
+    #: True for sets over ranks, which all ranks keep even if some have no blocks
+    may_be_empty: ClassVar[bool] = False
 
     index: NDArray[np.int64]  #: (k, d)
 

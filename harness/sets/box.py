@@ -40,7 +40,8 @@ class Box:
     @property
     def block(self) -> NDArray[np.int64]:
         """The variables with a finite bound."""
-        return np.flatnonzero(np.isfinite(self.lower) | np.isfinite(self.upper))
+        is_bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
+        return np.flatnonzero(np.asarray(is_bounded))  # of a distributed vector: local
 
     def check(self, n: int) -> None:
         """Raise ValueError for other shapes, NaN, or a lower bound above an upper."""

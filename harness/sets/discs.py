@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -107,7 +107,7 @@ class Discs(Blocks):
         factors = np.abs(entries)
         if (factors != factors[:, :1]).any():
             raise ValueError("Discs cannot be scaled unevenly")
-        return Discs(columns, self.radius / factors[:, 0])
+        return replace(self, index=columns, radius=self.radius / factors[:, 0])
 
     def _norms(self, v: Vector) -> Vector:
         return norms(v[self.index])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import Any
@@ -15,13 +14,12 @@ import numpy as np
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.failures import run_collectively
 from mortarbench.harness.distributed.vectors import (
-    DistributedColumns,
     DistributedQP,
     Ranks,
 )
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
-from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES, SolverSpec
 from mortarbench.harness.solution import Solution, Status
@@ -244,7 +242,6 @@ def _values_by_ranks(
     raises TypeError for operations that its slice does not determine.
     """
     qp = emitted.share().qp
-    qp = replace(qp, G=DistributedColumns(no_rows(qp.q.size), ranks))
     try:
         with np.errstate(all="ignore"):
             residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)

@@ -18,7 +18,6 @@ from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from mortarbench.harness import (
     QP,
     Friction,
-    InputError,
     ReferenceOverRanks,
     Solution,
     Status,
@@ -90,9 +89,9 @@ class DecomposedLinearisation:
         return self.dual.share().qp
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the distributed dual with the bounds of `friction`."""
-        limits = self.dual.bounds(friction.bound)
-        return self.reference(self._qp.with_bounds(*limits), start)
+        """Solve the distributed dual with the given friction bounds."""
+        qp = replace(self._qp, sets=self.dual.sets(friction.bound))
+        return self.reference(qp, start)
 
     def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
@@ -153,17 +152,11 @@ def distributed_qp_of(
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks; if the ranks computed different
-        subdivisions; if the fixed-point iteration for Coulomb's law diverges or has
-        fewer iterates than selected; or for friction in space, because multipliers in
-        discs are not implemented on several ranks.
+        If there are fewer subdomains than ranks, ranks have cut the bodies differently,
+        or the fixed point of Coulomb's law does not converge or has fewer iterates than
+        selected.
 
     """
-    laws = [law for stage in problem.stages for law in stage.laws]
-    if problem.bodies.shape.dim > 2 and any(law.acts for law in laws):
-        raise InputError(
-            "friction in space on several ranks is not built; expected one rank"
-        )
     path = decomposed_path(problem, choice, ranks, reference)
     chosen = path.problem(choice.step, choice.iterate)
     last = path.last_of(choice.step)

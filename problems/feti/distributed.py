@@ -25,8 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from mortarbench.harness import QP, InputError, Solution, Vector, no_rows
+from mortarbench.harness import (
+    QP,
+    Box,
+    Discs,
+    InputError,
+    Solution,
+    Vector,
+    no_rows,
+)
 from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.discs import DistributedDiscs
 from mortarbench.harness.distributed.factor import Touched, local_factor, touched_rows
 from mortarbench.harness.distributed.sparse import CompressedRows, LinearMap
 from mortarbench.harness.distributed.vectors import (
@@ -69,9 +78,15 @@ class Partition(NamedTuple):
 
 
 def partition(
-    B: csr_array, domains: Subdomains, ranks: int, clusters: Clusters | None = None
+    B: csr_array,
+    domains: Subdomains,
+    ranks: int,
+    clusters: Clusters | None = None,
+    discs: Sequence[Discs] = (),
 ) -> Partition:
     """Distribute the subdomains and the rows of B (m, N) over ranks.
+
+    discs : the rows of a disc reach the same ranks, those that any of them touches
 
     Raises
     ------
@@ -84,6 +99,12 @@ def partition(
     subdomain = np.searchsorted(domains.start, B.indices, side="right") - 1
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, subdomain)), shape=(B.shape[0], S))
+    group = np.arange(B.shape[0])
+    for one in discs:
+        group[one.index] = one.index[:, :1]
+    members = group, np.arange(group.size)
+    same = csr_array((np.ones(group.size, dtype=np.int32), members))
+    touches = csr_array(same.T @ (same @ touches))
     touches.data[:] = 1
     work, size = _work(B, domains), np.diff(domains.start)
     graph = csr_array(touches.T @ touches)
@@ -93,16 +114,17 @@ def partition(
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
     reach.data[:] = 1
-    return Partition(rank, reach, assign_owners(np.arange(B.shape[0]), reach))
+    return Partition(rank, reach, assign_owners(group, reach))
 
 
-def assign_owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return the owner (t,) of each row, round-robin among the ranks that touch it.
+def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
+    """Return an owner for each of some rows (t,), round-robin among those it touches.
 
-    rows : (t,) global numbers of the rows
-    reach : (t, ranks) nonzero where a rank touches a row, with sorted indices
+    group : number of the first row of the same disc, or of the row itself; the rows of
+        a disc have one owner, since they reach the same ranks
+    reach : (t, ranks) the ranks that touch them, ascending
     """
-    turn = rows % np.diff(reach.indptr)
+    turn = group % np.diff(reach.indptr)
     return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
@@ -624,7 +646,9 @@ def condense_over_ranks(
     received = [n for n, t in tasks.items() if t.factor_rank != me == t.block_rank]
     local = [n for n, t in tasks.items() if t.factor_rank == me == t.block_rank]
     exclusive = {n for n in local if len(tasks[n].ranks) == 1}
-    position = {name: i for i, name in enumerate(names)}
+    positions = dict[str, list[int]]()
+    for i, name in enumerate(names):  # two bodies may have equal subdomains
+        positions.setdefault(name, []).append(i)
     factors = {
         n: groups_by_name[n].template.border_factor(groups_by_name[n].touched)
         for n in sent + local
@@ -636,7 +660,8 @@ def condense_over_ranks(
         for n in some:
             kind, touched = groups_by_name[n].template, groups_by_name[n].touched
             if n in exclusive:
-                yield position[n], kind.condense(touched)
+                condensed = kind.condense(touched)
+                yield from ((i, condensed) for i in positions[n])
             else:
                 blocks[n] = np.stack(kind.blocks(touched, factors.pop(n)))
 
@@ -665,7 +690,9 @@ def condense_over_ranks(
     )
     blocks |= dict(zip(foreign, arrays, strict=True))
     del arrays  # so that each full block is released as the caller packs it
-    yield from ((position[n], Condensed(*blocks.pop(n))) for n in list(blocks))
+    for n in list(blocks):
+        condensed = Condensed(*blocks.pop(n))
+        yield from ((i, condensed) for i in positions[n])
 
 
 def _exchange_blocks(
@@ -701,7 +728,8 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
 
     """
     B, domains = operator.B, operator.domains
-    partitioned = partition(B, domains, ranks.size, operator.clusters)
+    discs = tuple(one for one in qp.sets if isinstance(one, Discs))
+    partitioned = partition(B, domains, ranks.size, operator.clusters, discs)
     touched = np.flatnonzero(partitioned.reach[:, [ranks.rank]].toarray())
     reach = csr_array(partitioned.reach[touched])
     halo = build_halo(ranks, touched, reach, partitioned.owner[touched])
@@ -727,9 +755,8 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     qp_local = QP(
         P=RankOperator(local, halo),
         q=q,
-        lb=lb,
-        ub=ub,
-        G=no_rows(owned.size),
+        sets=(Box(lb, ub), *(DistributedDiscs.of(one, owned, ranks) for one in discs)),
+        G=DistributedColumns(no_rows(owned.size), ranks),
         h=np.zeros(0),
         A=DistributedColumns(csr_array(qp.A[:, owned]), ranks),
         b=np.array(qp.b),

@@ -19,17 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from mortarbench.harness import QP, InputError, Vector, no_rows
+from mortarbench.harness import QP, Box, InputError, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.discs import DistributedDiscs
 from mortarbench.harness.distributed.vectors import (
     DISTRIBUTED_DIGEST,
     DistributedColumns,
     DistributedQP,
-    DistributedVector,
     Ranks,
     Share,
     distributed,
 )
+from mortarbench.harness.mechanics import friction_discs
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import (
     Halo,
@@ -64,7 +65,7 @@ class LocalDual:
     def halo(self) -> Halo:
         """Owned rows and ghosts of this rank."""
         rows = self.subdomains.rows
-        owner = assign_owners(rows.number, rows.reach)
+        owner = assign_owners(rows.group, rows.reach)
         return build_halo(self.subdomains.ranks, rows.number, rows.reach, owner)
 
     @cached_property
@@ -109,44 +110,34 @@ class LocalDual:
             partial(condense_over_ranks, ranks=ranks),
             clusters and replace(clusters, domains=unfactored),
         )
-        lower, upper = self.bounds(self.subdomains.problem.contact.bound)
         qp = QP(
             P=RankOperator(local, self.halo),
             q=distributed(self.q, ranks),
-            lb=lower,
-            ub=upper,
-            G=no_rows(self.q.size),
+            sets=self.sets(self.subdomains.problem.contact.bound),
+            G=DistributedColumns(no_rows(self.q.size), ranks),
             h=np.zeros(0),
             A=DistributedColumns(self.G, ranks),
             b=self.b,
         )
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
-    def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
-        """Return bounds of the multipliers of owned rows; `bound` (k,) is for friction.
+    def sets(self, bound: Vector) -> tuple[Box, DistributedDiscs]:
+        """Return the sets of the multipliers of owned rows: λ_n ≥ 0 and ‖λ_t‖ ≤ g.
 
-        Raises
-        ------
-        InputError
-            For friction in space, where multipliers are constrained to discs.
-
+        bound : (k,) friction bounds
         """
-        if bound.size and self.subdomains.problem.contact.tangents > 1:
-            raise InputError(
-                "friction in space on MPI ranks is not built; expected one process"
-            )
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
+        contact = self.subdomains.problem.contact
         scale = self.subdomains.problem.contact_scale
-        pressing = scale.size - bound.size
-        bound = bound / scale[pressing:]
-        below = np.concatenate([np.zeros(pressing), -bound])
-        above = np.concatenate([np.full(pressing, np.inf), bound])
-        number = self.halo.rows[self.halo.owned]
-        touching = number >= E
-        lower, upper = (np.full(number.size, x) for x in (-np.inf, np.inf))
-        lower[touching] = below[number[touching] - E]
-        upper[touching] = above[number[touching] - E]
-        return distributed(lower, ranks), distributed(upper, ranks)
+        normal = scale.size - bound.size
+        owned = self.halo.rows[self.halo.owned]
+        lower, upper = (np.full(owned.size, x) for x in (-np.inf, np.inf))
+        lower[(owned >= E) & (owned < E + normal)] = 0.0
+        discs = friction_discs(bound / scale[normal:], contact.tangents, E + normal)
+        return (
+            Box(distributed(lower, ranks), distributed(upper, ranks)),
+            DistributedDiscs.of(discs, owned, ranks),
+        )
 
     def with_bound(self, bound: Vector) -> LocalDual:
         """Return a copy with friction bounds `bound` (k,); cached results are kept."""
@@ -197,11 +188,14 @@ def distributed_qp(
         names = others * [_digest(first.subdomains)] if first else [_digest(local)]
         return DISTRIBUTED_DIGEST + hex_digest(map(str.encode, names), 16)
 
-    bounds = dual.bounds(local.problem.contact.bound)
+    contact = local.problem.contact
+    in_discs = contact.bound.size if contact.tangents > 1 else 0
+    between = contact.bound.size - in_discs
     return DistributedQP(
         variables=local.rows.total,
         equality_rows=local.unit_motions,
-        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
+        bounds=contact.rows.shape[0] - contact.bound.size + 2 * between,
+        discs=in_discs // contact.tangents,
         share=dual.share,
         digest=digest,
         answer=evaluation(
@@ -295,7 +289,7 @@ def _coarse_rows(local: LocalSubdomains, mine: Nodes) -> csr_array:
     R = local.resultants(unknown, np.ones(unknown.size))
     touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
     part = csr_array(touched @ R)
-    owner = assign_owners(rows.number, rows.reach)
+    owner = assign_owners(rows.group, rows.reach)
     messages: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
     for one in set(range(ranks.size)) - {ranks.rank}:
         foreign = np.flatnonzero(owner == one)

@@ -94,6 +94,14 @@ class Contact(NamedTuple):
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
 
+    @property
+    def groups(self) -> Nodes:
+        """First row of the tangential vector of each row (m_I,), or the row itself."""
+        group = np.arange(self.rows.shape[0])
+        first = group.size - self.bound.size
+        group[first:] = np.repeat(group[first :: self.tangents], self.tangents)
+        return group
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecomposedProblem:
@@ -509,7 +517,10 @@ class _Rows(NamedTuple):
 
     number: Nodes  #: (t,) global numbers, ascending
     B: csr_array  #: (t, N_p)
-    reach: csr_array  #: (t, ranks) nonzero where a rank touches a row
+    #: (t,) first row of the same tangential vector, or the row itself; rows of one
+    #: group have one owner
+    group: Nodes
+    reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
     c: Vector  #: (t,)
     equalities: int  #: number of equality rows on all ranks
     total: int  #: number of rows on all ranks
@@ -634,12 +645,14 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
     row, column, value = (
         np.concatenate(p) for p in list(zip(*entries, strict=True))[:3]
     )
-    number, place = np.unique(row, return_inverse=True)
+    pairs = np.concatenate([part.reached for part in entries])
+    # rows that only other rows of their vector touch here have no entries
+    number = np.unique(pairs[pairs[:, 1] == ranks.rank, 0])
+    place = np.searchsorted(number, row)
     unknowns = problem.components * local.nodes.number.size
     B = csr_array((value, (place, column)), shape=(number.size, unknowns))
     if problem.eliminated:
         B = csr_array(B[:, local.free])
-    pairs = np.concatenate([part.reached for part in entries])
     pairs = pairs[np.isin(pairs[:, 0], number)]
     reach = csr_array(
         (
@@ -655,7 +668,17 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
     touching = number >= E
     c = np.zeros(number.size)
     c[touching] = (scale * contact.c)[number[touching] - E]
-    return _Rows(number, B, reach, c, E, E + scale.size)
+    group = number.copy()
+    group[touching] = E + contact.groups[number[touching] - E]
+    return _Rows(
+        number=number,
+        B=B,
+        group=group,
+        reach=reach,
+        c=c,
+        equalities=E,
+        total=E + scale.size,
+    )
 
 
 def _support_rows(local: LocalSubdomains) -> Entries:
@@ -743,8 +766,15 @@ def _contact_rows(local: LocalSubdomains) -> Entries:
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
     copies = _local_copies(local, node)
-    row = _equality_count(problem) + entries.row.astype(np.int64)
-    reached = np.stack([row[copies.node], copies.rank], axis=1)
+    E, group = _equality_count(problem), problem.contact.groups
+    row = E + entries.row.astype(np.int64)
+    # a disc has one owner: each rank that one of its rows touches holds all of them
+    pairs = np.stack([group[entries.row][copies.node], copies.rank], axis=1)
+    pairs = np.unique(pairs, axis=0)
+    members = np.bincount(group, minlength=1)[pairs[:, 0]]
+    reached = np.repeat(pairs, members, axis=0)
+    before = np.repeat(np.cumsum(members) - members, members)
+    reached[:, 0] += E + np.arange(before.size) - before
     multiplicity = problem.layout.multiplicity(node)
     share = problem.contact_scale[entries.row] * entries.data / multiplicity
     of = copies.node[copies.local]

@@ -1,18 +1,24 @@
 """Reference solve of duals distributed over MPI ranks: active sets, CG on each face.
 
-Minimises ½xᵀFx + qᵀx subject to Gx = e and l ≤ x ≤ u, with the components of x
-distributed over the ranks (`harness.distributed`). The equality rows must be linearly
-independent on the components without bounds, as they are if all bodies are supported.
+Minimises ½xᵀFx + qᵀx subject to Gx = e, l ≤ x ≤ u and ‖x_I‖ ≤ r on discs, with the
+components of x distributed over the ranks (`harness.distributed`). The equality rows
+must be linearly independent on the components without bounds, as they are if all bodies
+are supported.
 
 1. On a face, with the components 𝒜 fixed at a bound, x_𝓕 solves a linear system:
    projected preconditioned conjugate gradients, 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted
-   from the true residual until only rounding remains (iterative refinement).
+   from the true residual until only rounding remains (iterative refinement). A disc on
+   whose boundary x is, with the normal vector z_I = ηx_I, is linearised there, as in
+   Newton's method: nᵀx_I = r with its outward normal n, and x_I moves along the
+   tangents, on which η is added to F, the curvature of the boundary.
 2. Primal-dual active sets (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13):
    components with a multiplier of the wrong sign are freed, components beyond a bound
-   are fixed there. The sets may cycle. After ten changes in a row that did not reduce
-   the number of wrong components, only the last wrong one changes, until there are
-   fewer (block principal pivoting, Júdice and Pires 1994, Comput. Oper. Res. 21, which
-   ends after finitely many changes).
+   are fixed there. The same for discs, whose n and η are those of w = x_I + γz_I (for
+   friction: Hüeber, Stadler and Wohlmuth 2008, SIAM J. Sci. Comput. 30). The sets may
+   cycle. After ten changes in a row that did not reduce the number of wrong components,
+   only the last wrong one changes, until there are fewer (block principal pivoting,
+   Júdice and Pires 1994, Comput. Oper. Res. 21, which ends after finitely many changes
+   if there are no discs).
 
 The result is the solution, to about rounding, for the active set that both signs
 confirm. It is computed without any of the solvers under test.
@@ -21,16 +27,17 @@ confirm. It is computed without any of the solvers under test.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_array, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
-from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals, no_rows
+from mortarbench.harness import QP, Discs, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
+from mortarbench.harness.sets.blocks import norms
 
 Mask = NDArray[np.bool_]
 
@@ -45,6 +52,9 @@ ROUNDING_RESIDUAL = 1e-14
 #: Multipliers of the wrong sign and violations of bounds count as rounding below this
 #: value, relative to the largest multiplier or component.
 SIGN_ROUNDING = 1e-12
+#: angle between x and the normal at which a disc was linearised, in radians: Newton's
+#: method then leaves an error of its square
+MAX_TURN = 1e-7
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 
 
@@ -64,23 +74,20 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """
     task = _Task.of(qp)
     point = task.zero_point() if start is None else _Point.of(start)
-    fixed = (point.z != 0) | (task.lower == task.upper)
-    # the nearer bound, not the sign of z: a multiplier near zero may have either sign
-    below = point.x - task.lower <= task.upper - point.x
-    lower, upper = fixed & below, fixed & ~below
+    face = task.first_face(point)
     fewest, patience = np.inf, PATIENCE
     for faces in range(1, MAX_FACES + 1):
-        point = task.minimise_on_face(point.x, lower, upper)
-        below, above = task.next_active_set(point, lower, upper)
-        wrong = (below != lower) | (above != upper)
+        point = task.minimise_on_face(point.x, face)
+        following = task.next_face(point, face)
+        wrong = face.state != following.state
         changes = task.total(float(np.count_nonzero(wrong)))
-        if not changes:
+        if not changes and task.is_normal(point, face):
             return _check_residual(qp, task, point, faces)
         patience = PATIENCE if changes < fewest else patience - 1
         fewest = min(fewest, changes)
-        if patience < 0:
+        if patience < 0 and changes:
             wrong = task.only_last(wrong)
-        lower, upper = np.where(wrong, below, lower), np.where(wrong, above, upper)
+        face = following._replace(state=np.where(wrong, following.state, face.state))
     raise ArithmeticError(
         f"the reference solve over ranks found no active set in {MAX_FACES} trials"
     )
@@ -89,15 +96,14 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
 def _check_residual(qp: QP, task: _Task, point: _Point, faces: int) -> Solution:
     s = Solution(
         status=Status.SOLVED,
-        x=distributed(point.x, task.G.ranks),
+        x=distributed(task.discs.project(point.x), task.G.ranks),
         y=point.y,
         z=np.zeros(0),
         z_box=distributed(point.z, task.G.ranks),
         iterations=faces,
         counts={"P_products": task.products},
     )
-    none = DistributedColumns(no_rows(point.x.size), task.G.ranks)
-    worst = kkt_residuals(replace(qp, G=none), s).worst
+    worst = kkt_residuals(qp, s).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
         raise ArithmeticError(
             f"the reference solve over ranks left a residual of {worst:.1e}, more than "
@@ -111,12 +117,22 @@ class _Point(NamedTuple):
 
     x: Vector  #: (n,)
     y: Vector  #: (r,) multipliers of Gx = e, on every rank
-    z: Vector  #: (n,) multipliers of bounds; negative at a lower one
+    z: Vector  #: (n,) normal to the sets: negative at a lower bound
 
     @classmethod
     def of(cls, s: Solution) -> _Point:
         """Return the local components of a solution."""
         return cls(np.asarray(s.x), np.asarray(s.y), np.asarray(s.z_box))
+
+
+class _Face(NamedTuple):
+    """Components at bounds, and discs that are linearised on their boundary."""
+
+    #: (n + k,) of components, −1 at the lower bound, 1 at the upper one, else 0; then
+    #: of discs, 1 on the boundary
+    state: NDArray[np.int8]
+    normal: NDArray[np.float64]  #: (k, d) outward unit normals
+    curvature: Vector  #: (k,) η ≥ 0
 
 
 @dataclass(eq=False)
@@ -130,12 +146,19 @@ class _Task:
     q: Vector
     lower: Vector
     upper: Vector
+    discs: Discs  #: the local ones
+    length: Vector  #: (k,) γ of each disc, a length divided by a force
     products: int = 0
 
     @classmethod
     def of(cls, qp: QP) -> _Task:
         M = qp.P.preconditioner("dirichlet", "stiffness")
         q, lower, upper = (np.asarray(v) for v in (qp.q, qp.lb, qp.ub))
+        discs = Discs(np.zeros((0, 2), dtype=np.int64), np.zeros(0))
+        for one in qp.sets[1:]:
+            assert isinstance(one, Discs)
+            discs = Discs(one.index, np.asarray(one.radius))
+        diagonal = np.asarray(qp.P.diagonal())
         return cls(
             lambda x: np.asarray(qp.P @ x),
             lambda x: np.asarray(M(x)),
@@ -144,6 +167,8 @@ class _Task:
             q,
             lower,
             upper,
+            discs,
+            1 / diagonal[discs.index].mean(axis=1),
         )
 
     def zero_point(self) -> _Point:
@@ -172,14 +197,35 @@ class _Task:
         self.products += 1
         return self.F(x) + self.q
 
-    def minimise_on_face(self, x: Vector, lower: Mask, upper: Mask) -> _Point:
-        """Minimise on the face where the masked components are at their bounds.
+    def moving(self, face: _Face) -> tuple[csr_array, Vector]:
+        """Return the projector (n, n) onto a face, and its origin (n,).
+
+        The origin is x where it does not move, and zero on the directions of the face.
+        """
+        n, (index, radius) = self.q.size, (self.discs.index, self.discs.radius)
+        at_bound, sliding = face.state[:n], self.on_disc(face)
+        free = (at_bound == 0).astype(float)
+        origin = np.where(at_bound < 0, self.lower, self.upper)
+        origin[at_bound == 0] = 0.0
+        free[index[radius == 0]] = 0.0
+        at, normal = index[sliding], face.normal[sliding]
+        origin[at] = radius[sliding, None] * normal
+        outward = normal[:, :, None] * normal[:, None, :]
+        row, column = np.broadcast_arrays(at[:, :, None], at[:, None, :])
+        across = csr_array((outward.ravel(), (row.ravel(), column.ravel())), (n, n))
+        return csr_array(diags_array(free) - across), origin
+
+    def minimise_on_face(self, x: Vector, face: _Face) -> _Point:
+        """Minimise on a face.
 
         x : start
         """
-        free = ~(lower | upper)
+        moving, origin = self.moving(face)
+        curvature, on_disc = np.zeros(x.size), self.on_disc(face)
+        curvature[self.discs.index] = (face.curvature * on_disc)[:, None]
+        columns = DistributedColumns(csr_array(self.G.part @ moving), self.G.ranks)
         try:
-            coarse = cholesky(csc_matrix(self.G.gram(free)))
+            coarse = cholesky(csc_matrix(columns.gram()))
         except CholmodNotPositiveDefiniteError:
             raise ArithmeticError(
                 "the reference solve over ranks reached a face with linearly dependent "
@@ -187,34 +233,56 @@ class _Task:
             ) from None
 
         def spread(t: Vector) -> Vector:
-            """Return G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹t."""
-            return np.where(free, np.asarray(self.G.T @ coarse(t)), 0.0)
+            """Return Π Gᵀ(G Π Gᵀ)⁻¹t, with the projector Π onto the face."""
+            return np.asarray(columns.T @ coarse(t))
 
         def project(v: Vector) -> Vector:
-            v = np.where(free, v, 0.0)
-            return v - spread(self.G @ v)
+            v = moving @ v
+            return np.asarray(v - spread(self.G @ v))
 
-        x = np.where(lower, self.lower, np.where(upper, self.upper, x))
+        def bent(v: Vector) -> Vector:
+            """Return the curvature of the boundary of discs times v."""
+            return np.asarray(curvature * (moving @ v))
+
+        # M ≈ F⁻¹ is too large where the curvature exceeds F, as on small discs, and it
+        # is zero along redundant rows (friction on supported nodes), which bend as well
+        length = np.zeros(x.size)
+        length[self.discs.index] = (self.length * on_disc)[:, None]
+        soft = 1 / np.sqrt(1 + length * curvature)
+
+        def precondition(v: Vector) -> Vector:
+            """Return an approximation of (F + bent)⁻¹v in the face."""
+            return project(soft * (self.M(soft * v) + length * (soft * v)))
+
+        x = origin + moving @ x
         x += spread(self.e - self.G @ x)
         size = self.norm(project(self.q))
         for _ in range(MAX_CG_ROUNDS):
             # the second projection removes the rounding of the first
-            w = project(project(-self.gradient(x)))
+            w = project(project(-self.gradient(x) - bent(x)))
             if self.norm(w) <= ROUNDING_RESIDUAL * size:
                 break
-            x += self._correction(w, project)
+            x += self._correction(w, project, precondition, bent)
             x += spread(self.e - self.G @ x)
         r = -self.gradient(x)
-        y = coarse(self.G @ np.where(free, r, 0.0))
-        return _Point(x, y, np.where(free, 0.0, r - np.asarray(self.G.T @ y)))
+        y = coarse(columns @ (r - bent(x)))
+        is_free = face.state[: x.size] == 0
+        is_free[self.discs.index[on_disc | (self.discs.radius == 0)]] = False
+        return _Point(x, y, np.where(is_free, 0.0, r - np.asarray(self.G.T @ y)))
 
-    def _correction(self, w: Vector, project: Callable[[Vector], Vector]) -> Vector:
-        """Return d in the face with 𝒫(w − Fd) small, by conjugate gradients."""
+    def _correction(
+        self,
+        w: Vector,
+        project: Callable[[Vector], Vector],
+        precondition: Callable[[Vector], Vector],
+        bent: Callable[[Vector], Vector],
+    ) -> Vector:
+        """Return d in the face with 𝒫(w − Fd − bent(d)) small, by CG."""
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
-        p = y = project(self.M(w))
+        p = y = precondition(w)
         wy = self.total(float(w @ y))
         for _ in range(MAX_CG_STEPS):
-            Fp = self.F(p)
+            Fp = self.F(p) + bent(p)
             self.products += 1
             curvature = self.total(float(p @ Fp))
             if not min(wy, curvature) > 0:  # only rounding along redundant rows is left
@@ -224,21 +292,60 @@ class _Task:
             w = w - alpha * project(Fp)
             if self.norm(w) <= enough:
                 break
-            y = project(self.M(w))
+            y = precondition(w)
             wy, before = self.total(float(w @ y)), wy
             p = y + (wy / before) * p
         return d
 
-    def next_active_set(
-        self, point: _Point, lower: Mask, upper: Mask
-    ) -> tuple[Mask, Mask]:
-        """Return the masks of components to fix at lower and at upper bounds."""
+    def first_face(self, point: _Point) -> _Face:
+        """Return the face on which a solution of a similar problem is."""
+        x, z, index = point.x, point.z, self.discs.index
+        at_bound = (z != 0) | (self.lower == self.upper)
+        # the nearer bound, not the sign of z: a multiplier near zero may have either
+        below = x - self.lower <= self.upper - x
+        at_bound[index] = False
+        state = np.where(at_bound, np.where(below, -1, 1), 0)
+        normal, _ = self._pushes(point)
+        forces, radius = norms(z[index]), self.discs.radius
+        on_disc = (forces > 0) & (radius > 0)
+        return _Face(
+            np.append(state, on_disc).astype(np.int8),
+            normal,
+            forces / np.where(on_disc, radius, 1.0),
+        )
+
+    def next_face(self, point: _Point, face: _Face) -> _Face:
+        """Return the face that the signs of multipliers and violations suggest."""
         x, _, z = point
+        n, radius = x.size, self.discs.radius
         largest = [
             self.G.ranks.extreme(float(abs(v).max(initial=0.0)), np.max) for v in (x, z)
         ]
         off_x, off_z = (SIGN_ROUNDING * v for v in largest)
-        same = self.lower == self.upper
-        below = np.where(lower, (z <= off_z) | same, x < self.lower - off_x)
-        above = np.where(upper, z >= -off_z, x > self.upper + off_x)
-        return below, above & ~below
+        same, state = self.lower == self.upper, face.state[:n]
+        below = np.where(state < 0, (z <= off_z) | same, x < self.lower - off_x)
+        above = np.where(state > 0, z >= -off_z, x > self.upper + off_x) & ~below
+        normal, push = self._pushes(point)
+        slack = np.where(self.on_disc(face), -off_z * self.length, off_x)
+        pushed = (push > radius + slack) & (radius > 0)
+        safe = np.where(radius > 0, radius, 1.0)
+        curvature = np.maximum(push / safe - 1, 0) / self.length
+        state = above.astype(np.int8) - below.astype(np.int8)
+        return _Face(np.append(state, pushed).astype(np.int8), normal, curvature)
+
+    def on_disc(self, face: _Face) -> Mask:
+        """Return the discs (k,) that are linearised on their boundary."""
+        return np.asarray(face.state[self.q.size :] > 0)
+
+    def is_normal(self, point: _Point, face: _Face) -> bool:
+        """Return True if x is normal to the boundary of discs, up to `MAX_TURN`."""
+        on, across = self.on_disc(face), np.asarray(self.moving(face)[0] @ point.x)
+        turn = norms(across[self.discs.index])[on] / self.discs.radius[on]
+        return self.G.ranks.extreme(float(turn.max(initial=0.0)), np.max) <= MAX_TURN
+
+    def _pushes(self, point: _Point) -> tuple[NDArray[np.float64], Vector]:
+        """Return w/‖w‖ (k, d) and ‖w‖ (k,) of discs, with w = x_I + γz_I."""
+        index = self.discs.index
+        w = point.x[index] + self.length[:, None] * point.z[index]
+        size = norms(w)
+        return w / np.where(size > 0, size, 1.0)[:, None], size

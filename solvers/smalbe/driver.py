@@ -490,7 +490,8 @@ def recovered(
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)
     for one, active in boundaries:
         at_disc = one.index[active]
-        z_box[at_disc] = _normal_part(x[at_disc], -r[at_disc])
+        outward = np.asarray(x)[at_disc], -np.asarray(r)[at_disc]
+        z_box[at_disc] = _normal_part(*outward)
     return x, a, z_box, Fx
 
 
@@ -523,12 +524,11 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
-    over = task.problem.F.over
-    bound = np.inf
     if not task.problem.discs:
+        over = task.problem.F.over
         bound = compiled.residual_bound(qp, point, Fx, diagonal, G, over)
-    if bound <= enough or isinstance(qp.q, DistributedVector):
-        return bound
+        if bound <= enough or isinstance(qp.q, DistributedVector):
+            return bound
     task.problem.F.count += 1
     return kkt_residuals(qp, point).worst
 

@@ -25,10 +25,10 @@ cdef struct Parts:
 cdef class FeasibleSet:
     """The box l ≤ x ≤ u, and discs of variables that have no bounds.
 
-    Vectors may be distributed over processes, but not with discs. Each operation passes
-    over its vectors once and accumulates all sums that the step needs: separate
-    operations would read each vector several times per CG step. A disc is free or
-    active as a whole (discs.h).
+    Vectors may be distributed over processes, with each disc on one of them. Each
+    operation passes over its vectors once and accumulates all sums that the step needs:
+    separate operations would read each vector several times per CG step. A disc is free
+    or active as a whole (discs.h).
     """
 
     cdef Py_ssize_t n
@@ -36,7 +36,8 @@ cdef class FeasibleSet:
     cdef const double *upper
     cdef const double *upper_if_any  # NULL where all are inf
     cdef Reduction over
-    cdef discs D  # its count is zero without discs
+    cdef discs D  # of this process; its count may be zero
+    cdef bint has_discs  # on any process
     cdef object arrays  # keeps the memory that D points to
 
     @staticmethod
@@ -51,9 +52,9 @@ cdef class FeasibleSet:
         return new
 
     cdef int add_discs(self, sets, const double *shift) except -1:
-        """Add discs ‖x_I + shift_I‖ ≤ r.
+        """Add discs ‖x_I + shift_I‖ ≤ r; called by all processes, or by none.
 
-        sets : `harness.sets.discs.Discs`
+        sets : `harness.sets.discs.Discs`, at least one, with the discs of this process
         shift : (n,), NULL for zero
         """
         cdef const int[::1] start, index
@@ -67,12 +68,13 @@ cdef class FeasibleSet:
         start = starts.astype(np.int32)
         indices = np.concatenate([one.index.ravel() for one in sets])
         index = indices.astype(np.int32)
-        radius = np.concatenate([one.radius for one in sets])
+        radius = np.concatenate([np.asarray(one.radius) for one in sets])
         slack = np.empty(len(sizes))
         is_off = np.ones(self.n + 2, dtype=bool)
         is_off[indices + 1] = is_off[0] = is_off[self.n + 1] = False
         ranges = np.flatnonzero(np.diff(is_off)).astype(np.intp)
         self.arrays = start, index, radius, slack, ranges
+        self.has_discs = True
         self.D.count, self.D.ranges = len(sizes), ranges.size // 2
         self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
         self.D.slack, self.D.centre = &slack[0], shift
@@ -103,7 +105,7 @@ cdef class FeasibleSet:
     cdef int lengths(self, const double *x, const double *g, const double *p,
                      const double *Hp, Line *line) except -1:
         """Compute the step lengths along x − αp."""
-        if self.over.ranks is None and not self.D.count:
+        if self.over.ranks is None and not self.has_discs:
             lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
             return 0
         line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
@@ -116,7 +118,7 @@ cdef class FeasibleSet:
         """Return the largest α for which the components of this process stay in the set."""
         cdef double least = INFINITY
         cdef Py_ssize_t i, o, size
-        if not self.D.count:
+        if not self.has_discs:
             return first_bound(x, p, self.lower, self.upper_if_any, self.n)
         for i in range(self.D.ranges):
             o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
@@ -148,7 +150,7 @@ cdef class FeasibleSet:
         """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""
         cdef Py_ssize_t i, o, size
         cdef double sums[3]
-        if self.D.count:
+        if self.has_discs:
             parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
             for i in range(self.D.ranges):
                 o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
@@ -158,7 +160,7 @@ cdef class FeasibleSet:
                 parts.beta_square += sums[1]
                 parts.reduced_square += sums[2]
             split_discs(&self.D, x, g, tau, phi, free, &parts.phi_square)
-            return 0
+            return self.over.add(&parts.phi_square, 3)
         split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 3)
 
@@ -174,7 +176,7 @@ cdef class FeasibleSet:
         """
         cdef Py_ssize_t i, o, size
         cdef double sums[4]
-        if self.D.count:
+        if self.has_discs:
             parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
             parts.phi_Hp = 0.0
             for i in range(self.D.ranges):
@@ -187,7 +189,7 @@ cdef class FeasibleSet:
                 parts.reduced_square += sums[2]
                 parts.phi_Hp += sums[3]
             advance_discs(&self.D, alpha, x, g, p, Hp, tau, phi, free, &parts.phi_square)
-            return 0
+            return self.over.add(&parts.phi_square, 4)
         advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
                 self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 4)
@@ -255,14 +257,14 @@ cdef class FeasibleSet:
             s[self.D.index[i]] *= -1
 
     cdef double step_back(self, const double *x, const double *g, double tau, double *s,
-                          double *square) noexcept:
-        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs. Only for one process."""
+                          double *square) except? -1:
+        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs."""
         cdef double sums[2]
         cdef Py_ssize_t i, j, first, last
         sums[:] = [0.0, 0.0]
-        for i in range(max(self.D.ranges, not self.D.count)):
+        for i in range(self.D.ranges if self.has_discs else 1):
             first, last = 0, self.n
-            if self.D.count:
+            if self.has_discs:
                 first, last = self.D.range[2 * i], self.D.range[2 * i + 1]
             for j in range(first, last):
                 s[j] = x[j] - fmin(fmax(x[j] - g[j] / tau, self.lower[j]), self.upper[j])
@@ -270,6 +272,7 @@ cdef class FeasibleSet:
                 sums[1] += s[j] * s[j]
         if self.D.count:
             step_on_discs(&self.D, x, g, 1 / tau, False, s, sums)
+        self.over.add(sums, 2)
         square[0] = sums[1]
         return sums[0]
 
@@ -331,14 +334,13 @@ cdef class FeasibleSet:
         """
         cdef double energy = 0.0
         cdef Py_ssize_t i, o, size
-        if self.D.count:
+        if self.has_discs:
             for i in range(self.D.ranges):
                 o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
                 energy += inward_energy(x + o, g + o, self.lower + o, self.upper + o,
                                         diagonal + o, norm, noise, size)
-            return energy + inward_energy_of_discs(
-                &self.D, x, g, diagonal, norm, noise
-            )
+            energy += inward_energy_of_discs(&self.D, x, g, diagonal, norm, noise)
+            return self.over.total(energy)
         return self.over.total(inward_energy(
             x, g, self.lower, self.upper, diagonal, norm, noise, self.n
         ))

@@ -294,7 +294,7 @@ cdef class MPRGP:
         cdef double weight, began, gamma = 0.0  # of the deferred update p ← φ − γp
         self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
             not self.is_preconditioned()
-        ) and not self.set.D.count and self.expansion != SPECTRAL
+        ) and not self.set.has_discs and self.expansion != SPECTRAL
         self.cost_now, self.n_costs = 0.0, 0
         self.settled, self.patience = 0, SETTLED_FACE
         self.record_cost(0.0)
@@ -487,7 +487,7 @@ cdef class MPRGP:
         raised; the line search decreases the cost in either case.
         """
         cdef double length
-        if self.set.D.count:  # where a longer or shorter step leaves curved boundaries
+        if self.set.has_discs:  # where a longer or shorter step leaves curved boundaries
             length = self.searched_projection(self.B.tau, 0.0)
         else:
             self.B.step(self.x, self.g, self.set, self.s)
@@ -536,7 +536,8 @@ cdef class MPRGP:
             self.directions.begin(self.free)
             self.first_direction()
         return self.expansion == SPECTRAL and self.spectral_length > 0 and (
-            self.set.feasible_length(self.x, self.p) < self.spectral_length
+            self.over.least(self.set.feasible_length(self.x, self.p))
+            < self.spectral_length
         )
 
     cdef int step_spectrally(self) except -1:
@@ -634,7 +635,7 @@ cdef class MPRGP:
         if not square:
             return 0
         self.H(self.s, self.Hs)
-        line.curvature = dot(self.s, self.Hs, self.n)
+        line.curvature = self.over.total(dot(self.s, self.Hs, self.n))
         # gᵀs ≥ τ‖s‖² for projections. At the end of a run rounding of the large normal
         # components of g hides it, and the step would be refused.
         line.slope = fmax(line.slope, tau * square)
@@ -708,7 +709,7 @@ cdef class MPRGP:
         )
         self.record_cost(change_along(&self.line, length))
         if self.expansion == SPECTRAL:
-            self.spectral_length = dot(self.p, self.p, self.n) / curvature
+            self.spectral_length = self.over.total(dot(self.p, self.p, self.n)) / curvature
         if drifts and self.line.slope <= 0:
             length = 0.0
         elif not self.in_two:
@@ -795,7 +796,9 @@ cdef class MPRGP:
         """Step to the boundary, then spectrally unless that was most of the CG step."""
         cdef double feasible = self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
-            self.spectral_length = dot(self.p, self.p, self.n) / self.line.curvature
+            self.spectral_length = (
+                self.over.total(dot(self.p, self.p, self.n)) / self.line.curvature
+            )
         self.record_cost(change_along(&self.line, feasible))
         self.to(feasible, self.p, self.Hp, False)
         return feasible > LONG_STEP * cg or self.step_spectrally()

@@ -138,9 +138,9 @@ cdef class SMALBE(MPRGP):
                 self.above.at[i] += (value[i - r] + residual[i - r]) / self.norm
         if not self.n_directions:
             return 0
-        while first < n and not self.set.has_bound(first) and not self.set.D.count:
+        while first < n and not self.set.has_bound(first) and not self.set.has_discs:
             first += 1
-        while last > first and not self.set.has_bound(last - 1) and not self.set.D.count:
+        while last > first and not self.set.has_bound(last - 1) and not self.set.has_discs:
             last -= 1
         basis = DenseBasis.zeros(self.n_directions, n, first, last - first)
         memcpy(basis.U, self.rows.C, r * n * sizeof(double))
@@ -446,7 +446,7 @@ cdef class SMALBE(MPRGP):
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
         cdef list owners = []
-        if self.set.D.count:
+        if self.set.has_discs:
             return None
         restored_x, multipliers, boxes, product = empty(n), zeros(r), zeros(n), empty(n)
         cdef Room room = Room(r * r if self.rows.C else 0)

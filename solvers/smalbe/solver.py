@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from mortarbench.harness import QP, About, Box, Discs, Solution
-from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe.driver import Carry, prepared
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import missing_data
@@ -63,8 +62,6 @@ class SMALBE(Options):
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
             return "takes bounds and equality rows, no inequality rows"
-        if len(qp.sets) > 1 and isinstance(qp.q, DistributedVector):
-            return "takes discs on one process only"
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
