@@ -151,9 +151,14 @@ def on_ranks() -> None:
 Column = tuple[str, Callable[[Row], str]]
 
 
+def digits(x: float) -> str:
+    """Return three significant digits, or all digits before the point."""
+    return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
+
+
 def number(head: str, name: str, unit: float = 1.0) -> Column:
     """Return a column of measurements, in units of `unit`; "–" for those left out."""
-    return head, lambda r: f"{r.measured[name] / unit:.3g}" if shows(r, name) else "–"
+    return head, lambda r: digits(r.measured[name] / unit) if shows(r, name) else "–"
 
 
 def model(name: str, of: Callable[[Row], float], unit: float = 1.0) -> Column:
@@ -164,8 +169,9 @@ def model(name: str, of: Callable[[Row], float], unit: float = 1.0) -> Column:
         if not shows(r, name):
             return "–"
         if not value:
-            return f"{prediction / unit:.3g}"
-        return f"{prediction / unit:.3g} ({100 * (prediction / value - 1):+.0f} %)"
+            return digits(prediction / unit)
+        off = f"{100 * (prediction / value - 1):+.0f}".replace("-", "−")
+        return f"{digits(prediction / unit)} ({off} %)"
 
     return "model", cell
 
