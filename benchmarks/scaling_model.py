@@ -1,15 +1,18 @@
-"""Parameters of the cost model on this machine, and its form against 1, 2 and 4 ranks.
+"""Parameters of the cost model on this machine, and its form on ranks and clusters.
 
-`python -m benchmarks.scaling_model` prints the table of docs/scaling-model.md that
-depends on the machine. All times are the smallest of many calls, because other programs
-on the machine only lengthen them. More ranks than CPUs share these; messages then wait
-for their receivers, so only the local part is meaningful.
+`python -m benchmarks.scaling_model` prints the tables of docs/scaling-model.md that
+depend on the machine, in Markdown. `cube-wall/n=32/feti=4` has 512 congruent subdomains
+of 107 811 dofs. All times are the smallest of many calls, because other programs on the
+machine only lengthen them. More ranks than CPUs share these; messages then wait for
+their receivers, so that only the times of local products are printed.
 """
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -20,80 +23,225 @@ import mortarbench as mb
 from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.problems.experiments.scaling_model import (
+    REDUCTIONS,
     Distribution,
     Machine,
+    Prediction,
     predict,
 )
+from mortarbench.problems.feti.blocks import BlockDiagonal
+from mortarbench.solvers.smalbe.rows import equality_rows
+from mortarbench.solvers.smalbe.solver import SMALBE
 
-CASE, SUBDOMAINS, CELLS = "cube-wall/n=32/feti=8/dual", 64, 8
-RANKS = (1, 2, 4)
+SIDE, CELLS, TOL = 8, 4, 1e-6  #: subdomains per side, H/h, tolerance of a solve
+RANKS, CLUSTERS = (1, 2, 4), (1, 2, 4)
 CALLS = 60
+LOCAL, DISTINCT = "local products, s", "local products of distinct blocks, s"
+PRODUCT, COARSE = "product and projection, s", "coarse unknowns"
+SENT, MESSAGES = "bytes per product", "messages per product"
+APPLICATIONS, REDUCED = "applications", "reductions per application"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Measurements of one number of ranks and one cluster, beside the model."""
+
+    ranks: int
+    cluster: int
+    measured: dict[str, float]
+    machine: dict[str, float]  #: fields of `Machine`
+
+    @property
+    def run(self) -> Distribution:
+        """The distribution that was measured."""
+        return Distribution(
+            cores=self.ranks, per_core=SIDE**3 / self.ranks, cells=CELLS,
+            cluster=self.cluster, congruent=True,
+        )  # fmt: skip
+
+    @property
+    def model(self) -> Prediction:
+        """Prediction with the speeds that the same ranks had just before."""
+        return predict(self.run, Machine(**self.machine))
 
 
 def smallest(work: Callable[[], object]) -> float:
-    """Return the smallest time of many calls, s."""
+    """Return the smallest time of many calls on the slowest rank, s."""
     times = []
     for _ in range(CALLS):
         start = perf_counter()
         work()
         times.append(perf_counter() - start)
-    return min(times)
+    slowest: float = MPI.COMM_WORLD.allreduce(min(times), MPI.MAX)
+    return slowest
 
 
-def measured() -> Machine:
+def speeds() -> Machine:
     """Return the speeds of a core and of messages between ranks.
 
     One triangle of 64 MiB passes through memory; the block of a subdomain multiplies
-    the vectors of 32 congruent ones.
+    the vectors of 64 congruent ones.
     """
     n, m = 4096, Distribution(cores=1, cells=CELLS).block
     packed, x = np.ones(n * (n + 1) // 2), np.ones(n)
-    block, columns = np.ones((m, m), order="F"), np.ones((m, 32), order="F")
+    block, columns = np.ones((m, m), order="F"), np.ones((m, 64), order="F")
     bandwidth = packed.nbytes / smallest(lambda: dspmv(n, 1.0, packed, x))
-    rate = 2.0 * m * m * 32 / smallest(lambda: dgemm(1.0, block, columns))
-    speeds = network(MPI.COMM_WORLD)
+    rate = 2.0 * m * m * 64 / smallest(lambda: dgemm(1.0, block, columns))
+    between = network(MPI.COMM_WORLD)
     return Machine(
         bandwidth=bandwidth, rate=rate, node_bandwidth=bandwidth,
-        latency=speeds["message_seconds"], seconds_per_byte=speeds["seconds_per_byte"],
+        latency=between["message_seconds"],
+        seconds_per_byte=between["seconds_per_byte"],
     )  # fmt: skip
 
 
-def main() -> None:
-    """Print a row of the table; without MPI, start this module on all `RANKS`."""
-    if len(sys.argv) == 1:
-        print("ranks | block products, ms | model | sent, kB | model | GB/s, Gflop/s")
-        for n in RANKS:
-            command = ["mpiexec", "-n", str(n), sys.executable, "-m",
-                       "benchmarks.scaling_model", "rank"]  # fmt: skip
-            subprocess.run(command, check=True)
-        return
+def distinct() -> float:
+    """Return the time of local products if no two subdomains share a block, s."""
+    n = Distribution(cores=1, cells=CELLS).block
+    count = SIDE**3 // MPI.COMM_WORLD.size
+    triangles = [np.ones(n * (n + 1) // 2) for _ in range(count)]
+    blocks, x = BlockDiagonal(triangles, [n] * count, [1] * count), np.ones(n * count)
+    return smallest(lambda: blocks(x))
+
+
+def measured(cluster: int) -> dict[str, float]:
+    """Return counts and times of a product and a projection, and counts of a solve."""
+    world = MPI.COMM_WORLD
+    joined = "" if cluster == 1 else f"/cluster={cluster}"
+    qp = mb.build(f"cube-wall/n={SIDE * CELLS}/feti={CELLS}{joined}/dual").qp
+    ranks = Ranks(world)
+    share = qp.P.build().share(qp, ranks).qp
+    blocks, x = share.P.local.inverse_map, np.ones(share.q.size)
+    X = np.ones(blocks.shape[1])
+    rows = equality_rows(share.A, share.b, np.isfinite(np.asarray(share.lb)))
+    local = smallest(lambda: blocks(X))
+    together = smallest(lambda: rows.project(share.P @ x))
+    ranks.clear()
+    share.P @ x
+    product = dict(ranks.counts)
+    solve = SMALBE().prepare(share, TOL)
+    ranks.clear()
+    counts = solve().counts
+    qp.P.forget()
+    return {
+        LOCAL: local, PRODUCT: together, COARSE: qp.A.shape[0],
+        SENT: world.allreduce(product["bytes"], MPI.MAX),
+        MESSAGES: world.allreduce(product["messages"], MPI.MAX),
+        APPLICATIONS: counts["P_products"] + counts["preconditioner_applies"],
+        # every application sends as many messages as a product; a single rank none
+        REDUCED: ranks.counts["reductions"] * product["messages"]
+        / max(ranks.counts["messages"], 1),
+    }  # fmt: skip
+
+
+def on_ranks() -> None:
+    """Print the measurements of this number of ranks as JSON."""
     world = MPI.COMM_WORLD
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})  # as for ranks of a run
-    machine = measured()
-    ranks = Ranks(world)
-    qp = mb.build(CASE).qp
-    share = qp.P.build().share(qp, ranks).qp
-    x, times = np.ones(share.q.size), []
-    for _ in range(CALLS):
-        ranks.clear()
-        share.P @ x
-        times.append(ranks.seconds["products"])
-    local = world.reduce(min(times), MPI.MAX)
-    sent = world.reduce(ranks.counts["bytes"], MPI.MAX)
-    if world.rank == 0:
-        shared = Distribution(
-            cores=world.size, per_core=SUBDOMAINS / world.size, cells=CELLS,
-            congruent=True,
-        )  # fmt: skip
-        model = predict(shared, machine)
-        print(
-            f"{world.size} | {1e3 * local:.1f} | {1e3 * model.local:.1f} | "
-            f"{sent / 1e3:.1f} | {model.sent / 1e3:.1f} | "
-            f"{machine.bandwidth / 1e9:.1f}, {machine.rate / 1e9:.1f}; message "
-            f"{1e6 * machine.latency:.1f} µs, {1e9 * machine.seconds_per_byte:.2f} ns/B"
-        )
+    machine, different = speeds(), distinct()
+    for cluster in CLUSTERS:
+        results = {DISTINCT: different, **measured(cluster)}
+        if world.rank == 0:
+            row = Row(ranks=world.size, cluster=cluster, measured=results,
+                      machine=asdict(machine))  # fmt: skip
+            print(json.dumps(asdict(row)), flush=True)
+
+
+Column = tuple[str, Callable[[Row], str]]
+
+
+def digits(x: float) -> str:
+    """Return three significant digits, or all digits before the point."""
+    return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
+
+
+def number(head: str, name: str, unit: float = 1.0) -> Column:
+    """Return a column of measurements, in units of `unit`; "–" for those left out."""
+    return head, lambda r: digits(r.measured[name] / unit) if shows(r, name) else "–"
+
+
+def model(name: str, of: Callable[[Row], float], unit: float = 1.0) -> Column:
+    """Return a column of predictions with their deviations from measurements."""
+
+    def cell(r: Row) -> str:
+        value, prediction = r.measured[name], of(r)
+        if not shows(r, name):
+            return "–"
+        if not value:
+            return digits(prediction / unit)
+        off = f"{100 * (prediction / value - 1):+.0f}".replace("-", "−")
+        return f"{digits(prediction / unit)} ({off} %)"
+
+    return "model", cell
+
+
+def shows(r: Row, name: str) -> bool:
+    """Return True if a measurement is meaningful on this number of ranks."""
+    if name == REDUCED:
+        return r.ranks > 1
+    return name != PRODUCT or r.ranks <= len(os.sched_getaffinity(0))
+
+
+def table(rows: list[Row], *columns: Column) -> None:
+    """Print a table in Markdown; the first column is the number of ranks."""
+    every = (("ranks", lambda r: str(r.ranks)), *columns)
+    print("\n| " + " | ".join(head for head, _ in every) + " |")
+    print("|" + " --: |" * len(every))
+    for row in rows:
+        print("| " + " | ".join(cell(row) for _, cell in every) + " |")
+
+
+def main() -> None:
+    """Measure on all `RANKS`, and print the tables."""
+    rows = []
+    for n in RANKS:
+        command = ["mpiexec", "-n", str(n), sys.executable, "-m",
+                   "benchmarks.scaling_model", "rank"]  # fmt: skip
+        lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        rows += [Row(**json.loads(line)) for line in lines.stdout.splitlines()]
+    alone = {r.cluster: r.measured[APPLICATIONS] for r in rows if r.ranks == 1}
+    cluster: Column = ("$m$", lambda r: str(r.cluster))
+    growth: Column = (
+        "relative to $m = 1$, $\\sqrt m$",
+        lambda r: f"{r.measured[APPLICATIONS] / alone[1]:.2f}, {r.model.steps:.2f}",
+    )
+    table(
+        rows, cluster,
+        number("coarse unknowns", COARSE), model(COARSE, lambda r: r.run.coarse),
+        number("applications", APPLICATIONS), growth,
+        number("messages", MESSAGES),
+        model(MESSAGES, lambda r: 2 * r.run.neighbours),
+        number("sent, kB", SENT, 1e3), model(SENT, lambda r: r.model.sent, 1e3),
+        number("reductions", REDUCED), model(REDUCED, lambda _: REDUCTIONS),
+    )  # fmt: skip
+    table(
+        rows, cluster,
+        number("local, ms", LOCAL, 1e-3),
+        model(LOCAL, lambda r: r.model.local + r.model.joints, 1e-3),
+        number("product and projection, ms", PRODUCT, 1e-3),
+        model(PRODUCT, lambda r: r.model.seconds, 1e-3),
+    )  # fmt: skip
+    different = [r for r in rows if r.cluster == 1]
+    table(
+        different,
+        ("GB/s", lambda r: f"{r.machine['bandwidth'] / 1e9:.1f}"),
+        ("Gflop/s", lambda r: f"{r.machine['rate'] / 1e9:.1f}"),
+        ("message, µs", lambda r: f"{1e6 * r.machine['latency']:.1f}"),
+        ("ns/B", lambda r: f"{1e9 * r.machine['seconds_per_byte']:.2f}"),
+        number("distinct blocks, ms", DISTINCT, 1e-3),
+        model(
+            DISTINCT,
+            lambda r: predict(
+                replace(r.run, congruent=False), Machine(**r.machine)
+            ).local,
+            1e-3,
+        ),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    if len(sys.argv) == 1:
+        main()
+    else:
+        on_ranks()
