@@ -155,7 +155,8 @@ class ContactSide:
     push: Vector | None = None
     #: (s,) tangential traction on the side, Pa; in space its size
     shear: Vector | None = None
-    #: (s,) "open", "stick", "slip" or `SLIDING`; older files have "open" for `SLIDING`
+    #: (s,) "open", "stick", "slip" or `SLIDING`, "" for nodes without a contact row;
+    #: old files have "open" for the last two
     friction: NDArray[Any] | None = None
     friction_force: NDArray[Any] | None = None  #: (s, dim) part of `force`, tangential
     #: (k, 3) exact solution, if known: distance along the side from its middle, m,

@@ -269,7 +269,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     """Return reasons to doubt a verified answer, a line each.
 
     The QP is solved, but the certified bound may be weak or the model inadequate: no
-    contact, or displacements too large for linear kinematics.
+    contact, contact at a single node, or displacements too large for linear kinematics.
     """
     if record.verdict is not Verdict.VERIFIED or solution is None:
         return ()
@@ -294,6 +294,12 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
                 "no node is in contact: the sides stay apart, and the answer is that "
                 "of bodies without contact; check the direction of the load and the "
                 "initial gap"
+            )
+        elif record.quantities.get("active") == 1 < record.quantities["contact_rows"]:
+            reasons.append(
+                "a single node is in contact: its pressure is the force over the share "
+                "of the side that belongs to the node, and grows on finer meshes; "
+                "refine the mesh near the contact"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)

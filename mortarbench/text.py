@@ -28,6 +28,13 @@ UNITS = {
     "contact_force": "N/m",
     "multiplier_sum": "N/m",
     "max_von_mises": "Pa",
+    "tangential_force": "N/m",
+    "stick_area": "m²",
+    "stick_radius": "m",
+    "displacement": "m",
+    "normal_force": "N per m",
+    "tangential_sum": "N per m",
+    "published_error": "(relative)",
     "stress_error": "(dimensionless)",
 }
 _CONTACTS = "contacts"  #: quantity with a table for each pair of sides

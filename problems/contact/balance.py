@@ -98,7 +98,11 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         for name, centre, part in zip(bodies.names, centres, parts, strict=True)
         if np.abs(part).max() > _MIN_MOTION * np.abs(parts).max()
     ]
-    raise InputError(_imbalance_message(moving, size))
+    held = {
+        bodies.names[b]
+        for b in bodies.body_of_node[bodies.B_D.indices // bodies.mesh.dim]
+    }
+    raise InputError(_imbalance_message(moving, size, held))
 
 
 def check_friction(
@@ -224,8 +228,21 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     return np.asarray(load - A @ forces)
 
 
-def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
-    """Return the message about an unbalanced force or moment."""
+def _imbalance_message(moving: list[_BodyMotion], size: float, held: set[str]) -> str:
+    """Return the message about an unbalanced force or moment.
+
+    held : names of bodies with a support; of several that move together, the message
+        names those without
+    """
+    names = [body.name for body in moving]
+    its = "its" if len(names) == 1 else "their"
+    loose = [name for name in names if name not in held] if len(names) > 1 else []
+    free = (
+        f"; {' and '.join(map(repr, loose))} {'have' if len(loose) > 1 else 'has'} no "
+        "support"
+        if loose
+        else ""
+    )
     turning = max(moving, key=lambda body: float(np.abs(body.rotation).max()))
     sliding = max(moving, key=lambda body: float(np.abs(body.velocity).max()))
     most = float(np.abs(sliding.velocity).max())
@@ -235,12 +252,11 @@ def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
             for axis, v in zip(_AXES, sliding.velocity, strict=False)
             if abs(v) > _MIN_MOTION * most
         ]
-        names = [body.name for body in moving]
-        whose = "its" if len(names) == 1 else "their"
-        return _message(names, f"{whose} load in {' and '.join(axes)}")
+        return _message(names, f"{its} load in {' and '.join(axes)}{free}")
+    who = "it" if len(names) == 1 else repr(turning.name)
     return _message(
-        [turning.name],
-        f"the moment of its load: it can turn about {_pivot(turning, size)}",
+        names,
+        f"the moment of {its} load: {who} can turn about {_pivot(turning, size)}{free}",
     )
 
 

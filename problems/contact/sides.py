@@ -38,13 +38,13 @@ def contact_sides(
 ) -> tuple[ContactSide, ...]:
     """Return forces, pressures and gaps along the slave side of each pair, in SI units.
 
-    Nodal forces are the sum of contact and friction forces. The pressure is the
-    component of the contact force along the normal of the deformed side, divided by the
-    undeformed length ∫N_j (area in space) assigned to the node. The gap is the slack
-    c − Bu of the row of the node; for mortar contact, it is a weighted mean of the gap
-    around the node. With friction, each node has one of the `states`, and the shear is
-    the friction force along the tangent (−n_y, n_x) divided by this length; in space,
-    it is the magnitude of the friction force divided by this area.
+    The nodal force is the sum of contact and friction. The pressure is the component of
+    the contact force along the normal of the deformed side, divided by the undeformed
+    length ∫N_j (in space, area) that belongs to the node. The gap is the slack c − Bu
+    of the node's row; with mortar contact, this is the mean gap around the node with
+    the weights of the row. With friction, the shear is the friction force along the
+    tangent (−n_y, n_x) over the same length, in space its size over the area, and each
+    node with a row has one of the `states`, any other an empty one.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
@@ -72,7 +72,8 @@ def contact_sides(
         gap[place] = slack[rows]
         push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
         push = np.nan_to_num(push)
-        nodal_state = np.full(len(slave), "open", dtype=state.dtype)
+        nodal_state = np.full(len(slave), "", dtype=state.dtype)
+        nodal_state[place] = "open"
         here = (row >= rows.start) & (row < rows.stop)
         nodal_state[place[row[here] - rows.start]] = state[here]
         along = side.tangents[:, 0] if dim == 2 else unit(shearing, 0 * shearing)

@@ -51,6 +51,7 @@ from mortarbench.problems.duality.feti_dual import (
 from mortarbench.problems.duality.problem import StructuredGrids, StructuredSolids
 from mortarbench.problems.fem.elasticity import (
     Material,
+    Plane,
     elasticity_matrix,
     rigid_modes,
     stiffness,
@@ -67,6 +68,7 @@ from mortarbench.problems.fem.mesh import (
     nodes_of_side,
     rectangle_grid,
 )
+from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 from mortarbench.problems.feti.distributed_dual import LocalDual
 from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.spectrum import (
@@ -115,6 +117,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
             cells=mesh.cells,
             bodies=plate.material,
             displacement=as_vectors(new.recover(s).x * LENGTH, mesh.dim),
+            nodal={"von_mises": plate.von_mises(new.recover(s).x * LENGTH)},
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
@@ -148,7 +151,8 @@ class Plate:
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
-    moduli: Vector  #: (k,) moduli of the materials, steel first
+    moduli: Vector  #: (k,) moduli of the materials, that of steel first
+    plane: Plane | None  #: None in space
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
     parts: DecomposedProblem
@@ -177,6 +181,15 @@ class Plate:
     def clamped(self) -> NDArray[np.int64]:
         """Displacement components at the clamped edge."""
         return _clamped(self.mesh.boundaries, self.mesh.dim)
+
+    def von_mises(self, u: Vector) -> Vector:
+        """Recover the stress (N,) at the nodes, Pa; u in m.
+
+        Nodes between two materials have one value, although the stress jumps there.
+        """
+        D = self.D[self.material] * (LOAD / LENGTH)
+        stress = recover(self.mesh, centre_stress(self.mesh, D, u))
+        return von_mises(stress, STEEL.nu, self.plane)
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
@@ -223,6 +236,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
         subdomain=subdomain,
         material=material,
         moduli=moduli,
+        plane=_plane(p),
         D=D,
         primal=primal,
         parts=parts,
@@ -333,9 +347,13 @@ def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:
 def _stiffness(p: Mapping[str, Any]) -> tuple[Vector, NDArray[np.float64]]:
     """Return non-dimensional moduli (2,) and elasticity matrices (2, v, v)."""
     moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
-    plane = p["plane"] if p["dim"] == 2 else None
     materials = [Material(E, STEEL.nu) for E in moduli]
-    return moduli, np.stack([elasticity_matrix(m, plane) for m in materials])
+    return moduli, np.stack([elasticity_matrix(m, _plane(p)) for m in materials])
+
+
+def _plane(p: Mapping[str, Any]) -> Plane | None:
+    """Return the plane state; None in space."""
+    return p["plane"] if p["dim"] == 2 else None
 
 
 def _clamped(sides: Mapping[str, Nodes], dim: int) -> Nodes:

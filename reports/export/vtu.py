@@ -103,7 +103,7 @@ def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
         if side.friction is not None:
             assert side.shear is not None
             shear[side.nodes] += side.shear
-            states = map(str, np.asarray(side.friction))
+            states = [str(s) or "open" for s in side.friction]
             np.maximum.at(weight, side.nodes, [_BY_WEIGHT.index(s) for s in states])
     nodal = {"pressure": pressure, "gap": gap}
     if any(side.friction is not None for side in sides):
@@ -113,16 +113,19 @@ def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
 
 
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
-    """Write a CSV of one contact, with a row per node along the slave side."""
+    """Write a CSV of one contact, with a row per node of the slave side.
+
+    In the plane, nodes are in the order of the side, and the first column is its arc
+    length; in space they are ascending.
+    """
     # names of pairs come from users: keep letters, digits and dashes
     name = "-".join(re.findall(r"\w+", side.name)) or "contact"
     path = vtu.with_name(f"{vtu.stem}-{name}.csv")
     points = fields.points[side.nodes]
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     u, axes = fields.displacement[side.nodes], "xyz"[: fields.dim]
     extent, unit = ("length_m", "N_per_m") if fields.dim < 3 else ("area_m2", "N")
     columns = {
-        "along_m": np.append(0.0, np.cumsum(steps)),
+        "along_m": _arc_length(points) if fields.dim < 3 else None,
         **{f"{axis}_m": points[:, k] for k, axis in enumerate(axes)},
         **{f"u{axis}_m": u[:, k] for k, axis in enumerate(axes)},
         extent: side.length,
@@ -137,6 +140,12 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     with _named(path), replacing(path) as file:
         file.write(csv_text([*present], rows).encode())
     return path
+
+
+def _arc_length(points: NDArray[np.float64]) -> Vector:
+    """Return the distance (s,) of points along a chain from its first one."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.append(0.0, np.cumsum(steps))
 
 
 def _without_nan(value: float | str) -> float | str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
@@ -71,6 +72,7 @@ _OPEN = "#6b7480"
 _STATES = FRICTION | {"open": (_OPEN, "grey")}
 _OUTLINE = Look(colour=INK, width=0.7)
 _ALONG = 0.9  #: cosine of the angle from an axis, above which normals count as parallel
+_MARGIN = 0.03  #: around arrows at the edge of a panel, relative to its size
 _CREASE = np.radians(40)  #: least angle between faces whose edge is outlined
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
@@ -306,7 +308,13 @@ def _pressure_panel(
     high = np.minimum(middle + half, corners.max(axis=0))
     unit, name = length_unit(float((high - low).max()))
     labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
-    arrows, key = _friction_arrows(fields, side, camera, float((high - low).max()))
+    size = float((high - low).max())
+    arrows, key = _friction_arrows(fields, side, camera, size)
+    if arrows:  # none is cut off at the frame
+        ends = [(mark.feet, mark.feet + mark.vectors) for mark in arrows]
+        shown_ends = np.vstack([*itertools.chain(*ends), low, high])
+        low = shown_ends.min(axis=0) - _MARGIN * size
+        high = shown_ends.max(axis=0) + _MARGIN * size
     return FieldPanel(
         low=_pair(low),
         high=_pair(high),
@@ -321,7 +329,7 @@ def _pressure_panel(
 
 def _friction_arrows(
     fields: Fields, side: ContactSide, camera: Camera, span: float
-) -> tuple[list[FieldMark], str]:
+) -> tuple[list[Vectors], str]:
     """Draw the shear traction on the slave nodes, and count their states.
 
     span : size of the panel, m
@@ -334,7 +342,7 @@ def _friction_arrows(
     largest = float(sizes.max(initial=0.0))
     drawn = 0.12 * span / (largest or 1.0) * camera.project(traction)
     feet, acts = camera.project(fields.points[side.nodes]), sizes > _ACTIVE * largest
-    arrows: list[FieldMark] = [
+    arrows = [
         Vectors(
             feet=feet[of], vectors=drawn[of], colour=colour, width=0.006, cased=True
         )
@@ -523,7 +531,12 @@ def _loaded(fields: Fields) -> list[_Loaded]:
         sides = [("", fields.contact_nodes, fields.contact_forces, None)]
     contacts = []
     for name, nodes, forces, friction in sides:
-        states = np.full(len(nodes), "") if friction is None else friction
+        # nodes without a row may still carry a share of their neighbours' forces
+        states = (
+            np.full(len(nodes), "")
+            if friction is None
+            else np.where(friction == "", "open", friction)
+        )
         size, apart = np.hypot(*forces.T), states == SLIDING
         active = size > _ACTIVE * size.max(initial=0.0)
         if active.any():

@@ -67,7 +67,7 @@ def places(fields: Fields, side: ContactSide) -> Vector:
 def _states(side: ContactSide) -> Vector:
     if side.friction is None:
         return np.full(side.nodes.size, "open")
-    return np.asarray(side.friction)
+    return np.where(side.friction == "", "open", side.friction)
 
 
 def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
