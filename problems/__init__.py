@@ -1,4 +1,4 @@
-"""Registry of families of problems; each emits one problem as QPs of several forms."""
+"""Registry of problem families; each returns a problem as QPs of several forms."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ PROBLEMS: Registry[Family] = Registry(
     }
 )
 
-#: functions that assemble a stored operator P of these families, see
-#: `harness.operators`
+#: functions that restore stored operators P of these families, see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
     {
         "tfeti": entry(

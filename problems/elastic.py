@@ -1,10 +1,10 @@
 """Building blocks of elastic families in plug-ins; the names in `__all__` are stable.
 
 Mesh the bodies, `join` them, `assemble` them with supports, load and contact pairs, and
-emit the QP by `one_step`. See docs/plugins.md for a complete family. Lengths are in m,
-moduli and tractions in Pa, forces in N per m of thickness.
+obtain the QP from `one_step`. See docs/plugins.md for a complete family. Lengths are in
+m, moduli and tractions in Pa, forces in N per m of thickness.
 
-A block of steel, pressed onto another one::
+For example, a steel block is pressed onto another one::
 
     lower = prefixed(rectangle((0.0, 0.0), (1.0, 0.5), (6, 3)), "lower_")
     upper = prefixed(rectangle((0.0, 0.5), (1.0, 0.5), (4, 2)), "upper_")
@@ -112,19 +112,19 @@ def one_step(
     form : "primal", "dual" or, if the supports fix every body, "dual-bounds"
     contact : "nts" (node to segment) or "mortar"
     basis : basis of the multipliers of mortar contact
-    friction : law for the sides of every pair: FrictionLaw("tresca", bound=1e6), in Pa,
-        or FrictionLaw("coulomb", mu=0.3), of which the QP is the last iterate
+    friction : law for every pair: FrictionLaw("tresca", bound=1e6), in Pa, or
+        FrictionLaw("coulomb", mu=0.3), for which the QP is the last fixed-point iterate
     reference : argument of `Family.build`; required by Coulomb's law
-    parts : number of subdomains of all bodies together (Total FETI), with form "dual"
-        only; 0: no decomposition
+    parts : total number of subdomains (Total FETI), for form "dual" only; 0 for no
+        decomposition
     glue : kind of rows that join the copies of a node
 
     Raises
     ------
     InputError
-        When the form is unknown, no slave node faces its master, the load of some body
-        is not balanced, the law of friction is unknown or its value negative, the fixed
-        point does not converge, or `parts` or `glue` is not possible.
+        If the form is unknown, no slave node faces its master, the load of a body
+        cannot be balanced, the friction law is unknown or its parameter negative, the
+        fixed-point iteration does not converge, or `parts` or `glue` is invalid.
 
     """
     if form not in FORMS:
@@ -144,7 +144,7 @@ def one_step(
         bodies=elastic,
         linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
-        # first bound of Coulomb's law: large enough to support bodies by friction
+        # the first bound of Coulomb's law must suffice to support bodies by friction
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )
     choice = Choice(size=parts, glue=glue)
@@ -172,5 +172,5 @@ def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
 
 
 def _no_reference(qp: QP) -> Solution:
-    """Raise AssertionError, in place of a reference solve that is never called."""
+    """Raise AssertionError; stands in for a reference solver that is never called."""
     raise AssertionError("no reference solve was given")

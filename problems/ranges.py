@@ -1,4 +1,4 @@
-"""Declaration of the keys of families: defaults, ranges, conditions between keys.
+"""Declaration of the keys of families: defaults, ranges and conditions between keys.
 
 A failed check raises InputError with one line that states the expected value.
 """
@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 MIN_STRETCH = 0.1  #: smallest stretch of a body under pressure
-#: magnitudes of physical values, SI: products of several stay finite and non-zero
+#: limits of the magnitude of physical values, SI; products of several such values
+#: neither overflow nor underflow
 MIN_SIZE, MAX_SIZE = 1e-30, 1e30
-MAX_STEPS = 10_000  #: most load steps, and most linearisations of each
+MAX_STEPS = 10_000  #: largest number of load steps, and of linearisations per step
 #: lower bound of the memory per displacement component: K and its pattern
 COMPONENT_MIB = 1 / 1024
 
@@ -32,13 +33,13 @@ class Key:
     """One key of a family: its default and its allowed values."""
 
     default: Value
-    least: int | None = None  #: smallest integer; None: no limit
-    most: int | None = None  #: largest integer; None: no limit
-    values: tuple[Value, ...] = ()  #: allowed values; empty: not a list of choices
-    is_size: bool = False  #: positive, between MIN_SIZE and MAX_SIZE
+    least: int | None = None  #: smallest integer; None for no limit
+    most: int | None = None  #: largest integer; None for no limit
+    values: tuple[Value, ...] = ()  #: allowed values; empty if not a choice
+    is_size: bool = False  #: True if the value must be between MIN_SIZE and MAX_SIZE
 
     def with_default(self, default: Value) -> Key:
-        """Return the key with another default."""
+        """Return a copy of the key with another default."""
         return replace(self, default=default)
 
     def check(self, family: str, key: str, params: Mapping[str, Value]) -> None:
@@ -87,21 +88,21 @@ def defaults_of(keys: Keys) -> dict[str, Value]:
 
 HALVINGS = key(0, 0, 30)
 STEPS = key(10, 1, MAX_STEPS)
-#: keys of the contact method; node-to-segment contact ignores basis
+#: keys of the contact method; node-to-segment contact ignores `basis`
 METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
 PLANES = schema(plane=choice("strain", "stress"))
 #: key of the gluing rows, which join the copies of a node (`problems.feti.subdomains`)
 GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
-#: key of clusters: subdomains along a side of a cluster; 0: no clusters
+#: key of clusters: number of subdomains per side of a cluster; 0 for no clusters
 CLUSTERS = schema(cluster=key(0, 0))
-#: keys of a decomposition into subdomains: H/h (0: one piece per body), and the others
+#: keys of a decomposition into subdomains; `feti` is H/h, or 0 for undivided bodies
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
 DIMENSION = schema(dim=choice(2, 3))
-#: keys that families in space do not support yet, with the only value they allow
+#: keys that families in space do not support yet, with their only allowed value
 PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
-#: laws of friction, each with the key of its parameter
+#: friction laws, each with the key of its parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
-#: parameters of the laws of friction, with their allowed values
+#: parameters of the friction laws, with a description of their allowed values
 LAW_PARAMETERS = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
@@ -114,15 +115,15 @@ LAW_KEYS = schema(
     loading=choice("quasi-static", "static"),
 )
 FRICTION = schema(**LAW_KEYS, iterate=key(0, 0))
-#: keys of large deformation; newton=0 is the last iteration
+#: keys of large deformation; newton=0 selects the last iteration
 KINEMATICS = schema(
     kinematics=choice("linear", "finite"),
     material=choice("neo-hooke", "svk"),
     newton=key(0, 0),
 )
-#: key of the second derivatives of the gaps in the tangent
+#: key that adds the second derivatives of the gaps to the tangent
 CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
-#: keys that finite strain does not support, with the only value it allows
+#: keys that finite strain does not support, with their only allowed value
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0,
     "parts": 0,
@@ -130,7 +131,7 @@ LINEAR_ONLY: Mapping[str, Value] = {
     "plane": "strain",
     "relin": 1,
 }
-#: keys that the name of a case of bodies may set, with the defaults of its file
+#: keys of a case of bodies whose defaults a TOML file may set
 SETTINGS = schema(
     **METHODS,
     **PLANES,
@@ -182,8 +183,8 @@ def physical(where: str, value: Any) -> float:
     Raises
     ------
     InputError
-        Unless it is 0 or between MIN_SIZE and MAX_SIZE in magnitude. (For comparison,
-        Young's modulus of steel is 2e11 Pa.)
+        Unless the value is 0 or its magnitude is between MIN_SIZE and MAX_SIZE. (For
+        comparison, Young's modulus of steel is 2e11 Pa.)
 
     """
     if not is_number(value) or not (value == 0 or MIN_SIZE <= abs(value) <= MAX_SIZE):
@@ -195,9 +196,9 @@ def physical(where: str, value: Any) -> float:
 
 
 def check_memory(family: str, components: int) -> None:
-    """Raise InputError for a case that cannot fit into memory, before building it.
+    """Raise InputError for a case that does not fit into memory, before building it.
 
-    components : lower bound of the number of displacement components; each takes at
+    components : lower bound of the number of displacement components; each requires at
         least 1 KiB (stiffness and its pattern), and about 4 KiB with a factor
     """
     needed, limit = components * COMPONENT_MIB, case_limit_mib()
@@ -212,9 +213,9 @@ def check_memory(family: str, components: int) -> None:
 def check_friction(
     family: str, params: Mapping[str, Value], *, elsewhere: bool = False
 ) -> None:
-    """Raise InputError unless the keys of friction are consistent.
+    """Raise InputError unless the friction keys are consistent.
 
-    elsewhere : True if single pairs of sides may have laws of their own
+    elsewhere : True if individual pairs may have their own friction laws
     """
     law = str(params["friction"])
     for key, allowed in LAW_PARAMETERS.items():
@@ -251,7 +252,8 @@ def check_decomposition(
 ) -> None:
     """Raise InputError unless the keys of a decomposition are consistent.
 
-    key, what : key that requests subdomains, and its meaning for the message
+    key : key that requests subdomains
+    what : meaning of this key, for the message
     """
     for name, default in defaults_of({**GLUES, **CLUSTERS}).items():
         if not params[key] and params.get(name, default) != default:
@@ -304,7 +306,7 @@ def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> No
 
 
 def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for friction on arcs: refinement changes their polygons."""
+    """Raise InputError for friction on arcs, whose polygons refinement changes."""
     if params["friction"] != "none":
         raise InputError(
             f"{family}: friction={params['friction']} on curved sides, whose slip "
@@ -313,10 +315,10 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
 
 
 def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for the error of a mesh at finite strain.
+    """Raise InputError if the discretisation error is requested at finite strain.
 
     The QP of the next finer mesh is linearised at another state, so that the distance
-    between the two solutions is not the discretisation error of either mesh.
+    between both solutions is not the discretisation error of either mesh.
     """
     if params["kinematics"] == "finite":
         raise InputError(
@@ -326,10 +328,12 @@ def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
 
 
 def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
-    """Raise InputError for the error of a mesh with Coulomb's law, which has no energy.
+    """Raise InputError if the discretisation error is requested with Coulomb's law.
 
-    laws : kinds of the laws of all pairs
-    meshes : keys of cases whose answers can be compared instead, for the message
+    The error is measured in the energy norm, and Coulomb's law has no energy.
+
+    laws : kinds of the friction laws of all pairs
+    meshes : description of cases to compare instead, for the message
     """
     if "coulomb" in laws:
         raise InputError(
@@ -355,7 +359,7 @@ def check_tangential(family: str, params: Mapping[str, Value]) -> None:
 def one_of(
     family: str, params: Mapping[str, Value], known: Mapping[str, tuple[Value, ...]]
 ) -> None:
-    """Raise InputError unless each key of `known` has one of the values listed."""
+    """Raise InputError unless each key of `known` has one of its listed values."""
     for key, values in known.items():
         if params[key] not in values:
             raise InputError(
@@ -365,12 +369,12 @@ def one_of(
 
 
 def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
-    """Return twice the value of each of the integer `keys`, numbers of cells."""
+    """Return the integer `keys`, which are numbers of cells, with doubled values."""
     return {key: 2 * int(params[key]) for key in keys}
 
 
 def check_dense_memory(family: str, n: int) -> None:
-    """Raise InputError for a dense n × n matrix that cannot fit into memory."""
+    """Raise InputError for a dense n × n matrix that does not fit into memory."""
     needed, limit = 8 * n**2 / 2**20, case_limit_mib()
     if needed > limit:
         raise InputError(

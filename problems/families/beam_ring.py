@@ -85,10 +85,9 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved, which runs its own load steps.
+        """Return the case with every cell halved, with its own load steps.
 
-        The arcs of the ring are then approximated by other polygons, on which friction
-        is refused.
+        Friction is refused, because the refined arcs of the ring are other polygons.
         """
         refuse_friction(self.name, params)
         return super().refined(params)

@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 MIN_SLENDERNESS = 2.0  #: smallest ratio of length to thickness
-#: PL²/EI; outside these limits, the formula of the elastica loses digits
+#: limits of PL²/EI, outside of which the formula of the elastica loses digits
 MIN_LOAD, MAX_LOAD = 1e-3, 1e3
-#: closer to ½, the Cholesky factor of the tangent loses nearly all digits
+#: largest Poisson's ratio; closer to ½, the Cholesky factor of the tangent loses nearly
+#: all digits
 MAX_NU = 0.4999
 
 
@@ -45,7 +46,7 @@ class Cantilever(DeclaredFamily):
     model = "cantilever.newton_step"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; the default nx makes cells half as long as thick."""
+        """Return all keys; with the default nx, cells are half as long as thick."""
         params: dict[str, Any] = {**self.defaults, **given}
         # limited before rounding: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)

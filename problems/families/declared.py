@@ -1,4 +1,4 @@
-"""Base classes of families declared by their keys and by functions of their models."""
+"""Base classes of families that declare their keys and name functions of models."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ class DeclaredFamily(Family):
     Attributes
     ----------
     keys : keys in the order of canonical names
-    model : "MODULE.FUNCTION" of `problems.models` that returns the case. Its parameters
-        are any of form, params and reference, and single keys
+    model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
+        of the function may be form, params, reference and individual keys
     subdomains : module of `problems.models` whose `in_subdomains` returns the
-        decomposed problem and whose `results` evaluates it on ranks; empty: the dual is
-        always assembled by one process
-    cells : numbers of cells, doubled by refinement if there is no key `halvings`
-    conditions : checks of several keys, by the key whose presence requires each
+        decomposed problem and whose `results` evaluates it on ranks; if empty, one
+        process always assembles the dual
+    cells : keys with numbers of cells, which refinement doubles if there is no key
+        `halvings`
+    conditions : checks that involve several keys; each applies if its key is declared
 
     """
 
@@ -73,7 +74,7 @@ class DeclaredFamily(Family):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved, or None if the family has no meshes.
 
-        Arcs are then approximated by other polygons.
+        Refined arcs are other polygons.
 
         Raises
         ------
@@ -88,16 +89,16 @@ class DeclaredFamily(Family):
         return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True if bodies are decomposed, without Newton's method."""
+        """Return True if bodies are decomposed and kinematics are linear."""
         size = params.get("feti") or params.get("parts")
         return bool(size) and params.get("kinematics") != "finite"
 
     def emission(
         self, form: str, params: Mapping[str, Value]
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return the function that assembles a rank's share of the dual, or None.
+        """Return a function that assembles the share of a rank in the dual, or None.
 
-        None means that one process has to assemble the case.
+        None means that one process must assemble the case.
         """
         if form != "dual" or not self.is_divided(params):
             return None
@@ -128,12 +129,13 @@ class DeclaredFamily(Family):
 
 
 class ContactFamily(DeclaredFamily):
-    """A family of elastic bodies in contact, stated once as a `ContactProblem`.
+    """A family of elastic bodies in contact, defined by a `ContactProblem`.
 
     Attributes
     ----------
-    problem : "MODULE.FUNCTION" of `problems.models`, from params to a `ContactProblem`
-    model : "MODULE.FUNCTION" that returns the QP of a Newton iteration, for
+    problem : "MODULE.FUNCTION" of `problems.models` that returns the `ContactProblem`
+        for params
+    model : "MODULE.FUNCTION" that returns the case of a Newton iteration, for
         kinematics=finite
 
     """

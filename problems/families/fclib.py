@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 class Fclib(FromFile):
     """Contacts with Coulomb friction from FCLIB files, ``fclib:PATH.hdf5``.
 
-    The QP is the last of the convex problems of `loop`, whose solution satisfies
-    Coulomb's law, or problem number `iterate`. The digest of the file's
-    content is a parameter of the case.
+    The QP is the last convex problem of `loop`, whose solution satisfies Coulomb's law,
+    or problem number `iterate`. The digest of the file is a parameter of the case.
     """
 
     name = "fclib"
@@ -47,12 +46,12 @@ class Fclib(FromFile):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return a convex problem in units of the largest entries of W and q.
+        """Return the case of a convex problem, scaled by the maxima of W and q.
 
         Raises
         ------
         InputError
-            If the file is damaged or not a convex problem, or the loop does not
+            If the file is damaged or its problem not convex, or if the loop does not
             converge.
         PastEndError
             If the loop has fewer problems than `iterate`.
@@ -121,5 +120,6 @@ class Fclib(FromFile):
         )
 
 
-#: scaled natural map of a stored solution that counts as a dummy: zeros have about 1
+#: stored solutions with a larger scaled natural map count as dummies; for r = 0 the map
+#: is about 1
 DUMMY = 0.1

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 class FromFile(Family):
     """QPs from files: npz, mat (of `export` or Maros-Mészáros), QPS text or Parquet.
 
-    Text and mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file's
-    content is a parameter of the case: records identify what was measured, and a
-    changed file is another case.
+    Text and mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file
+    is a parameter of the case. It identifies the measured QP in records, and a changed
+    file is another case.
 
-    copies : copies in a result folder; None: files are read from their own path
+    copies : copies in a result folder; None to read files from their original path
     """
 
     name = "file"
@@ -35,7 +35,7 @@ class FromFile(Family):
         self.copies = copies
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys, with the digest of the file's content."""
+        """Return all keys, including the digest of the file."""
         params = {**self.defaults, **given}
         if params["path"] and "sha256" not in given:
             path = str(params["path"])
@@ -55,7 +55,7 @@ class FromFile(Family):
         self._located(params)
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
-        """Return the file with the digest of its content and its format."""
+        """Return the file with its digest and format."""
         path, sha256 = str(params["path"]), str(params["sha256"])
         suffix = format_of(Path(path))
         if path.lower().endswith(".gz"):
@@ -82,7 +82,7 @@ class FromFile(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the QP; the quantity `value` is its objective in the file's units."""
+        """Return the case; `value` is the objective in the units of the file."""
         from mortarbench.harness import Case
         from mortarbench.problems.files.readers import read
 

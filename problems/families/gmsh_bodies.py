@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 class GmshBodies(ContactFamily):
-    """Bodies of a user: a mesh, and a TOML with materials, loads, contacts.
+    """User-defined bodies: a mesh, and a TOML with materials, loads, contacts.
 
-    The digest of the content of both files is a parameter of the case, so that changed
-    files are another case.
+    The digest of both files is a parameter of the case, so that changed files define
+    another case.
     """
 
     name = "bodies"
@@ -59,7 +59,7 @@ class GmshBodies(ContactFamily):
     conditions = MappingProxyType({"kinematics": check_kinematics})
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys, with those of the file; step defaults to steps."""
+        """Return all keys, including those of the file; step defaults to steps."""
         params: dict[str, Value] = {**self.defaults, **given}
         if params["path"]:
             from mortarbench.problems.models.description import read_description
@@ -76,7 +76,7 @@ class GmshBodies(ContactFamily):
         return params if "step" in given else params | {"step": params["steps"]}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless keys are in range and the files have their digest."""
+        """Raise InputError unless keys are in range and the digest is correct."""
         from mortarbench.problems.models.description import pair_laws, read_description
 
         p: Any = params
@@ -122,7 +122,7 @@ class GmshBodies(ContactFamily):
         Raises
         ------
         InputError
-            When a file is wrong, or rounding makes the Cholesky factorisation fail.
+            If a file is invalid, or if the Cholesky factorisation fails by rounding.
 
         """
         from numpy.linalg import LinAlgError

@@ -37,7 +37,7 @@ class Greco(ContactFamily):
     problem = "greco.problem"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range, and mu not negative."""
+        """Raise InputError unless every key is in its range and mu is not negative."""
         super().check(params)
         dim, n, depth = (int(params[key]) for key in ("dim", "n", "depth"))
         if dim == 2 and depth != self.defaults["depth"]:

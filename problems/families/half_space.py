@@ -22,12 +22,13 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-#: bytes per cell of the grid: transforms on four times as many cells, and vectors
+#: bytes per cell of the grid, for vectors, and transforms on four times as many cells
 _CELL_BYTES = 600
-#: Cells along a side of a normal problem that the reference solve has to solve: 48
-#: take 6 s of processor time, 64 take 31 s.
+#: largest number of cells per side of a normal problem for the reference solver; 48
+#: take 6 s of processor time, 64 take 31 s
 MAX_SOLVED = 48
-MIN_ROUGH = 64  #: cells along a side of a rough surface, whose shortest wave is side/32
+#: smallest number of cells per side of a rough surface, whose shortest wave is side/32
+MIN_ROUGH = 64
 
 
 class HalfSpace(DeclaredFamily):
@@ -48,7 +49,7 @@ class HalfSpace(DeclaredFamily):
     )
     forms = ("dual",)
     model = "half_space.cases.half_space_case"
-    conditions = {}  # noqa: RUF012  # friction has conditions of its own, see `check`
+    conditions = {}  # noqa: RUF012  # `check` has its own conditions for friction
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range and used by the law."""

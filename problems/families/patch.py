@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 MAX_DISTORTION = (
-    0.35  #: largest shift; cells turn inside out where nodes move by half a cell
+    0.35  #: largest shift in cell sizes; shifts of half a cell could invert cells
 )
 
 
@@ -85,7 +85,7 @@ class ContactPatch(ContactFamily):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; raise InputError with Coulomb's law.
 
-        The number of rows of cells, rounded up to n/2, may not double for odd n.
+        Blocks have n/2 rows of cells, rounded up, which may not double for odd n.
         """
         finer = double(params, *self.cells)
         meshes = "/".join(f"{name}={n}" for name, n in finer.items())

@@ -36,7 +36,7 @@ class JournalBearing(DeclaredFamily):
     model = "variational.journal_bearing"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the eccentricity is below 1, where surfaces touch."""
+        """Raise InputError unless the eccentricity is below 1 (surfaces touch at 1)."""
         super().check(params)
         if float(params["eccentricity"]) >= 1:
             raise InputError(
@@ -46,7 +46,7 @@ class JournalBearing(DeclaredFamily):
 
 
 class Torsion(DeclaredFamily):
-    """Elastic-plastic torsion of a square bar, bounds on both sides: MINPACK-2."""
+    """Elastic-plastic torsion of a square bar, with two-sided bounds: MINPACK-2."""
 
     name = "torsion"
     keys = schema(n=key(50, 2), twist=size(5.0))
@@ -54,6 +54,6 @@ class Torsion(DeclaredFamily):
     model = "variational.torsion"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are two nodes per side and a positive twist."""
+        """Raise InputError unless n is at least 2 and the twist is positive."""
         super().check(params)
         check_memory(self.name, int(params["n"]) ** 2)

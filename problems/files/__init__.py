@@ -1,1 +1,1 @@
-"""QPs from files: formats, content by digest, two-sided rows."""
+"""QPs from files: formats, digests and two-sided rows."""

@@ -1,16 +1,17 @@
 """FCLIB files: problems of contact with Coulomb friction in HDF5.
 
-The unknowns of a local problem are the forces r of the contacts, blocks (N, T₁[, T₂]),
-and multipliers l; a global one also contains the velocities v of the bodies::
+The unknowns of a local problem are the contact forces r, in blocks (N, T₁[, T₂]), and
+multipliers l. Global problems also contain the velocities v of the bodies::
 
     u = W r + V l + q,   Vᵀr + R l + s = 0                        (local)
     M v = H r + G l + f,   Gᵀv + b = 0,   u = Hᵀv + w             (global)
 
-with û = u + (μ‖u_T‖, 0) in the dual of the friction cones K, and r ∈ K orthogonal to û.
-A matrix is a group  nzmax, m, n, nz, p, i, x:  nz = −1 by columns, −2 by rows, and the
-number of triplets otherwise. The documentation of FCLIB says that p holds the rows of
-triplets, but files that Siconos wrote have CSparse's order, p for columns. Both orders
-are read; if both fit, the second is used.
+where û = u + (μ‖u_T‖, 0) is in the dual of the friction cones K, and r ∈ K is
+orthogonal to û.
+A matrix is a group of nzmax, m, n, nz, p, i and x. It is stored by columns if nz = −1,
+by rows if nz = −2, and as nz triplets otherwise. According to the documentation of
+FCLIB, p contains the rows of triplets, but files written by Siconos have the order of
+CSparse, with columns in p. Both orders are read; the second is used if both fit.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.
@@ -41,7 +42,7 @@ _EXPECTED = "an FCLIB file (HDF5)"
 _KINDS = ("fclib_local", "fclib_global")
 _COLUMNS, _ROWS = -1, -2  #: values of nz for compressed matrices
 
-Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by their path in it
+Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ class FclibFile:
 
 
 def read_datasets(path: Path) -> Datasets:
-    """Return all arrays of an HDF5 file by their path, such as fclib_local/W/x.
+    """Return all arrays of an HDF5 file by HDF5 path, such as fclib_local/W/x.
 
     Raises
     ------
@@ -127,8 +128,8 @@ def to_contact(arrays: Datasets) -> FclibFile:
     Raises
     ------
     InputError
-        If an array is missing or does not fit the others, or the problem is
-        of a kind that is not supported.
+        If an array is missing or inconsistent with others, or if the kind of problem is
+        not supported.
 
     """
     kinds = [
@@ -196,7 +197,7 @@ def _factor(name: str, K: Any) -> Any:
 
 
 class _Group:
-    """Arrays of a group of a file, read with checks."""
+    """Arrays of a group of a file, validated on access."""
 
     def __init__(self, name: str, arrays: Datasets) -> None:
         self.name, self._arrays = name, arrays
@@ -229,7 +230,7 @@ class _Group:
         return vector
 
     def matrix(self, name: str, m: int, n: int) -> csc_array:
-        """Return a matrix of the expected shape (m, n)."""
+        """Return a matrix; raise InputError unless its shape is (m, n)."""
         nz, *shape = (self.integer(f"{name}/{key}") for key in ("nz", "m", "n"))
         if shape != [m, n]:
             raise InputError(
@@ -259,12 +260,12 @@ class _Group:
 def save_fclib(path: Path, qp: QP, meta: Mapping[str, Any], source: str = "") -> None:
     """Write a QP over friction cones, or the arrays of the FCLIB file `source`.
 
-    meta : plain data; stored as the description, in JSON
+    meta : plain data, stored as the description in JSON
 
     Raises
     ------
     InputError
-        When the format cannot hold the QP, or a file cannot be read or written.
+        If the format cannot represent the QP, or a file cannot be read or written.
 
     """
     if source:
@@ -284,7 +285,7 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
     Raises
     ------
     InputError
-        If a variable is in no cone, the cones differ in dimension, there are other
+        If a variable is not in a cone, the cones differ in dimension, there are other
         constraints, or P is an operator.
 
     """

@@ -1,6 +1,7 @@
-"""Formats of QP files, and digests of their content.
+"""Formats and digests of QP files.
 
-Text and .mat files may be compressed by gzip; npz and Parquet are compressed already.
+Text and .mat files may be compressed by gzip; npz and Parquet files are always
+compressed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files
 
 
 def format_of(path: Path) -> str:
-    """Return the suffix that names the format of a QP file, without a final .gz.
+    """Return the suffix of a QP file that indicates its format, ignoring a final .gz.
 
     Raises
     ------
@@ -36,7 +37,7 @@ def format_of(path: Path) -> str:
 
 
 def check_digest(path: Value, asked: Value, found: str) -> None:
-    """Raise InputError unless the content has the digest in the name of the case."""
+    """Raise InputError unless the digest of a file is that in the name of the case."""
     if asked != found:
         raise InputError(
             f"{path}: its content has the digest {found}, not {asked}; "

@@ -4,20 +4,20 @@ Fields are separated by white space, so that names cannot contain any; files in 
 columns are read as well. Sections follow Maros and Mészáros (1999), "A repository of
 convex quadratic programming problems", Optim. Methods Softw. 11/12:
 
-* N rows after the first are ignored; the objective's RHS is minus its constant.
+* N rows after the first are ignored; the RHS of the objective is minus its constant.
 * RANGES R turns  ≤ b  into [b − |R|, b],  ≥ b  into [b, b + |R|],  = b  into
   [b, b + R] or, for R < 0, [b + R, b].
-* BOUNDS default to [0, ∞); a negative UP alone removes the lower bound, as in
+* BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in
   commercial readers.
-* QUADOBJ and QSECTION hold one triangle of P, QMATRIX both; the objective is
-  ½xᵀPx + qᵀx, so diagonal entries are as in P, not halved.
+* QUADOBJ and QSECTION contain one triangle of P, and QMATRIX both. The objective is
+  ½xᵀPx + qᵀx, so that diagonal entries are those of P, not halved.
 
-Undefined names and malformed numbers raise an error with their line. (The reader of
-HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
+Undefined names and malformed numbers raise an error that states their line. (The reader
+of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
 
-A QP that is written and read again is the same to the last digit of every number. If P
-is symmetric only up to rounding, its symmetric part is written: the objective depends
-on nothing else, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
+Writing and reading a QP reproduces every number to the last digit. If P is symmetric up
+to rounding only, its symmetric part is written: the objective depends on this part
+alone, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ _NUMBER = re.compile(
 
 @dataclass(eq=False)
 class _QPSModel:
-    """Content of the sections read so far; rows and columns by name."""
+    """Content of the sections read so far; keys are names of rows and columns."""
 
-    rows: dict[str, str] = field(default_factory=dict)  #: name → N, L, G or E
+    rows: dict[str, str] = field(default_factory=dict)  #: type N, L, G or E by name
     columns: dict[str, int] = field(default_factory=dict)
     entries: dict[tuple[str, str], float] = field(default_factory=dict)  #: row, column
     rhs: dict[str, float] = field(default_factory=dict)
@@ -64,12 +64,12 @@ class _QPSModel:
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
     """Parse a QPS text; return the problem and the sign of its objective.
 
-    The sign is −1 for a maximisation, whose objective is negated with its constant.
+    For a maximisation, the sign is −1 and the objective, with its constant, is negated.
 
     Raises
     ------
     InputError
-        If the text is malformed; the message names the line if possible.
+        If the text is malformed; the message states the line if possible.
 
     """
     model, section, ended = _QPSModel(), "", False
@@ -104,8 +104,8 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     Raises
     ------
     InputError
-        If the QP has sets other than bounds, a finite right-hand side or bound counts
-        as infinite in the format, or the file cannot be written.
+        If the QP has sets other than bounds, if a finite right-hand side or bound would
+        be infinite in the format, or if the file cannot be written.
 
     """
     if len(qp.sets) > 1:
@@ -130,7 +130,10 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines; rows e1 … are Ax = b, i1 … are Gx ≤ h, columns x1 …."""
+    """Yield the lines of a QPS text.
+
+    Rows e1 … are Ax = b, rows i1 … are Gx ≤ h, and columns are x1 ….
+    """
     rows = [f"e{i + 1}" for i in range(qp.b.size)]
     rows += [f"i{i + 1}" for i in range(qp.h.size)]
     for key, value in meta.items():
@@ -159,7 +162,7 @@ def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _column_lines(A: csc_array, q: Vector, rows: list[str]) -> Iterator[str]:
-    """Write each column, also those without entries."""
+    """Yield the lines of each column, including columns without entries."""
     for j, cost in enumerate(q):
         part = slice(A.indptr[j], A.indptr[j + 1])
         if cost or part.start == part.stop:

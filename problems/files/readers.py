@@ -22,15 +22,15 @@ from mortarbench.problems.files.file_digest import format_of
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 
-#: (QP, scale, constant): the objective of the file is scale·(objective of the QP) +
+#: (QP, scale, constant); the objective of the file is scale·(objective of the QP) +
 #: constant
 Loaded = tuple[QP, float, float]
 
-_COPIES = 16  #: memory of a parsed QPS text relative to the file, as Python objects
+_COPIES = 16  #: memory of the Python objects of a QPS text, relative to the file size
 
 
 def read(path: Path) -> Loaded:
-    """Read a QP in the format indicated by the suffix of its path (also before .gz).
+    """Read a QP in the format indicated by the suffix of its path, ignoring .gz.
 
     Raises
     ------
@@ -90,15 +90,15 @@ _READERS: dict[str, Callable[[Path], Loaded]] = {
 
 
 def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
-    """Return the problem  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  of the arrays of a .mat file.
+    """Return the problem  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  from arrays of a .mat file.
 
-    P and q may be called Q and c, and r may be missing. In the distributed files the
-    last n rows of A are the identity; they become bounds of the variables.
+    P and q may be named Q and c, and r may be missing. In the files of the collection,
+    the last n rows of A are the identity; they are converted to bounds of variables.
 
     Raises
     ------
     InputError
-        If a variable is missing or its shape does not fit the others.
+        If a variable is missing or its shape is inconsistent with others.
 
     """
     read = partial(_first_named, arrays)
@@ -135,7 +135,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
 def _first_named(
     arrays: Mapping[str, Any], read: Callable[..., Any], *names: str
 ) -> Any:
-    """Read the variable under the first of its names that is present."""
+    """Read a variable by the first of `names` that is present."""
     return read(arrays, next((name for name in names if name in arrays), names[0]))
 
 

@@ -11,13 +11,13 @@ from scipy.sparse import csc_array, csr_array, vstack
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.qp import check_symmetric
 
-MIN_INFINITE = 1e20  #: bounds of at least this size count as infinite
+MIN_INFINITE = 1e20  #: bounds of at least this magnitude count as infinite
 
 
 class TwoSidedQP(NamedTuple):
     """The problem  min ½xᵀPx + qᵀx + r  subject to  l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
 
-    P: Any  #: (n, n) sparse, both triangles
+    P: Any  #: (n, n) sparse, with both triangles
     q: Vector  #: (n,)
     r: float
     A: Any  #: (m, n) sparse
@@ -30,7 +30,7 @@ class TwoSidedQP(NamedTuple):
 def one_sided(qp: TwoSidedQP) -> QP:
     """Return the QP with rows l = u as equalities and all others as inequalities.
 
-    All upper sides  Ax ≤ u  come first, then all lower sides  −Ax ≤ −l; free rows are
+    Upper limits  Ax ≤ u  precede lower limits  −Ax ≤ −l; rows without limits are
     dropped.
 
     Raises
@@ -61,7 +61,7 @@ def one_sided(qp: TwoSidedQP) -> QP:
 
 
 def _limits(what: str, low: Vector, high: Vector) -> tuple[Vector, Vector]:
-    """Replace absent limits by ±inf; raise InputError if limits admit no value."""
+    """Replace absent limits by ±inf; raise InputError if no value satisfies them."""
     low = np.where(low <= -MIN_INFINITE, -np.inf, low)
     high = np.where(high >= MIN_INFINITE, np.inf, high)
     bad: NDArray[np.bool_] = (
