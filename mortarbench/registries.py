@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.results.work_unit import Commands
     from mortarbench.harness.solution import Solution
 
-#: Lock that allows one thread at a time to load plug-ins, build, solve, run or validate:
-#: these operations set thread numbers, standard output and modules of the whole process.
+#: Lock by which only one thread at a time loads plug-ins, builds, solves or validates,
+#: which changes thread counts, standard output and modules of the whole process.
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
