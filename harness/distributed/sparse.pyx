@@ -4,9 +4,9 @@
 A `LinearMap` is a sparse matrix, the inverse of a factorised one, or a composition of
 other maps. Operators of decomposed bodies are such maps, and so are the rows of their
 coarse problem: on short vectors, the overhead of library calls, and another pass over
-the vectors for a linear combination, would cost more than the product. Compiled when
-the package is installed; `sparse.pyi` has the types, `sparse.pxd` those of compiled
-callers.
+the vectors for a linear combination, would cost more than the product. The module is
+compiled when the package is installed; `sparse.pyi` declares its types, and
+`sparse.pxd` those for compiled callers.
 """
 
 from libc.math cimport sqrt
@@ -366,7 +366,7 @@ cdef class Identity(LinearMap):
 
 
 cdef class DirectSum(LinearMap):
-    """The map of consecutive parts of a vector, each by a map of its own."""
+    """The block diagonal map of consecutive parts of a vector, each with its own map."""
 
     cdef tuple maps
 
@@ -485,8 +485,8 @@ cdef class BorderedFactor(LinearMap):
         A = LLᵀ,   L = ⎡L_aa     ⎤     with rows in the given order.
                        ⎣L_ba  L_bb⎦
 
-    Changes of the border need a factor of its Schur complement L_bbL_bbᵀ only. As a map
-    this is x ↦ A⁻¹x.
+    Changes of the border only require a new factor of its Schur complement L_bbL_bbᵀ.
+    As a linear map, the factor is x ↦ A⁻¹x.
 
     order : (n,) permutation of the rows, the border last
     columns : the first n − b columns of L (n, n − b) in CSC format, diagonal first
@@ -735,7 +735,7 @@ cdef class BorderedFactor(LinearMap):
         return result
 
     def extended(self, const double[::1] u):
-        """Return the x with L_aaᵀx_a + L_baᵀx_b = u_a and x_b = u_b, u as of `reduced`.
+        """Return x with L_aaᵀx_a + L_baᵀx_b = u_a and x_b = u_b, for u from `reduced`.
         """
         self.expect(u.shape[0], self.n)
         result = np.empty(self.n)

@@ -2,8 +2,8 @@
 """Products of sparse matrices of doubles with vectors of extended precision.
 
 Entries are converted one by one: a copy of a stiffness matrix in extended precision
-would need more than twice its memory, and more time than the product. Compiled when the
-package is installed; `products.pyi` has the types.
+would need more than twice its memory, and more time than the product. The module is
+compiled when the package is installed; `products.pyi` declares its types.
 """
 
 import numpy as np
@@ -24,7 +24,8 @@ def times_columns(
     const double[::1] data, const index[::1] indices, const index[::1] indptr,
     const long double[::1] x, Py_ssize_t rows,
 ):
-    """Return Mx (rows,) for M by columns (CSC), its entries doubles, x extended."""
+    """Return Mx (rows,) for M in CSC, with double entries, and x in extended precision.
+    """
     product = np.zeros(rows, dtype=np.longdouble)
     cdef long double[::1] y = product
     cdef long double x_j

@@ -1,25 +1,26 @@
 /* Incomplete Cholesky factors of principal submatrices of a sparse symmetric matrix.
 
-   M = (I + L) D (I + L)' in an order of elimination, with the entries of L where P has
-   some. What elimination would put elsewhere is dropped; `keep` times that is added to the
-   two diagonal entries of its row and column, so that row sums are kept for keep = 1
+   M = (I + L) D (I + L)' in an order of elimination, where the pattern of L is that of P.
+   Fill-in outside this pattern is dropped, and `keep` times each dropped entry is added to
+   the diagonal entries of its row and column, which preserves row sums for keep = 1
    (Gustafsson 1978, modified incomplete Cholesky; Meijerink and van der Vorst 1977 for
    keep = 0; survey: Benzi 2002).
 
-   The order is 0, 1, ... up to `half`, then n - 1, n - 2, ... down to it. Each column of
-   the first part, and of the second up to the distance `reach` of its last entries, waits
-   for the one before, which takes as long as a division or some multiplications, but not
-   for the other part: both are done in turn, in the time of one (twisted factorisation).
+   The order is 0, 1, ... up to `half`, then n - 1, n - 2, ... down to it (twisted
+   factorisation). Within each part, a column depends on the one before, with the latency
+   of a division or some multiplications. The parts are independent of each other, except
+   within the distance `reach` of the end of the second part, so that columns of both are
+   eliminated alternately, in the time of one part.
 
-   Only components that are free take part. Where P lies on few diagonals, L is stored by
-   these, too: then only entries next to the diagonal are a recurrence, and the others are
-   taken off some hundred rows at once. */
+   Only free components are included. If P has few diagonals, L is also stored by
+   diagonals. Then only the entries next to the main diagonal form a recurrence, and the
+   others are subtracted for some hundred rows at once. */
 
 #ifndef INCOMPLETE_H
 #define INCOMPLETE_H
 
 enum {
-    RUN = 256 /* most components of a run: what stays in the nearest cache */
+    RUN = 256 /* largest number of components of a run, chosen to fit the L1 cache */
 };
 
 typedef struct {
@@ -39,7 +40,7 @@ typedef struct {
     double *pivot, *inverse, *y;
 } incomplete;
 
-/* Append the intervals of free components of [a, b), ascending or descending. */
+/* Append the intervals of free components in [a, b), ascending or descending. */
 static void
 append_runs(incomplete *F, in free, Py_ssize_t a, Py_ssize_t b, int down, Py_ssize_t most)
 {
@@ -68,7 +69,7 @@ static void find_runs(incomplete *F, in free, Py_ssize_t most)
     append_runs(F, free, F->half, tail, 1, most);
 }
 
-/* Eliminate column j, and say whether its pivot is good. */
+/* Eliminate column j; return true if its pivot is large enough. */
 INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, double least)
 {
     const int *restrict row = F->row, *restrict target = F->target;
@@ -94,8 +95,8 @@ INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, doub
     return (p > least * F->diagonal[j]) & (p < INFINITY);
 }
 
-/* The same by diagonals, of which there are `count`, a number that the compiler knows: an
-   entry that P does not have is zero. */
+/* Eliminate column j of a matrix stored by diagonals; `count` of them is a constant for
+   the compiler. Entries that are not in the pattern of P are zero. */
 INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t count,
                               double keep, double least)
 {
@@ -136,7 +137,7 @@ INLINE int eliminate(const incomplete *F, Py_ssize_t j, Py_ssize_t count, double
                  : eliminate_column(F, j, keep, least);
 }
 
-/* Eliminate the columns of all runs, those of both parts in turn. */
+/* Eliminate the columns of all runs, alternating between both parts. */
 INLINE int eliminate_all(incomplete *F, Py_ssize_t count, double keep, double least)
 {
     Py_ssize_t a = 0, b = F->first_of_second, i, j;
@@ -165,8 +166,8 @@ INLINE int eliminate_all(incomplete *F, Py_ssize_t count, double keep, double le
     return good;
 }
 
-/* Factorise P_FF, its diagonal multiplied by 1 + shift; whether all pivots are at least
-   `least` of that. */
+/* Factorise P_FF with its diagonal multiplied by 1 + shift; return true if all pivots are
+   at least `least` times this diagonal. */
 TWICE static int
 factorise_incompletely(incomplete *F, in free, double keep, double shift, double least)
 {
@@ -199,8 +200,8 @@ factorise_incompletely(incomplete *F, in free, double keep, double shift, double
     }
 }
 
-/* y = S v less what rows of L in columns before take off it, but for the recurrence with
-   the one next to the diagonal, of a run [a, b). */
+/* y = S v on a run [a, b), minus the products with earlier columns of L, except for the
+   recurrence with the entries next to the main diagonal. */
 INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v)
 {
     double *y = F->y;
@@ -229,7 +230,7 @@ INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v
     }
 }
 
-/* The same of y = D^-1 y and L', from the last column on. */
+/* The backward counterpart: y = D^-1 y and L', starting at the last column. */
 INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
 {
     double *y = F->y;
@@ -258,14 +259,15 @@ INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
     }
 }
 
-/* A recurrence y_i = y_i - l y_before of a run: where it begins, and with what. */
+/* A recurrence y_i = y_i - l y_before on a run: its start and its coefficients. */
 typedef struct {
     Py_ssize_t at, left, step;
     const double *l;
     double last;
 } recurrence;
 
-/* Forward: up in the first part, down in the second. Backward: the other way. */
+/* The forward sweep ascends in the first part and descends in the second; the backward
+   sweep is reversed. */
 INLINE recurrence
 begin_recurrence(const incomplete *F, Py_ssize_t a, Py_ssize_t b, int backward)
 {
@@ -298,7 +300,7 @@ INLINE void go_on(recurrence *c, double *y, Py_ssize_t size)
     c->left -= size;
 }
 
-/* Two of them in turn, for neither waits for the other. */
+/* Two independent recurrences, evaluated alternately. */
 INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
 {
     Py_ssize_t size = c->left < d->left ? c->left : d->left;
@@ -393,7 +395,7 @@ INLINE void backward_column(const incomplete *F, Py_ssize_t j)
     y[j] = rest;
 }
 
-/* z = S M^-1 S v for v that is zero where nothing is free; the sum of z along. */
+/* z = S M^-1 S v for v that is zero off the free set; returns the sum of z along. */
 TWICE static double solve_incompletely(const incomplete *F, in v, in along, out z)
 {
     double *y = F->y, sum = 0;
@@ -425,7 +427,7 @@ TWICE static double solve_incompletely(const incomplete *F, in v, in along, out 
     return sum;
 }
 
-/* s = P(x - z) - x, P the projection on lower <= x <= upper; g's. */
+/* s = P(x - z) - x with the projection P onto lower <= x <= upper; returns g's. */
 TWICE static double
 projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
 {
@@ -440,8 +442,8 @@ projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
     return slope;
 }
 
-/* S P S for P by rows, S diagonal: its entries, the largest sum of absolute values of a
-   row, and the least sums of rows of P and of S P S, in units of the diagonal. */
+/* Compute the entries of S P S for P by rows and diagonal S, its largest row sum of
+   absolute values, and the smallest row sums of P and of S P S relative to the diagonal. */
 TWICE static void
 scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
               Py_ssize_t n, out told)

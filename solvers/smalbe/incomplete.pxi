@@ -22,7 +22,7 @@ cdef enum:
 
 
 cdef inline bint is_later(Py_ssize_t i, Py_ssize_t j, Py_ssize_t half) noexcept nogil:
-    """Return whether i is eliminated after j: up to `half`, then down from the last."""
+    """Return True if i is eliminated after j: up to `half`, then down from the last."""
     return i > j if j < half else half <= i < j
 
 
@@ -57,10 +57,10 @@ def sparsity(matrix):
 
 
 def scaled_by_diagonal(matrix, scale):
-    """Return the entries of SPS, and what is known of its rows.
+    """Return the entries of SPS, and bounds from its row sums.
 
-    That is the largest sum of absolute values of a row, and the least sums of rows of
-    P and of SPS, where S² is the inverse of P's diagonal, relative to that.
+    The bounds are the largest row sum of absolute values, and the smallest row sums of
+    P and of SPS relative to the diagonal, where S² is the inverse diagonal of P.
 
     matrix : P in SciPy's csr format; scale : S (n,)
     """
@@ -80,19 +80,19 @@ cdef class IncompleteFactor:
     The pattern of L is that of P. Dropped entries are added to the diagonal times `keep`,
     KEEP or 0 (modified incomplete Cholesky, Gustafsson, BIT 18, 1978, 142-156); both are
     in Benzi's survey (J. Comput. Phys. 182, 2002, 418-477). On a tridiagonal matrix
-    nothing is dropped, and M = P_FF. Where a pivot is below LEAST_PIVOT of the diagonal
-    entry, `keep` becomes 0, and if that is not enough the diagonal is multiplied by
-    1 + σ with a growing σ (Manteuffel, Math. Comp. 34, 1980, 473-497). So M is positive
-    definite for every symmetric P with a positive diagonal, and never NaN. Both choices
-    stay for all later faces.
+    nothing is dropped, and M = P_FF. If a pivot is below LEAST_PIVOT times the diagonal
+    entry, `keep` is set to 0, and if that does not suffice, the diagonal is multiplied
+    by 1 + σ with increasing σ (Manteuffel, Math. Comp. 34, 1980, 473-497). Hence M is
+    finite and positive definite for every symmetric P with a positive diagonal. Both
+    choices are kept for all later faces.
 
-    The factor is that of WPW with positive weights W: row sums are kept of that matrix,
-    so W·1 should be a vector that P takes to zero in the inside of a domain.
+    The factor is that of WPW with positive weights W, whose row sums are preserved.
+    Therefore W·1 should be a vector that P maps to zero in the interior of a domain.
 
     matrix : P in SciPy's csr or csc format, with sorted indices
     weights : W (n,)
     scale : S (n,); `inverse` is S M⁻¹ S
-    keep : whether dropped entries go to the diagonal
+    keep : True to add dropped entries, times KEEP, to the diagonal
     """
 
     cdef incomplete F
@@ -235,10 +235,11 @@ cdef class IncompleteFactor:
         release_memory(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
-        """Factorise on the face of the components where `free` (n,) is 1, unless the
-        present factor M̃ is of this face, or contains it and `may_exceed` it.
+        """Factorise on the face of the components where `free` (n,) is 1.
 
-        Then M⁻¹ is the part of M̃⁻¹ on the face, which is positive definite.
+        The present factor M̃ is kept if it is that of this face or, with `may_exceed`,
+        of a larger free set. M⁻¹ is then the block of M̃⁻¹ on the face, which is positive
+        definite.
         """
         cdef Py_ssize_t i
         cdef bint inside = self.is_ready
@@ -279,8 +280,8 @@ cdef class IncompleteFactor:
         return sum_
 
     cdef Py_ssize_t widen(self, double *free, Py_ssize_t count, long layers) noexcept:
-        """Add to `free` what is at most so many edges of P's graph from `queue` (count,);
-        returns how many components these are."""
+        """Add to `free` all components within `layers` edges of `queue` (count,) in the
+        graph of P; return the new length of the queue, which contains them too."""
         cdef Py_ssize_t first = 0, last = count, i, k
         cdef long layer
         for layer in range(layers):
@@ -305,5 +306,5 @@ cdef class IncompleteFactor:
 
 
 cdef _integers(a):
-    """Return an array as one of C's int; one number where it has none, for an address."""
+    """Return an array as C ints; an empty one gets one entry, to have an address."""
     return np.ascontiguousarray(a if len(a) else [0], dtype=np.int32)

@@ -1,18 +1,19 @@
-# KKT residuals of a QP with bounds only, of which MPRGP solves a scaled and normalised
-# form: no product is needed, for the gradient is known.
+# KKT residuals of a QP with bounds only, from the gradient of the scaled and normalised
+# form that MPRGP solves; no product is required.
 
 
 @cython.final
 cdef class Judge:
     """Bound the worst KKT residual of a QP at a point of its normalised form.
 
-    With x = y/d (d the scale of the variables, x on its bound where y is) and the gradient
-    g of the normalised form, Px + q = ‖H‖ d g. What follows is `residual_bound`.
+    With the scale d of the variables, x = y/d (exactly on a bound where y is), and the
+    gradient g of the normalised form satisfies Px + q = ‖H‖ d g. The bound is then that
+    of `residual_bound`.
 
-    qp : as given
+    qp : the original QP
     scaled : the QP in y = d x
     root : d (n,), None for ones
-    diagonal : of P (n,), as given
+    diagonal : (n,) diagonal of the original P
     norm : ‖H‖, by which the scaled one is divided
     """
 

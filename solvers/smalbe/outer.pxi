@@ -14,8 +14,8 @@ cdef double ENERGY_BUDGET = 1.25
 # of plain gradient projection. With zero, an F of low rank leaves τ = 0 and thus no step
 # (`test_what_once_failed`).
 cdef double MIN_TAIL = 1e-4
-# ‖g^P‖ at which the KKT residual is asked for first and from which on it no longer counts,
-# in units of tol‖b‖. At a residual of 1e-6 strings have 1e-4, and bearings 1e-5.
+# ‖g^P‖ in units of tol‖b‖ at which the KKT residual is evaluated first, and below which it
+# is no longer evaluated. At a residual of 1e-6 strings have 1e-4, and bearings 1e-5.
 cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
 
@@ -364,11 +364,11 @@ cdef class SMALBE(MPRGP):
         return size <= self.small_gradient and self.is_accurate()
 
     cdef bint is_judged_solved(self, double size) except -1:
-        """Return whether the KKT residual of the problem as given is within tol.
+        """Return True if the KKT residual of the original problem is within tol.
 
-        It takes as long as some steps, so it is asked only where ‖g^P‖, `size`, is what
-        it should be by then: in proportion to the residual of the last time. A residual
-        that has no scale (at x = 0) leaves the decision to ‖g^P‖.
+        The evaluation costs as much as some steps. It is therefore repeated only when
+        `size`, ‖g^P‖, has decreased enough, assuming that the residual is proportional
+        to it. A residual without a scale (at x = 0) leaves the decision to ‖g^P‖.
         """
         cdef double residual
         if size > self.next_judged:

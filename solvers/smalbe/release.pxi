@@ -2,9 +2,9 @@
 
 
 cdef double gain_of_projection(MPRGP at) except? -1:
-    """Return how far the cost falls at least where x becomes P(x − g/τ), τ ≥ ‖H‖.
+    """Return a lower bound of the decrease of the cost by the step to P(x − g/τ).
 
-    With s = P(x − g/τ) − x it is −gᵀs/2, as gᵀs ≤ −τ‖s‖².
+    With s = P(x − g/τ) − x and τ ≥ ‖H‖, the bound is −gᵀs/2, because gᵀs ≤ −τ‖s‖².
     """
     at.set.minimise(at.x, at.g, at.B.tau, at.s, NULL)
     return -0.5 * at.over.total(dot(at.g, at.s, at.n))
@@ -17,13 +17,14 @@ cdef bint step_by_factor(MPRGP at) except -1:
 
         s = P(x − M⁻¹g_F) − x,    x ← x + αs
 
-    with α minimal along s, in the set where 1 is not beyond: Newton's step where M is
-    exact. The boundary of a contact zone moves by one component in such a step, because
-    only those next to it are released. So `layers` of neighbours of these in the graph of
-    P are let go as well, as if they were free; those that M⁻¹g pushes outside stay at
-    their bounds. Where most of them came off, their number is doubled, else halved; it
-    is zero after an expansion. The step counts only if the cost fell by what gradient
-    projection must gain (`gain_of_projection`); else that is done, for one product more.
+    where α minimises the cost along s within the set; this is Newton's step if M is
+    exact. The boundary of a contact zone moves by only one component in such a step,
+    because only adjacent components are released. Therefore `layers` of neighbours in
+    the graph of P are released as well; those that M⁻¹g pushes outside stay at their
+    bounds. If most of these neighbours leave their bounds, the number of layers is
+    doubled, otherwise halved; it is reset to zero after an expansion. The step is
+    accepted only if the cost decreases by at least `gain_of_projection`; otherwise a
+    gradient projection step is taken, at the cost of one more product.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor

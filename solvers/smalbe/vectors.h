@@ -157,7 +157,7 @@ TWICE static double update_free_direction(in g, in free, double gamma, out p, Py
     return direction_block(g, free, gamma, p, n);
 }
 
-/* `update_free_direction`, then Hp = s F p, in one go through memory; result = φᵀp, pᵀHp. */
+/* `update_free_direction`, then Hp = s F p, in one pass over memory; result = φᵀp, pᵀHp. */
 TWICE static void sparse_update_free_direction(const sparse *F, double s, in g, in free,
                                      double gamma, out p, out Hp, out result)
 {
@@ -300,8 +300,8 @@ TWICE static int same(in a, in b, Py_ssize_t n)
     return 1;
 }
 
-/* The products c of `rows` rows U by rows with v, in one pass over v. Two sums a row where
-   these are few, for one would wait for itself. */
+/* c = Uv for `rows` rows U in one pass over v. If the rows are few, each has two partial
+   sums, because additions to a single sum would wait for each other. */
 INLINE void some_rows_times(in U, in v, out c, Py_ssize_t rows, Py_ssize_t n)
 {
     four t[8], s[8];
@@ -363,7 +363,7 @@ add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_
 }
 
 /* y = v + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over v, which may
-   be y. The last rows first: after `rows_times` these are in the nearest cache. */
+   be y. The last rows come first, because `rows_times` leaves them in the L1 cache. */
 TWICE static void combination(double s, in U, in c, const double *v, double *y,
                               Py_ssize_t k, Py_ssize_t n)
 {
@@ -782,8 +782,8 @@ TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
             columns[i * stride + j] = U[j * n + i];
 }
 
-/* S = S + Σ sᵢ vᵢvᵢᵀ of four vectors, those rows of V (n, k), k a multiple of four; only
-   the upper triangle of S (k, k) means something. */
+/* S = S + Σ sᵢ vᵢvᵢᵀ over four rows vᵢ of V (n, k), with k a multiple of four; only the
+   upper triangle of S (k, k) is valid. */
 TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_t k)
 {
     in v0 = V + row[0] * k, v1 = V + row[1] * k, v2 = V + row[2] * k;
@@ -1092,7 +1092,7 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
         all += r;
         at_most = LARGER(r, at_most);
     }
-    /* none is smaller than its share of all: few are left to look at */
+    /* the worst error is at least at_most / largest, so that few components are left */
     worst = LARGER(at_most / largest, worst);
     for (Py_ssize_t i = 0; i < n; i++) {
         double r = fabs(forces[i]), step, room;

@@ -81,7 +81,7 @@ def test_the_constraint_is_on_the_total_displacement():
 
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_rows_are_blind_to_translations_and_forces_balance_in_moment(seed):
+def test_rows_are_invariant_under_translations_and_forces_balance(seed):
     """The forces Bᵀλ of one row sum to zero; where the closest point is inside a
     segment they also have no moment about any point of the current configuration."""
     rng = np.random.default_rng(seed)

@@ -244,8 +244,8 @@ def test_the_overlaps_cover_the_common_part_exactly_once():
     assert (at.area > -1e-12).all()
 
 
-def test_faces_of_a_side_are_searched_as_each_alone():
-    """The side is steep: some faces meet the other side after few steps, some later."""
+def test_faces_are_searched_independently_of_each_other():
+    """The side is steep, so that faces take different numbers of search steps."""
     points, slave, master = stacked(
         grid((8, 8), 0.0, kind="quad", up=True),
         grid((6, 6), 0.0, kind="triangle", up=False),

@@ -138,7 +138,7 @@ def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
 
 @pytest.mark.parametrize("basis", BASES)
 def test_the_constraint_is_on_the_total_displacement(basis):
-    """Pushing a flat slave down by u changes the true gap, not the inequality."""
+    """Moving a flat slave down by u changes the gap, but not the inequality."""
     slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
     u = np.zeros((14, 2))
     u[:8, 1] = -0.3

@@ -100,7 +100,7 @@ def test_tangents_in_space_are_orthonormal_and_right_handed():
 
 
 def test_slip_over_a_plane_is_the_motion_along_it():
-    """In the plane +u_x over y = 0, in space u_x and u_y over z = 0."""
+    """The slip is u_x over y = 0 in the plane, and (u_x, u_y) over z = 0 in space."""
     for mesh, ground in (
         (rectangle((0, 0), (1, 1), (3, 1)), RigidPlane((0.0, 0.0), (0.0, 1.0))),
         (BLOCK, RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))),

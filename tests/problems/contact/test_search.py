@@ -91,7 +91,7 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
 
 
 @pytest.mark.parametrize("segments", SIZES)
-def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
+def test_facing_segments_are_found_among_all_pairs(segments):
     """Pairs with a point on the inner side of each of the normals, by (x − p) × n."""
     rng = np.random.default_rng(577215)
     bent = arc(40) + 0.002 * rng.standard_normal((41, 2))

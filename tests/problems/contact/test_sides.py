@@ -66,7 +66,7 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
 
 
 def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
-    """A row of the dual basis pushes at its node, and pulls slightly beside it."""
+    """The force of a row of the dual basis is slightly negative beside its node."""
     case = disc_between_plates(8, contact="mortar", basis="dual", rollers=True)
     s = Clarabel().prepare(case.qp, 1e-10)()
     active = np.split(s.z > 1e-6 * s.z.max(), 2)

@@ -134,7 +134,7 @@ def test_displacements_at_constraints_are_those_of_the_whole_inverse(floating):
 
 
 def condition(mesh, nodes):
-    """Return the condition number of the stiffness with `nodes` held."""
+    """Return the condition number of the stiffness with `nodes` fixed."""
     K = stiffness(mesh, D).toarray()
     free = np.setdiff1d(np.arange(mesh.dofs), dofs_of(np.asarray(nodes), 2))
     return np.linalg.cond(K[np.ix_(free, free)])
@@ -178,7 +178,7 @@ def clamped_bar(n=12):
     )  # fmt: skip
 
 
-def test_the_duals_carry_a_solution_all_the_way_back():
+def test_recovered_points_of_the_duals_solve_the_primal_problem():
     """The recovered point satisfies the KKT conditions of the original problem, and
     the objectives are related as promised; with one support dualised or eliminated."""
     primal = clamped_bar()

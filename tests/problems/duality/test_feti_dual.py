@@ -1,4 +1,4 @@
-"""The dual of torn bodies has the solution of the whole, whatever glues them."""
+"""The dual of torn bodies has the solution of the whole body for every gluing."""
 
 from dataclasses import replace
 

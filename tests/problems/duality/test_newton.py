@@ -42,7 +42,7 @@ def residuals(path, k=1):
 
 
 def settled(path, k=1):
-    """Residuals from the iteration on after which the active rows do not change."""
+    """Residuals after the last change of the active rows."""
     active = [i.answer.z > 1e-6 * i.answer.z.max() for i in path.iterations(k)]
     last = max(
         (j for j in range(1, len(active)) if (active[j] != active[j - 1]).any()),
@@ -90,7 +90,7 @@ def test_convergence_against_a_plane_is_quadratic():
 
 
 def test_two_bodies_with_linearised_rows_converge_linearly():
-    """Bodies that both deform: what the rows' second derivatives are left out for."""
+    """Both bodies deform, and the second derivatives of the gaps are neglected."""
     ratios = settled(ring_path(contact_stiffness="none"), 2)
     ratios = ratios[-5:] / ratios[-6:-1]
 
@@ -139,7 +139,7 @@ def test_no_emitted_qp_has_negative_curvature(path):
 
 
 def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
-    """Pressed blocks would turn aside, were it not for the contact below them."""
+    """Without the contact below them, pressed blocks would rotate."""
     clipped = [i.clipped for i in patch_path(stretch=0.6).iterations(1)]
 
     assert clipped[0] == 0
@@ -288,7 +288,7 @@ def test_rounding_of_the_energies_does_not_shorten_a_step(strain, potential):
 
 
 class Loaded(newton.NewtonPath):
-    """Loads of which only steps up to `reference` come to an equilibrium."""
+    """Load path on which only steps up to `reference` reach an equilibrium."""
 
     _kernel_defect = ""
 
@@ -326,7 +326,7 @@ def test_a_load_step_is_halved_until_its_parts_are_small_enough():
 
 @pytest.mark.parametrize(("k", "steps"), [(1, 1), (2, 3), (3, 7)])
 def test_the_smallest_part_of_a_load_step_is_its_256th(k, steps):
-    """And the last part ends at the load of the step, whatever was rounded."""
+    """The last part ends exactly at the load of the step, despite rounding."""
     parts, asked = loaded(1.01 / 256 / steps, k, steps)
     assert parts == 256
     assert asked[-1] == k / steps
@@ -398,7 +398,7 @@ class Iterated(newton.NewtonPath):
 
 
 def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
-    """Return what one load takes, and what was asked of the iterations."""
+    """Return the result of one load, and the arguments of its iterations."""
     log = {"posed": [], "weights": [], "moves": moves, "lam": lam}
     gaps = newton.Gaps(linearise=None, keep_segments=keep_segments)
     bodies = SimpleNamespace(length=2.0)
@@ -440,8 +440,8 @@ def test_weights_are_above_all_multipliers_so_far_however_small():
 
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e3])
-def test_nodes_that_press_keep_their_segments_where_nothing_settles(size):
-    """After 20 iterations; at the displacement in m, that is times the length 2."""
+def test_pressing_nodes_keep_their_segments_if_the_iteration_stalls(size):
+    """After 20 iterations, with the displacement in m, scaled by the length 2."""
     kept = []
 
     def keep_segments(u, pressing):
@@ -637,7 +637,7 @@ def test_rotations_either_way_are_rotations(monkeypatch, sign):
 
 
 def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
-    """The penalty function is exact for weights above ‖λ‖∞, and the last stay."""
+    """The penalty is exact for weights above ‖λ‖∞, and weights never decrease."""
     seen, move = [], newton.NewtonPath._line_search
 
     def spied(self, at, posed, lam, weight, best):
@@ -703,7 +703,7 @@ def test_an_impossible_load_says_where_it_stopped(monkeypatch):
         path.iterations(1)
 
 
-def test_a_load_lost_in_rounding_is_to_be_larger_and_one_beyond_all_smaller(
+def test_advice_is_a_larger_load_for_tiny_loads_and_a_smaller_one_otherwise(
     monkeypatch,
 ):
     """A tiny load has an equilibrium, that of linear elasticity; F does not show it."""
@@ -733,7 +733,7 @@ def test_supports_that_leave_a_rotation_are_refused():
 
 
 def test_paths_are_those_of_the_keys():
-    """Keys of the family reach the path; other steps are other loads."""
+    """The path depends on all keys, and the steps select the load."""
     case = BeamRing().build(
         "dual",
         BeamRing().complete({
@@ -748,7 +748,7 @@ def test_paths_are_those_of_the_keys():
 
 
 def test_a_node_between_two_segments_keeps_one_of_them():
-    """In step 6 a node of this ring is pushed to and fro at a vertex of the beam."""
+    """In step 6 a node of the ring alternates between segments at a vertex."""
     path = beam_ring._newton_path(
         (6, 4, 8, "strain"), ("nts", "dual"), 10, "neo-hooke", "geometric",
         reference_solution,

@@ -96,14 +96,14 @@ def test_deflections_converge_with_the_square_of_the_size_of_cells():
 
 
 def test_nearly_incompressible_beams_do_not_lock():
-    """Four dilatations a cell would be stiffer by ν²/(1 − 2ν)/ny², more than twice."""
+    """Four dilatations per cell would increase the stiffness by ν²/(1 − 2ν)/ny²."""
     _, answer = emitted("cantilever/nu=0.49/ny=3/slenderness=10/load=1/dual")
 
     assert abs(answer.quantities["deflection_error"]) < 0.06
 
 
 def test_every_iteration_is_a_convex_qp_in_the_total_displacement():
-    """Hessians are positive definite; each starts at the end of the line search."""
+    """Hessians are positive definite; each QP starts at the end of the line search."""
     bodies = beam(6.0, 5.0, (24, 2), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
 

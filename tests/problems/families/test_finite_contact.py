@@ -71,7 +71,7 @@ def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave
 
 
 @pytest.mark.parametrize("stretch", [0.9, 0.65])
-def test_so_are_those_of_st_venant_and_kirchhoff(stretch):
+def test_pressed_blocks_of_st_venant_kirchhoff_are_homogeneous(stretch):
     """Closed form: λ₁² = 1 + ν/(1 − ν)(1 − λ₂²), P₂₂ = λ₂E/(1 − ν²)·½(λ₂² − 1)."""
     got = quantities("contact-patch", stretch=stretch, material="svk")
     strain = (stretch**2 - 1) / 2

@@ -72,7 +72,7 @@ def test_an_unreachable_bound_makes_open_rows_stick_as_well():
     assert values["open"] < values["contact_rows"] - values["active"]
 
 
-def test_shear_that_tresca_grants_without_contact_is_counted_apart():
+def test_shear_without_contact_is_counted_separately():
     """Every row of the arc is open, sticks, slips, or slides without contact."""
     case, s, values = solved("beam-ring/steps=1/friction=tresca/bound=1e6/dual")
     friction, rows = case.mechanics.friction, values["contact_rows"]
@@ -237,7 +237,7 @@ def test_loads_are_balanced_where_friction_may_hold_them():
 
 @pytest.mark.parametrize("push", [0.2, -0.1])
 def test_below_the_limit_forces_do_not_depend_on_the_law(push):
-    """Statics determines the forces, whatever the law."""
+    """Statics determines the forces, independently of the law."""
     normal = (1 + 0.1 * push) / np.hypot(1, 0.1) * WEIGHT
     for law in (COULOMB, FrictionLaw("tresca", bound=0.5 * WEIGHT)):
         case = block_on_incline(push, law)

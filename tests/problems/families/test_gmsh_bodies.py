@@ -114,7 +114,7 @@ POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
 
 @pytest.fixture
 def described(tmp_path, monkeypatch):
-    """Write mesh and TOML into the working directory; return the name of the case."""
+    """Write a mesh and a TOML file to the working directory; return the case name."""
     monkeypatch.chdir(tmp_path)
 
     def write(mesh=None, toml=TOML):
@@ -867,7 +867,7 @@ def test_a_surface_that_is_not_plane_is_refused(described):
 
 
 def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
-    """2 MN/m pass through a disc: each of its two contacts bears all of it."""
+    """A force of 2 MN/m passes through a disc and acts on both of its contacts."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
     values = case.quantities(reference_solution(case.qp))
 

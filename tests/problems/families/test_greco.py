@@ -59,7 +59,7 @@ def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
 
 
 def test_forces_are_in_equilibrium():
-    """Friction and reactions on the right balance the push, contact forces the rest."""
+    """Friction and reactions on the right balance the horizontal load."""
     case, s = solved(8)
     got, reaction = case.quantities(s), case.mechanics.to_primal(s).y * 5e7 * 0.04
     fx, fy = got["contact_force"]

@@ -78,7 +78,7 @@ def test_full_unloading_to_the_other_side_is_loading_to_the_other_side():
 
 
 def test_the_kernel_displaces_as_the_integral_of_the_logarithm():
-    """And F is symmetric and positive definite: the segment is shorter than 4."""
+    """F is symmetric, and positive definite on a segment shorter than 4."""
     elements = Elements(8, 1.5)
     F, h = elements.F, elements.h
 

@@ -123,7 +123,7 @@ def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
 
 
 def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
-    """Equal cylinders press like one on a plane; a soft or small one yields more."""
+    """Equal cylinders have the pressure of one on a plane; softer ones have less."""
     theory = [
         two_cylinders({**CYLINDER.defaults, "load": 10.0, **keys})[1]
         for keys in ({}, {"ratio": 1e9, "radius": 1e9}, {"radius": 3.0, "ratio": 0.5})
@@ -291,7 +291,7 @@ def test_the_slip_begins_where_symmetry_puts_the_cylinders(keys):
 
 
 def test_friction_holds_equal_cylinders_together_without_a_force():
-    """Both deform alike, so that there is no slip, and the pressure is Hertz's."""
+    """Both deform symmetrically, so that nothing slips and the pressure is Hertz's."""
     keys = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)
     got, smooth = result(CYLINDER, **keys), result(CYLINDER, n=10, m=10, load=0.1)
 

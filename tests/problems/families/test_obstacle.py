@@ -41,7 +41,7 @@ def rates(errors):
 
 @pytest.mark.parametrize("dim", [1, 2])
 def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
-    """And lies on the obstacle, smoothly, within the unit distance."""
+    """Within the unit distance, the solution lies on the obstacle with equal slope."""
     rng = np.random.default_rng(20090)
     x, h = rng.uniform(-1.5, 1.5, (400, dim)), 1e-4
     steps = h * np.eye(dim)
@@ -69,7 +69,7 @@ def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
 
 
 def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
-    """Linear elements are, between points where the solution is known."""
+    """Linear elements are exact at nodes between points of known solution."""
     case, s = solved(SMALBE(), "primal", 1, 12)
     got = case.quantities(s)
 

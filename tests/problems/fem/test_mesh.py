@@ -49,7 +49,7 @@ def test_the_area_of_a_half_ring_converges_with_second_order():
     ids=["rectangle", "half ring", "half disc"],
 )
 def test_every_boundary_has_the_body_on_its_left(mesh):
-    """Summed edge normals vanish and ∮ x·n ds is twice the area (Gauss)."""
+    """Edge normals sum to zero and ∮ x·n ds is twice the area (Gauss)."""
     flux, total = 0.0, np.zeros(2)
     for nodes in mesh.boundaries.values():
         x = mesh.points[nodes]

@@ -303,7 +303,7 @@ def test_a_med_file_that_cannot_be_read_is_refused_in_one_line(
     assert "\n" not in str(e.value)
 
 
-def test_other_content_is_no_med_file(tmp_path):
+def test_other_content_is_not_a_med_file(tmp_path):
     for content in (b"", b"hello", b"\x89HDF\r\n\x1a\n" + bytes(200)):
         (tmp_path / "a.med").write_bytes(content)
         with pytest.raises(InputError, match=r"a\.med: not a \.med file \(HDF5\)"):

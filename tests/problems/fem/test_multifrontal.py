@@ -51,7 +51,7 @@ def dense(factor):
 
 
 def choices(mesh):
-    """Free components and those that come last: all, none, some; halves of both."""
+    """Choices of free components and of components eliminated last."""
     n, rng = mesh.dofs, np.random.default_rng(161803)
     every, half = np.arange(n), np.sort(rng.permutation(n)[: n // 2])
     return [

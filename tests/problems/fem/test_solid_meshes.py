@@ -142,7 +142,7 @@ def test_mirrored_cells_are_turned(tmp_path, kind):
         (lambda b: b.cells[:, :5], "cells of type pyramid; expected no pyramids"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, change, message):
+def test_unreadable_files_are_refused_in_one_line(tmp_path, change, message):
     cells = change(CUBE)
     kind = {5: "pyramid", 8: "hexahedron", 20: "hexahedron20"}[cells.shape[1]]
     top = CUBE.boundaries["top"]

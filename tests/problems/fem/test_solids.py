@@ -224,7 +224,7 @@ def test_facets_enclose_the_body_anticlockwise_from_outside(kind, faces):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 1, 12), (9, 2, 1)])
 def test_six_rigid_modes_are_the_kernel_of_a_floating_inverse(kind, size):
-    """Also of a bar, where central nodes alone would be on a line."""
+    """The body is also a bar, whose central nodes alone would be collinear."""
     mesh = box((0.0, 0.0, 0.0), tuple(map(float, size)), size)
     corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
     mesh = mesh if corners is None else divided(mesh, corners)
@@ -273,7 +273,7 @@ def test_the_fill_of_a_box_does_not_depend_on_its_orientation():
 
 
 @pytest.mark.parametrize("across", [1, 2, 3])
-def test_fixing_nodes_of_bars_feel_every_rotation(across):
+def test_fixing_nodes_of_bars_exclude_every_rotation(across):
     """The central nodes of 3 × 3 × 11 cells alone are on an axis of rotation."""
     for length in range(1, 30):
         divisions = across, across, length

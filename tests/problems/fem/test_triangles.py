@@ -123,7 +123,7 @@ def test_mortar_passes_the_patch_test_on_triangles(which, slave, basis):
     assert pressed(which, slave=slave, basis=basis)[-1] <= 1e-8
 
 
-def test_node_to_segment_fails_it_on_triangles_too_but_passes_the_whole_force():
+def test_node_to_segment_fails_on_triangles_but_transfers_the_total_force():
     bodies, primal, s, error = pressed((True, True), contact="nts")
     forces = as_vectors(-(primal.G.T @ s.z) * bodies.force, 2)
 

@@ -1,4 +1,4 @@
-"""Duals of torn bodies on ranks that are threads, and who forms which blocks."""
+"""Duals of torn bodies on ranks that are threads; assignment of blocks to ranks."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -52,7 +52,7 @@ def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
     assert sorted(np.bincount(factors)) == [4, 5]
 
 
-def test_blocks_fill_the_time_until_factors_are_given_away():
+def test_blocks_fill_the_time_until_factors_are_sent():
     tasks = assign_factorisations([dict.fromkeys("abcdefghi", 4)] * 2)
     factors = np.bincount([task.factor_rank for task in tasks.values()])
     more, less = factors.argmax(), factors.argmin()
@@ -61,7 +61,7 @@ def test_blocks_fill_the_time_until_factors_are_given_away():
     assert blocks_before_exchange(tasks, less) == 3  # blocks take a third of a factor
 
 
-def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
+def test_classes_of_a_single_rank_are_factorised_before_the_exchange():
     tasks = {
         "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
         "b": Assignment(4, [1], factor_rank=1, block_rank=1),
@@ -73,7 +73,7 @@ def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
     assert blocks_before_exchange(tasks, 0) == 0
 
 
-def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
+def test_blocks_fill_the_time_until_the_last_factor_is_sent():
     tasks = {
         "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
         "e": Assignment(
@@ -108,7 +108,7 @@ def test_one_rank_does_all():
     assert loads([{"a": 3, "b": 5}]).tolist() == [8]
 
 
-def test_nobody_gets_more_to_do_than_who_gives_it_away():
+def test_a_rank_never_receives_more_work_than_the_sender_keeps():
     rng = np.random.default_rng(7)
     for _ in range(200):
         names = rng.permutation(12)
@@ -126,8 +126,8 @@ def test_nobody_gets_more_to_do_than_who_gives_it_away():
         assert loads(work).max() <= whole.max()
 
 
-def test_what_several_neighbours_return_for_one_row_is_added_up():
-    """Row 0 was lent to both neighbours, rows 2 and 1 to one each."""
+def test_contributions_of_several_neighbours_to_a_row_are_summed():
+    """Row 0 is shared with both neighbours, rows 2 and 1 with one each."""
     arriving = np.array([1.0, 10.0, 100.0, 1000.0])
     at = Halo(
         ranks=SimpleNamespace(
@@ -164,7 +164,7 @@ def torn(request):
 
 
 def dual_of(torn):
-    """A QP with this F, whose numbers name its rows."""
+    """A QP with this F, whose data identify its rows."""
     F = dual_operator(torn.B, torn.domains, torn.equalities)
     m = torn.B.shape[0]
     G = csr_array((torn.B @ torn.domains.kernel).T)
@@ -227,8 +227,10 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
 
 
 @pytest.mark.parametrize("fill", [0, 10**6])
-def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkeypatch):
-    """Either way the sum of the ranks' parts of B W Bᵀ is inverted."""
+def test_contact_rows_are_inverted_in_distributed_or_replicated_form(
+    torn, fill, monkeypatch
+):
+    """In both forms, the sum of B W Bᵀ over ranks is inverted."""
     monkeypatch.setattr(factor, "MAX_FILL", fill)
     F, qp = dual_of(torn)
     x = np.random.default_rng(6).standard_normal(qp.q.size)
@@ -340,10 +342,10 @@ BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
         ([ONLY_WORK, BETTER, ONLY_WORK], BETTER, 37),
     ],
 )
-def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
+def test_among_partitions_with_balanced_work_the_best_sizes_win(
     answers, taken, asked, monkeypatch
 ):
-    """METIS is asked again while sizes are uneven, with 12 seeds and three weights."""
+    """If sizes are uneven, METIS runs with 12 seeds and three weights."""
     asks = []
 
     def answer(graph, weight, ranks, seed=None):
@@ -363,7 +365,7 @@ def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
         assert len({seed for seed, _ in asks[1:]}) == 12
 
 
-def test_sizes_are_weighed_beside_work_with_a_quarter_a_half_and_whole(monkeypatch):
+def test_weights_of_sizes_are_a_quarter_a_half_and_one(monkeypatch):
     """One subdomain has 7.94 of the mean size, others 0.008; all have equal work."""
     seen = set()
 
@@ -420,14 +422,14 @@ def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
 
 
 def halo_of(ranks, here):
-    """Rows of which `here` (ranks, m) tells who touches them, owned in turn."""
+    """Halo of rows touched by ranks as in the mask `here` (ranks, m)."""
     rows = np.flatnonzero(here[ranks.rank])
     reach = csr_array(here[:, rows].T.astype(int))
     return build_halo(ranks, rows, reach, assign_owners(rows, reach))
 
 
 def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
-    """Relative to the rows: two ranks share 0 … 5, each has two more for itself."""
+    """Two ranks share rows 0 … 5, and each touches two more rows alone."""
     here = np.zeros((2, 10), dtype=bool)
     here[:, :6] = here[0, [6, 8]] = here[1, [7, 9]] = True
     length = np.ones(10)
@@ -488,7 +490,7 @@ def test_the_sum_of_parts_is_inverted_rank_by_rank():
 
 
 def test_equal_contact_rows_are_inverted_to_rounding():
-    """A row that is there twice: any y with the same sum over both is as good."""
+    """A row is repeated: only the sum of y over both copies is determined."""
     here = np.ones((1, 3), dtype=bool)
     A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
 
@@ -503,8 +505,8 @@ def test_equal_contact_rows_are_inverted_to_rounding():
     assert on_threads(1, work)[0] == pytest.approx([1, 1, 1], abs=1e-6)
 
 
-def test_the_sum_of_parts_on_some_rows_is_inverted_by_all_alike():
-    """Couplings with other rows, and of equations with contact, are left out."""
+def test_the_sum_of_parts_on_selected_rows_is_inverted_on_all_ranks():
+    """Couplings with other rows, and of equality with contact rows, are dropped."""
     here, _, parts = summed()
     some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
     A = sum(parts)[np.ix_(some, some)]

@@ -1,4 +1,4 @@
-"""Shares that ranks emit, each from the parameters of a case: the QP of one process."""
+"""Shares assembled by ranks from the keys of a case equal the QP of one process."""
 
 import json
 import os
@@ -71,7 +71,7 @@ def emitted(ranks, cases):
 
 @pytest.fixture(scope="module")
 def described(tmp_path_factory):
-    """Bodies of a description, in parts, the case by what it is about."""
+    """Cases of described bodies in parts, by topic."""
     path = press.described(tmp_path_factory.mktemp("press"))
     name = f"bodies:{path}/parts=8"
     return {
@@ -82,7 +82,7 @@ def described(tmp_path_factory):
     }
 
 
-def test_of_a_description_one_process_emits_what_has_no_parts(described):
+def test_bodies_without_parts_are_emitted_by_one_process(described):
     case = parse(described["whole"], PROBLEMS)
 
     assert case.family.emission(case.form, case.params) is None
@@ -130,7 +130,7 @@ def test_a_kind_that_several_ranks_have_is_factorised_by_one_of_them(found, case
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_what_follows_solutions_is_what_one_process_poses(ranks):
+def test_problems_after_solutions_equal_those_of_one_process(ranks):
     for name, of in emitted(ranks, LATER).items():
         assert of["sizes"][0] == of["sizes"][1]
         assert of["entries"][0] == of["entries"][1]
@@ -261,7 +261,7 @@ def generated_with_coulomb_s_law(rng, count=3):
         "obstacle/dim=1/feti=5/dual",
     ],
 )  # fmt: skip
-def test_what_is_not_built_or_has_no_subdomains_is_emitted_by_one(name):
+def test_cases_without_subdomains_are_emitted_by_one_process(name):
     case = parse(name, PROBLEMS)
 
     assert case.family.emission(case.form, case.params) is None

@@ -1,4 +1,4 @@
-"""F = B K⁺Bᵀ by kinds and its preconditioners, against their dense definitions."""
+"""F = B K⁺Bᵀ by classes, and its preconditioners, against dense definitions."""
 
 from dataclasses import replace
 
@@ -82,7 +82,7 @@ def test_the_inverse_of_torn_bodies_is_a_generalised_one_and_symmetric(pair):
     assert_allclose(K_plus, K_plus.T, atol=1e-12 * abs(K_plus).max())
 
 
-def test_products_are_those_of_any_generalised_inverse_on_what_balances(pair):
+def test_products_are_those_of_any_generalised_inverse_on_balanced_loads(pair):
     K, B, R = dense(pair)
     F = operator_of(pair) @ np.eye(len(B))
     G = R.T @ B.T
@@ -129,7 +129,7 @@ def test_the_diagonal_is_that_of_the_matrix(pair):
     assert_allclose(implicit.diagonal(), diagonal, rtol=1e-10)
 
 
-def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
+def test_the_largest_blocks_are_implicit_if_memory_is_limited(monkeypatch):
     pair = beam_and_ring()
     arrays = operator_of(pair).arrays
     sizes = [
@@ -149,8 +149,8 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     assert (~explicit).sum() == 1
 
 
-def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
-    """Each of two membranes in one square, of the same kind or of two."""
+def test_a_single_subdomain_stores_one_triangle_of_its_blocks():
+    """Two membranes of one square each, in one class or in two."""
     pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
     (kind,) = pair.classes
     other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))
@@ -191,7 +191,7 @@ def definition(pair, kind, scaling):
 
 @pytest.mark.parametrize("scaling", SCALINGS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_preconditioners_are_what_they_are_defined_to_be(pair, kind, scaling):
+def test_preconditioners_agree_with_their_dense_definition(pair, kind, scaling):
     M = operator_of(pair).build().preconditioner(kind, scaling)
     _, B, _ = dense(pair)
     expected = B.T @ definition(pair, kind, scaling) @ B
@@ -201,7 +201,7 @@ def test_preconditioners_are_what_they_are_defined_to_be(pair, kind, scaling):
     assert_allclose(M(B[:, 0]), MB[:, 0], atol=1e-6 * abs(MB).max())
 
 
-def test_preconditioners_add_nothing_that_redundant_rows_do_not_feel():
+def test_preconditioners_add_nothing_in_the_kernel_of_redundant_rows():
     pair = membranes("redundant")
     _, B, _ = dense(pair)
     deaf = null_space(B.T)
@@ -224,8 +224,8 @@ def test_small_blocks_are_inverted_as_moore_and_penrose_do():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_contact_rows_do_not_weigh_the_equations(kind):
-    """Though contact touches supports, at both feet of the ring."""
+def test_contact_rows_do_not_affect_the_weights_of_equality_rows(kind):
+    """Contact touches supports at both feet of the ring."""
     pair = beam_and_ring()
     E = pair.equalities
     alone = dual_operator(pair.B[:E], pair.domains, E)
@@ -283,7 +283,7 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
     assert save_qp(tmp_path / "again.npz", read, serialised=True) == digest
 
 
-def test_equal_subdomains_share_one_stiffness_in_what_is_written():
+def test_equal_subdomains_share_one_stored_stiffness():
     few, many = (
         operator_of(
             on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).decomposed

@@ -1,4 +1,4 @@
-"""Parts of any mesh: connected by edges, of one body, about equal."""
+"""Parts of any mesh are connected by edges, within one body and nearly equal."""
 
 import numpy as np
 import pytest

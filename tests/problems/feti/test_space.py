@@ -83,9 +83,7 @@ def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
 
 @pytest.mark.parametrize("parts", [6, 12])
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
-def test_rows_hold_copies_together_at_faces_edges_and_corners_and_nothing_else(
-    glue, parts
-):
+def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, parts):
     """Up to 8 copies of a node: B_E v = 0 for v = T u with u = 0 at supports only."""
     mesh = box()
     fixed = dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3)
@@ -108,7 +106,7 @@ LEFT = {"x": 3, "y": 4, "z": 4, "xy": 1, "xz": 1, "yz": 3, "xyz": 0}
 
 
 @pytest.mark.parametrize("axes", LEFT)
-def test_a_face_that_is_held_along_axes_leaves_the_other_motions(axes):
+def test_a_face_fixed_along_some_axes_allows_the_other_motions(axes):
     mesh = bricks((4, 3, 2), (2.0, 1.0, 0.7))
     face = np.flatnonzero(mesh.points[:, 0] == 0)
     fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])

@@ -1,4 +1,4 @@
-"""Extreme eigenvalues by Lanczos, where they are known without it."""
+"""Extreme eigenvalues by Lanczos, for operators with known spectra."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,7 +48,7 @@ def test_eigenvalues_of_a_diagonal_are_its_entries() -> None:
     assert found.condition == pytest.approx(25.0)
 
 
-def test_equations_take_their_directions_out() -> None:
+def test_equality_rows_remove_their_directions() -> None:
     entries = np.linspace(2.0, 50.0, 40)
     kept = np.ones(40)
     kept[[0, 39]] = 0.0
@@ -96,7 +96,7 @@ def test_errors_of_ritz_values_come_from_the_last_entries_of_their_vectors() -> 
         ((0.0, 0.0), True),
     ],
 )
-def test_both_errors_are_held_against_their_own_eigenvalue(
+def test_each_error_is_relative_to_its_own_eigenvalue(
     errors: tuple[float, float], is_within: bool
 ) -> None:
     """1 % of the eigenvalues 1 and 10 are 0.01 and 0.1."""
@@ -110,7 +110,7 @@ def projector_of(dual: LocalDual) -> Callable[[Vector], Vector]:
 
 
 @pytest.mark.parametrize("rows", ["orthonormal", "chain", "redundant"])
-def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
+def test_the_projector_is_onto_the_kernel_of_g_in_the_range_of_b(rows: str) -> None:
     bodies, primal, _ = decomposed_pair(rows)
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
@@ -188,7 +188,7 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
 
 @pytest.mark.parametrize("floating", [True, False])
 def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
-    """On ker G ∩ range B; without a coarse problem on range B."""
+    """The space is ker G ∩ range B, or range B without a coarse problem."""
     without_lock(monkeypatch, DualOperator, "_blocks")
     pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).decomposed
     m = pieces.equalities
@@ -243,7 +243,7 @@ def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
     assert found.largest_error == pytest.approx(residuals[-1])
 
 
-def test_without_a_residual_what_is_left_is_rounding_of_the_largest() -> None:
+def test_a_zero_residual_leaves_rounding_of_the_largest_eigenvalue() -> None:
     """Five steps of an operator with eigenvalues up to 9e6."""
     found = ritz_bounds(1e6 * np.array([1.0, 9, 2, 3, 4]), np.zeros(4), 0.0)
     rounding = 5 * np.finfo(float).eps * 9e6

@@ -1,4 +1,4 @@
-"""Blocks of structured grids are numbered as the torn mesh of the whole is."""
+"""Blocks of structured grids are numbered like the torn mesh of the whole."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ GRIDS = (
 
 @pytest.fixture(scope="module", params=[1, 3, 4, 20])
 def torn(request):
-    """The layout of three grids in blocks, and their meshes torn into the same."""
+    """The layout of three grids in blocks, and their torn meshes."""
     mesh, body = join(tuple(grid.mesh() for grid in GRIDS))
     label = structured_bodies([grid.divisions for grid in GRIDS], request.param)
     whole = decompose(mesh.points, mesh.cells, label, body)
@@ -93,7 +93,7 @@ def test_spacings_are_those_of_the_cells_around(torn):
     assert whole[0] == pytest.approx(np.tile([2 / 13, 0.05], (14 * 6, 1)))
 
 
-def test_sides_of_grids_are_lines_where_they_are_asked_for(torn):
+def test_sides_of_grids_count_as_lines_on_request(torn):
     layout, whole = torn
     at = layout.places(np.arange(whole.nodes))
     inner, all_ = (layout.lines(at, ends=ends) for ends in (False, True))

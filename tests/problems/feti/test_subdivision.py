@@ -48,7 +48,7 @@ def discs(most):
 
 
 def mesh(most):
-    """The same grids as a mesh of which every node is asked for."""
+    """The same grids as a mesh with all nodes listed."""
     _, whole, body, parts = grids(most)
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
     return (
@@ -175,7 +175,7 @@ def _around(own):
         yield mine, set().union(*own[:s], *own[s + 1 :])
 
 
-def test_ranks_hold_alike_much_where_few_subdomains_have_most_of_the_work():
+def test_sizes_are_balanced_even_if_few_subdomains_have_most_of_the_work():
     """A half disc, graded: long boundaries in its middle, most nodes around it."""
     problem = parts_of("hertz-plane/n=8/halvings=4/feti=16/dual")
     of, rank = problem.layout, subdomains_of(problem, 2)

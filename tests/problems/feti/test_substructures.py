@@ -20,7 +20,7 @@ def dense(parts: LocalProblems) -> np.ndarray:
     return np.asarray(block_diag(*(torn.classes[k].K.toarray() for k in torn.class_of)))
 
 
-def test_a_solve_takes_the_rigid_part_from_forces_and_from_motions(
+def test_a_solve_projects_out_rigid_motions(
     parts: LocalProblems,
 ) -> None:
     """PK⁺Pb is the pseudoinverse of PKP, for forces with resultants too."""
@@ -66,7 +66,9 @@ def test_weights_are_traces_of_nodal_blocks_and_diagonals_those_of_the_whole(
     assert_allclose(parts.diagonal(at), (T.T @ K @ T).diagonal()[at])
 
 
-def test_a_product_takes_the_rigid_part_from_both_sides(parts: LocalProblems) -> None:
+def test_a_product_projects_rigid_motions_out_on_both_sides(
+    parts: LocalProblems,
+) -> None:
     K, R = dense(parts), parts.kernel.toarray()
     rng = np.random.default_rng(10)
     v = rng.standard_normal(len(K)) + 10 * (R @ rng.standard_normal(R.shape[1]))

@@ -1,4 +1,4 @@
-"""Bodies torn into subdomains, and the rows that hold these together."""
+"""Bodies torn into subdomains, and their gluing rows."""
 
 from dataclasses import replace
 from functools import partial
@@ -80,7 +80,7 @@ def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() ->
     assert label.tolist() == 2 * [0, 0, 0, 1, 1, 1, 2, 2]
 
 
-def test_compact_blocks_know_how_long_rows_and_columns_are_where_they_are() -> None:
+def test_compact_blocks_depend_on_local_lengths_of_rows_and_columns() -> None:
     """Cells of 100 by 1, in rows and columns given by two factors each."""
     one, many = np.ones(4), np.full(4, 100.0)
     strips, whole = [slice(k, k + 1) for k in range(4)], slice(0, 4)
@@ -201,7 +201,7 @@ def test_motions_of_the_kernel_are_orthonormal_and_cost_no_energy() -> None:
 
 
 @pytest.mark.parametrize("rows", GLUING)
-def test_rows_hold_exactly_what_is_whole_and_supported(rows: str) -> None:
+def test_rows_vanish_exactly_on_continuous_supported_displacements(rows: str) -> None:
     bodies, primal, pair = decomposed_pair(rows)
     u = np.sin(np.arange(bodies.mesh.dofs) ** 2)
     u[bodies.B_D.indices] = 0
@@ -236,7 +236,7 @@ def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
     assert_allclose(np.unique(root_E.round(6)), np.sqrt([400.0, 4000.0]).round(6))
 
 
-def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
+def test_a_class_has_its_boundary_and_material() -> None:
     _, _, pair = decomposed_pair(most=4)
     beam = pair.classes[0]  # 4 × 4 cells
     assert beam.boundary.size == 2 * 16
@@ -245,7 +245,7 @@ def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
 
 
 @pytest.mark.parametrize("rows", GLUING)
-def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> None:
+def test_rows_are_those_of_sparse_algebra_on_the_whole_body(rows: str) -> None:
     """Supports, gluing and contact in the same order, with the same signs."""
     bodies, primal, found = decomposed_pair(rows)
     label = structured_bodies([(32, 4), (36, 6)], 2)

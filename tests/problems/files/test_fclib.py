@@ -199,7 +199,7 @@ def changed(**arrays):
         (changed(vectors__q=np.array(b"text")), "vectors/q holds no numbers"),
     ],
 )
-def test_what_is_no_convex_problem_of_contact_is_refused(tmp_path, arrays, message):
+def test_problems_that_are_not_convex_are_refused(tmp_path, arrays, message):
     path = tmp_path / "wrong.hdf5"
     write_datasets(path, arrays)
     with pytest.raises(InputError, match=message) as raised:

@@ -1,4 +1,4 @@
-"""QPs from files: what is read is the QP that was written down."""
+"""QPs from files: the QP that is read equals the one that was written."""
 
 import gzip
 import json
@@ -178,7 +178,7 @@ def awkward(rng, n=7, *, symmetric=True):
 
 
 def of_symmetric_part(qp):
-    """The same QP: no objective depends on the rest of P."""
+    """The QP with the symmetric part of P, on which the objective depends alone."""
     M = {name: csc_array(M) for name, M in explicit_matrices(qp)[0].items()}
     return replace(qp, **{**M, "P": csc_array((M["P"] + M["P"].T) / 2)}, structure=None)
 
@@ -217,7 +217,7 @@ def test_highs_reads_an_exported_qps(tmp_path):
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_what_qps_would_take_for_infinite_is_not_written(tmp_path):
+def test_values_that_qps_treats_as_infinite_are_not_written(tmp_path):
     qp = replace(awkward(np.random.default_rng(33)), h=np.array([0.0, 1.0, 1e20]))
 
     with pytest.raises(
@@ -253,7 +253,7 @@ def test_a_compressed_file_is_the_file(written, tmp_path, name):
         ("a.csv", "a.csv: unknown format '.csv'; "),
     ],
 )
-def test_what_is_no_format_compressed_or_not_is_refused(written, name, message):
+def test_unknown_formats_are_refused_compressed_or_not(written, name, message):
     with pytest.raises(InputError) as e:
         build(written("", name))
     assert str(e.value).startswith(message)
@@ -501,7 +501,7 @@ def test_the_content_is_part_of_the_case(written):
 
 
 @pytest.mark.parametrize("text", ["file", "file:", "file/a.npz"])
-def test_a_name_without_a_path_says_how_to_write_one(text):
+def test_the_error_for_a_missing_path_states_the_syntax(text):
     with pytest.raises(InputError, match="no file; expected file:PATH"):
         parse(text, PROBLEMS)
 
