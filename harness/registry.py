@@ -401,7 +401,7 @@ def _with_options(
 
 
 def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
-    """Check the type of an option by its annotation, else by that of the default."""
+    """Check the type of an option by its annotation, or else by its default."""
     kinds = _classes(annotation)
     if kinds is None:
         kinds = None if current is None else (type(current),)

@@ -131,7 +131,7 @@ class Solution:
 
 
 def usable_history(history: object) -> tuple[History, str]:
-    """Return a history as plain arrays and "", or an empty one and what is wrong.
+    """Return a history as plain arrays and "", or an empty one and the defect.
 
     It never raises: a malformed history must not cost the answer that it belongs to.
     """

@@ -131,7 +131,7 @@ class Lines:
         sync_folder(self._path.parent)
 
     def _refuse_changed(self) -> None:
-        """Raise if the content is not what was read and written here."""
+        """Raise if the content differs from the lines read and written here."""
         held = os.fstat(self._fd)
         is_same = held.st_size == self._end
         if is_same:

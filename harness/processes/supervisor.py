@@ -581,7 +581,7 @@ class WorkerProcess:
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
-        """End all processes, and remove what they left in shared memory."""
+        """End all processes, and remove their files in shared memory."""
         if self._process is not None:
             self._footprint.notice(self._tree())
             if not self._is_dead():
@@ -675,7 +675,7 @@ class _WorkerEndError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # the limit of a start, not that of the suite
+            verdict = Verdict.FAILED  # the limit of a start, not the limit of the suite
         self.verdict = verdict
         self.signal = number
         self.is_fault = False  #: True if the worker reported a failure of our own code

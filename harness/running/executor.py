@@ -140,7 +140,7 @@ class Executor:
         """Measure one solver once on each case.
 
         Ranks that emit a QP also judge the answer if all code in them is ours. The case
-        is then built only for what they cannot evaluate.
+        is then built only for values that they cannot evaluate.
 
         Raises
         ------

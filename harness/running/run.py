@@ -1,6 +1,6 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process decides what is measured, and it alone writes the result folder. An engine
+This process selects the measurements, and it alone writes the result folder. An engine
 executes the blocks, so that a run is the same on one machine and on many.
 """
 

@@ -30,7 +30,7 @@ CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: residuals are then so large that every relative residual is small
 DIVERGED = 1e12
 #: ‖q‖∞ for solvers that compare with max(1, size): with sizes of about 1e4 the 1 has no
-#: effect, and their tests are relative as those of the harness
+#: effect, and their tests are relative, like the tests of the harness
 OBJECTIVE_SIZE = 1e4
 
 
