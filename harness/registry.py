@@ -332,7 +332,7 @@ def entry_point_plugins() -> Plugin:
 def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
-    It searches the folders of `sys.path`, which is faster than importing
+    The function searches the folders of `sys.path`, which is faster than importing
     importlib.metadata. An archive on the path counts as a package that may.
     """
     for place in sys.path:

@@ -84,7 +84,7 @@ class Results:
     def failed(self) -> tuple[Record, ...]:
         """Requested measurements that ended without an answer.
 
-        This includes measurements that reached a limit, but not declined ones.
+        Measurements that reached a limit are included, declined ones are not.
         """
         excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(

@@ -51,9 +51,9 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
 class Lines:
     """Sole writer of a file of lines.
 
-    It keeps a digest of the content in memory to detect edits by other programs. The
-    digest is compared at the end, and whenever the file has other time stamps than the
-    last write left. Edits between two runs are allowed.
+    The writer keeps a digest of the content in memory to detect edits by other
+    programs. The digest is compared at the end, and whenever the file has other time
+    stamps than the last write left. Edits between two runs are allowed.
 
     restored : called with a message when the file had to be written again
     """

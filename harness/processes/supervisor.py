@@ -118,7 +118,7 @@ class WorkerProcess:
     """A worker, started by the first request and restarted after each death.
 
     Two file descriptors are appended to `command`: of its requests and of its replies.
-    It runs in a session of its own, on one CPU (the last one that this process may
+    The worker runs in its own session, on one CPU (the last one that this process may
     use), with one thread in every library that obeys its environment variable. Its
     output goes to the file `log`.
 

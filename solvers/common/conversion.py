@@ -55,7 +55,7 @@ def needs_independent_rows(qp: QP) -> str | None:
 def csc(M: Matrix) -> csc_matrix:
     """Return a writable csc_matrix copy with sorted indices and no duplicates.
 
-    It is not a csc_array: OSQP warns about these and qpsolvers takes them for dense.
+    A csc_array would not do: OSQP warns about it, and qpsolvers takes it for dense.
     """
     copy = csc_matrix(M, dtype=np.float64, copy=True)
     copy.sum_duplicates()
