@@ -63,7 +63,7 @@ class Watch:
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
 
     def overheads(self):
-        """Return seconds between records without those of the solver and of fsync."""
+        """Return the seconds between records, less those of solver and fsync."""
         seconds = []
         for i in range(1, len(self.at)):
             gap = self.at[i] - self.at[i - 1]

@@ -350,7 +350,7 @@ def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
 
 def main() -> None:
     """Parse the command line and print the table."""
-    parser = ArgumentParser(description="What a solve of SMALBE costs.")
+    parser = ArgumentParser(description="Costs of a solve of SMALBE.")
     tables = parser.add_subparsers(dest="table", required=True)
     for name in ("dense", "sparse", "incomplete", "subdomains", "kept"):
         tables.add_parser(name)

@@ -346,7 +346,7 @@ class Exact(NamedTuple):
     ) -> tuple[Extended, Extended]:
         """Return σ(v) − λᵀv ≥ 0 of each contact row and each friction vector.
 
-        That of a vector, g‖v‖ − λᵀv, is evaluated without cancellation as
+        For a friction vector, g‖v‖ − λᵀv is evaluated without cancellation as
 
             (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
         """
@@ -586,7 +586,7 @@ class Mechanics:
     def energy(self, u: Extended) -> float:
         """Return the potential energy of `u` (n,) with the work of friction, SI.
 
-        It is summed in extended precision.
+        The energy is summed in extended precision.
         """
         objective = 0.5 * (u @ (self.stiffness @ u)) - self.exact.f @ u
         objective = objective + self.exact.friction_work(u).sum()

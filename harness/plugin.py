@@ -281,7 +281,7 @@ class Family(ABC):
     defaults: Mapping[str, Value]  #: all keys, in the order of canonical names
     forms: tuple[str, ...]  #: forms of the QPs
     path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
-    #: reason why refinement has no limit of finite energy; empty if it has one
+    #: reason why the energy diverges under refinement; empty if it converges
     singular: str = ""
 
     @abstractmethod
@@ -319,7 +319,7 @@ class Family(ABC):
     def with_copies(self, folder: Path) -> Family:
         """Return the family with the copied files of a result folder.
 
-        These replace files that are missing here, or have another content.
+        The copies replace files that are missing here or have another content.
         """
         return self
 

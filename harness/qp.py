@@ -325,7 +325,7 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    This is for use in `declines` of a solver that reads entries of P. If a solver
+    A solver that reads entries of P calls this function in `declines`. If a solver
     declines for this reason, a run assembles a small P, on the clock, and calls
     `declines` again.
 
@@ -467,7 +467,7 @@ def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     Raises
     ------
     InputError
-        When it is not numeric or has another shape; NaN and inf are not checked.
+        When `value` is not numeric or has another shape; NaN and inf are not checked.
 
     """
     array = _numbers(name, value)

@@ -95,7 +95,7 @@ MEASURED = tuple(f.name for f in fields(Measurement))
 class Record(Measurement):
     """A single run of one solver on one case at one tolerance; one JSON line.
 
-    It contains the measurement, the task, the claims of the solver and the verdict.
+    A record contains measurement, task, claims of the solver and verdict.
     Values that were not, or cannot be, measured are None, since JSON has no NaN.
     """
 

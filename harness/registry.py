@@ -332,7 +332,7 @@ def entry_point_plugins() -> Plugin:
 def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
-    It searches the folders of `sys.path`, which is faster than importing
+    The function searches the folders of `sys.path`, which is faster than importing
     importlib.metadata. An archive on the path counts as a package that may.
     """
     for place in sys.path:
@@ -401,7 +401,7 @@ def _with_options(
 
 
 def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
-    """Check the type of an option by its annotation, else by that of the default."""
+    """Check the type of an option by its annotation, or else by its default."""
     kinds = _classes(annotation)
     if kinds is None:
         kinds = None if current is None else (type(current),)

@@ -131,9 +131,10 @@ class Solution:
 
 
 def usable_history(history: object) -> tuple[History, str]:
-    """Return a history as plain arrays and "", or an empty one and what is wrong.
+    """Return a history as plain arrays and "", or an empty one and the defect.
 
-    It never raises: a malformed history must not cost the answer that it belongs to.
+    The function never raises, so that a malformed history does not invalidate its
+    answer.
     """
     try:
         return checked_history(history), ""
@@ -147,8 +148,8 @@ def checked_history(history: object) -> History:
     Raises
     ------
     ValueError
-        When it is not a mapping from identifiers to columns of equal length, or larger
-        than MAX_HISTORY_BYTES.
+        When `history` is not a mapping from identifiers to columns of equal length, or
+        is larger than MAX_HISTORY_BYTES.
 
     """
     if not isinstance(history, Mapping):

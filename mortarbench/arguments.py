@@ -25,7 +25,8 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     Raises
     ------
     InputError
-        If its suffix is not in `suffixes`, it is a folder, or its folder is missing.
+        If the suffix is not in `suffixes`, `path` is a folder, or its folder is
+        missing.
 
     """
     path = checked.path("path", path)
@@ -49,7 +50,7 @@ def check_result_folder(folder: Path) -> Path:
     Raises
     ------
     InputError
-        If there is no such folder, or it is a file.
+        If there is no such folder, or `folder` is a file.
 
     """
     if not os.path.isdir(folder):
@@ -64,7 +65,7 @@ def tolerance(tol: float, where: str = "tol") -> float:
     Raises
     ------
     InputError
-        If it is not a number between 0 and 1, both excluded.
+        If `tol` is not a number between 0 and 1, both excluded.
 
     """
     if not isinstance(tol, Real) or isinstance(tol, bool) or not 0 < tol < 1:
@@ -100,7 +101,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
     Raises
     ------
     InputError
-        If it is not a number of absolute value at most 1e9.
+        If `scale` is not a number of absolute value at most 1e9.
 
     """
     if not abs(scale) <= MAX_SCALE:  # `not ≤` is true for NaN as well
@@ -116,7 +117,7 @@ def budget(seconds: float, where: str = "budget") -> float:
     Raises
     ------
     InputError
-        If it is not a number ≥ 0.
+        If `seconds` is not a number ≥ 0.
 
     """
     if not checked.is_number(seconds) or not seconds >= 0:  # true for NaN as well

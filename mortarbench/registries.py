@@ -309,7 +309,7 @@ class Registries:
     def environment(self) -> dict[str, Any]:
         """Return the environment of the processes of a run; see `capture`.
 
-        It is captured in a new process unless this one is also limited to one thread,
+        A new process captures it unless this process is also limited to one thread,
         because programs such as a notebook load other libraries and use threads.
         """
         from mortarbench.harness.environment.environment import capture, capture_in

@@ -56,7 +56,7 @@ class Results:
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    #: solver labels in the order of the suite; from `load`, those of all records
+    #: solver labels in the order of the suite; from `load`, the labels in all records
     solvers: tuple[str, ...] = ()
     cases: frozenset[str] = frozenset()  #: names of the requested cases; empty: all
     #: requested measurements that are missing; repeating the call measures them
@@ -84,7 +84,7 @@ class Results:
     def failed(self) -> tuple[Record, ...]:
         """Requested measurements that ended without an answer.
 
-        This includes measurements that reached a limit, but not declined ones.
+        Measurements that reached a limit are included, declined ones are not.
         """
         excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(

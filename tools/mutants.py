@@ -187,7 +187,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _expressions(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield the changes of one expression, without those of its parts."""
+    """Yield the changes of one expression, but not of its parts."""
     match node:
         case ast.Compare(ops=[op]):
             yield _with(node, ops=[OPERATORS[type(op)]()])

@@ -7,7 +7,7 @@ with a case name in backquotes; ``key=1..24`` stands for a sequence of cases
 (of several such keys the last one runs fastest). A measured
 column is headed by a solver in backquotes (with options, ``key=value``) or by ``best
 preset``, then by the tolerance, then by ``warm`` or ``tightened`` for a sequence in
-which the solver keeps what it computed before. Other columns are left as they are.
+which the solver reuses earlier results. Other columns are left unchanged.
 """
 
 from __future__ import annotations

@@ -199,7 +199,7 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
 def membrane(k: int) -> QP:
     """Return the QP of a k × k membrane over a paraboloid, with its rim fixed.
 
-    It has bounds only. Its solution is not known, but KKT residuals verify answers.
+    The QP has bounds only. Its solution is unknown, but KKT residuals verify answers.
     """
     second = diags_array(
         [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]

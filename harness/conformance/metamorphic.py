@@ -98,7 +98,7 @@ def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
 def duplicate_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
     """Append copies of the selected rows.
 
-    The multiplier of a row is the sum of those of its copies, which are not unique.
+    The multiplier of a row is the sum of its copies' multipliers, which are not unique.
     """
     every = [np.arange(v.size) for v in (qp.b, qp.h)]
     twice = [

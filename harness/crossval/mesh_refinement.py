@@ -32,8 +32,8 @@ FACES = ((0, 2), (4, 6), (0, 4), (1, 5), (2, 6), (3, 7))
 def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     """Return the interpolation (M, N) from the nodes of `coarse` to those of `fine`.
 
-    It is linear on the edges and multilinear in the cells of `coarse`, which are
-    segments, quadrilaterals or hexahedra. A quadrilateral whose last two corners
+    The interpolation is linear on edges and multilinear in the cells of `coarse`: these
+    are segments, quadrilaterals or hexahedra. A quadrilateral whose last two corners
     coincide is a triangle. It is refined into four triangles, or like a quadrilateral,
     around the midpoint between that corner and the opposite side.
 

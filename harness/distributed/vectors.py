@@ -191,7 +191,7 @@ class _SingleProcess:
 class _Clock:
     """Timer of a block for one part, without the time of nested blocks.
 
-    It is a class because a generator-based context is a few times slower.
+    This is a class because a generator-based context is a few times slower.
     """
 
     __slots__ = ("before", "part", "seconds", "start")

@@ -163,7 +163,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the BLAS in a package's wheel, or without one that of the system."""
+    """Return the BLAS in a package's wheel, or the system's BLAS without a wheel."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":

@@ -63,7 +63,7 @@ def capture(
 ) -> dict[str, Any]:
     """Describe the environment of this process as nested plain data.
 
-    Entries that cannot be read are None. The threads are those of the calling process;
+    Entries that cannot be read are None. The threads refer to the calling process;
     use `capture_in` for those of a worker.
 
     plugins : files of plug-ins, whose code is measured along with ours

@@ -105,7 +105,7 @@ class Copies:
         Raises
         ------
         InputError
-            When it is neither at its path nor listed, or listed with several contents.
+            When the file is neither at its path nor listed, or has several contents.
 
         """
         if os.path.lexists(path):

@@ -178,7 +178,7 @@ def json_object(text: str | bytes) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        When it is not an object, or nested too deeply for Python's parser.
+        When `text` is not an object, or nested too deeply for Python's parser.
 
     """
     try:

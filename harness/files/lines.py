@@ -51,9 +51,9 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
 class Lines:
     """Sole writer of a file of lines.
 
-    It keeps a digest of the content in memory to detect edits by other programs. The
-    digest is compared at the end, and whenever the file has other time stamps than the
-    last write left. Edits between two runs are allowed.
+    The writer keeps a digest of the content in memory to detect edits by other
+    programs. The digest is compared at the end, and whenever the file has other time
+    stamps than the last write left. Edits between two runs are allowed.
 
     restored : called with a message when the file had to be written again
     """
@@ -131,7 +131,7 @@ class Lines:
         sync_folder(self._path.parent)
 
     def _refuse_changed(self) -> None:
-        """Raise if the content is not what was read and written here."""
+        """Raise if the content differs from the lines read and written here."""
         held = os.fstat(self._fd)
         is_same = held.st_size == self._end
         if is_same:

@@ -335,7 +335,7 @@ def compressed(
 ) -> Matrix:
     """Return a matrix from its CSC parts.
 
-    They are checked, since an index out of range would crash a product.
+    The parts are checked, since an index out of range would crash a product.
 
     Raises
     ------

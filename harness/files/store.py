@@ -42,7 +42,7 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
     Raises
     ------
     InputError
-        When it is missing or damaged.
+        When the point is missing or damaged.
 
     """
     with _restorable():

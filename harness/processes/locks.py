@@ -10,8 +10,8 @@ from threading import RLock
 class ForkSafeLock(ContextDecorator):
     """Reentrant lock, used as a context manager or as a decorator.
 
-    It is released in a child forked while another thread held it: that thread does not
-    exist in the child and could never release it.
+    The lock is free in a child forked while another thread held it: that thread does
+    not exist in the child and could never release it.
     """
 
     def __init__(self) -> None:

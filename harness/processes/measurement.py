@@ -65,7 +65,7 @@ class JudgedMeasurement(NamedTuple):
     record: Record
     solution: Solution | None  #: None if the worker ended without an answer
     #: True if there is a point but quantities or error bounds are missing. Ranks that
-    #: evaluate their answer fill in what they can
+    #: evaluate their answer compute some of these
     needs_evaluation: bool = True
 
 
@@ -82,7 +82,7 @@ def measure_and_judge(
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
     whole : returns the entire QP. If ranks emit the QP and evaluate the answer, it is
-        called only for what they cannot evaluate
+        called only for values that they cannot evaluate
     request : request to the worker, see `harness.processes.worker`, without the entries
         that follow from the record. The worker writes the point to the file ``out``
     time_limit, memory_limit : s and MiB
@@ -172,7 +172,9 @@ def _with_cost(
     """Add the cost of a measurement to its record; return it with notes on times."""
     assert reply.answer is not None
     cost, *notes = _plausible_cost(reply)
-    if record.ranks > 1:  # rank 0 measures its own memory, the parent that of all ranks
+    if (
+        record.ranks > 1
+    ):  # rank 0 measures its memory only; the parent measures all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
@@ -307,7 +309,7 @@ def measure_once(
     case : returns the case, which is built by the first call
     reference : solves the QP if residuals cannot decide
     source : origin of the QP. Ranks judge their answers only if all code in them is
-        ours; the case then evaluates only what they cannot
+        ours; the case then evaluates only the remaining values
 
     Raises
     ------

@@ -163,7 +163,7 @@ def _reap() -> dict[int, int]:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command, kill what it leaves behind, and end as it ended."""
+    """Run the command, kill its remaining descendants, and end in the same way."""
     if arguments[0] == "rank":
         _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments

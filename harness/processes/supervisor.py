@@ -118,7 +118,7 @@ class WorkerProcess:
     """A worker, started by the first request and restarted after each death.
 
     Two file descriptors are appended to `command`: of its requests and of its replies.
-    It runs in a session of its own, on one CPU (the last one that this process may
+    The worker runs in its own session, on one CPU (the last one that this process may
     use), with one thread in every library that obeys its environment variable. Its
     output goes to the file `log`.
 
@@ -581,7 +581,7 @@ class WorkerProcess:
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
-        """End all processes, and remove what they left in shared memory."""
+        """End all processes, and remove their files in shared memory."""
         if self._process is not None:
             self._footprint.notice(self._tree())
             if not self._is_dead():
@@ -675,7 +675,7 @@ class _WorkerEndError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # the limit of a start, not that of the suite
+            verdict = Verdict.FAILED  # the limit of a start, not the limit of the suite
         self.verdict = verdict
         self.signal = number
         self.is_fault = False  #: True if the worker reported a failure of our own code

@@ -276,7 +276,7 @@ def _limit_memory(mib: float | None) -> None:
     """
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = hard
-    # RLIMIT_DATA includes what is allocated already.
+    # RLIMIT_DATA includes memory that is already allocated.
     if mib is not None and (data := memory_mib("VmData")) is not None:
         soft = int((data + mib) * 2**20)
         if hard != resource.RLIM_INFINITY:

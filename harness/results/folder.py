@@ -363,7 +363,7 @@ def suite_text(folder: Path) -> str:
     Raises
     ------
     InputError
-        If it is missing, or not a suite.
+        If the file is missing, or not a suite.
 
     """
     path = folder / "suite.toml"

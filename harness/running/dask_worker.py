@@ -254,8 +254,8 @@ def _lock_folder() -> Iterator[int]:
     Raises
     ------
     InputError
-        If it is a link or a file, belongs to another user or is accessible to others.
-        They could place links in it, or hold the locks.
+        If the folder is a link or a file, belongs to another user or is accessible to
+        others, who could place links in it, or hold the locks.
 
     """
     path = Path(gettempdir()) / f"mortarbench-{os.getuid()}"

@@ -140,7 +140,7 @@ class Executor:
         """Measure one solver once on each case.
 
         Ranks that emit a QP also judge the answer if all code in them is ours. The case
-        is then built only for what they cannot evaluate.
+        is then built only for values that they cannot evaluate.
 
         Raises
         ------
@@ -384,10 +384,10 @@ def local_engine(
 def _step_tol(record: Record, entry: StoredCase) -> float | None:
     """Return the tolerance of a step of a fixed-point iteration.
 
-    It is θ·δ, at most `MAX_STEP_TOL`, where δ is the distance of the QP from the fixed
-    point (`harness.plugin.Case.unsettled`) and θ is `Record.tighten` (Eisenstat and
-    Walker 1996, SIAM J. Sci. Comput. 17). Return None if that is not looser than the
-    tolerance asked for, as for the last QP, where δ = 0.
+    The tolerance is θ·δ, at most `MAX_STEP_TOL`, with the distance δ of the QP from the
+    fixed point (`harness.plugin.Case.unsettled`) and θ is `Record.tighten` (Eisenstat
+    and Walker 1996, SIAM J. Sci. Comput. 17). Return None if that is not looser than
+    the tolerance asked for, as for the last QP, where δ = 0.
     """
     delta = float(entry.meta.get("unsettled", 0.0))
     tol = min(MAX_STEP_TOL, record.tighten * delta)

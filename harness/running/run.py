@@ -1,6 +1,6 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process decides what is measured, and it alone writes the result folder. An engine
+This process selects the measurements, and it alone writes the result folder. An engine
 executes the blocks, so that a run is the same on one machine and on many.
 """
 
@@ -256,7 +256,7 @@ def _check_same(
 ) -> None:
     """Refuse to continue if a name has changed its meaning since the last run.
 
-    That is the case if a label has other options, if a case has left the suite, or if
+    The run is refused if a label has other options, if a case has left the suite, or if
     the file of a case has changed.
     """
     now = {case.name: case.params for case in suite.names}

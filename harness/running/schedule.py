@@ -109,7 +109,7 @@ class Schedule:
     def blocks(self) -> Iterator[WorkUnit]:
         """Yield the remaining blocks.
 
-        Each depends on what is in the journal when it is requested: the stopping rule
+        Each depends on the journal at the time of the request: the stopping rule
         sees all blocks that were measured before.
         """
         for group in self.suite.groups:

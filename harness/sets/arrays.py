@@ -33,7 +33,7 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        When a set is neither of discs nor of cones.
+        When a set consists of neither discs nor cones.
 
     """
     arrays: dict[str, NDArray[Any]] = {}

@@ -127,7 +127,7 @@ def load_suite(
     Raises
     ------
     InputError
-        If it is wrong; the message names the file, the place and the correct form.
+        If the suite is wrong; the message names file, place and correct form.
 
     """
     text = read_text(path, "a TOML file", MAX_TOML_MIB)
@@ -149,7 +149,7 @@ def parse_suite(
     Raises
     ------
     InputError
-        If it is wrong; the message names the place and the correct form.
+        If the suite is wrong; the message names the place and the correct form.
 
     """
     with checked.located(where):

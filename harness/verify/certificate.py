@@ -150,7 +150,7 @@ class Certificate:
     def bound(self) -> float:
         """Bound of the relative errors of û, u_λ and the answer, in the energy norm.
 
-        It is infinite if the solution is not proven to be nonzero.
+        The bound is infinite if the solution is not proven to be nonzero.
         """
         return self._relative(self.error)
 

@@ -145,7 +145,7 @@ def _corrected(
 ) -> Iterator[Ray]:
     """Yield rays near w that satisfy cⱼ = 0 exactly where required.
 
-    It is required for variables without bounds, and for variables with a single bound
+    cⱼ = 0 is required for variables without bounds, and for those with a single bound
     if cⱼ is small and has the wrong sign. Three rays are tried: w itself, a ray with
     cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ = 0 only where required.
 

@@ -123,7 +123,7 @@ class MPIReduction:
         mine = local.components[local.shared]
         interface = np.unique(np.concatenate(comm.allgather(mine)))
         self._size = interface.size
-        #: (n,) position of each component among all shared ones; -1 if it is not shared
+        #: (n,) position of each component among all shared ones, else -1
         self._place = np.full(local.components.size, -1)
         self._place[local.shared] = np.searchsorted(interface, mine)
         first = np.full(interface.size, comm.size)

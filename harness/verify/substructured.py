@@ -329,8 +329,8 @@ class Undivided(_Stored):
 class Reduction(Protocol):
     """Completion of sums over subdomains that are stored elsewhere.
 
-    Components (n,) are those of the local subdomains; coarse unknowns (r,) are those of
-    all subdomains.
+    Components (n,) belong to the local subdomains, coarse unknowns (r,) to all
+    subdomains.
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:

@@ -14,7 +14,7 @@ from mortarbench.registries import Registries
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Reference
 
-#: suites with results beyond those of the paper, and their reduction for --quick
+#: Suites whose results the paper does not contain, and their reduction for --quick.
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
         "cases": ("*/Nr=4/*", "*/Nr=8/*", "*/Nr=15/*", "*/Nr=30/*dual*"),

@@ -56,7 +56,7 @@ class Pair:
 
     @cached_property
     def log(self) -> float | None:
-        """Mean logarithm of the times after minus that of the times before."""
+        """Mean logarithm of the times after, minus the mean logarithm before."""
         a, b = _seconds(self.after), _seconds(self.before)
         if not (self.both_verified and self.same_machine and a and b):
             return None
@@ -192,7 +192,7 @@ def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
 
 
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
-    """Average the ratios of a solver relative to those of the other solvers.
+    """Average the ratios of a solver relative to the ratios of the others.
 
     For each case and tolerance, the ratio of the solver is divided by the geometric
     mean of the ratios of the others, which cancels a slowdown of the whole run. Return

@@ -143,7 +143,7 @@ class Ranking:
     def spans(self) -> list[tuple[int, int]]:
         """Rank intervals: after all significantly faster solvers, before all slower.
 
-        They jointly contain the true ranks with 95 % confidence [1]_.
+        The intervals jointly contain the true ranks with 95 % confidence [1]_.
 
         References
         ----------

@@ -182,7 +182,7 @@ def comparison_groups(
 ) -> tuple[ComparisonGroup, ...]:
     """Return the groups of `all_groups` that can be compared over cases.
 
-    These have at least `CASES` cases, two solvers and one verified answer.
+    Such groups have at least `CASES` cases, two solvers and one verified answer.
     """
     groups = all_groups(evidence, pool_forms=pool_forms)
     return tuple(group for group in groups if group.comparable)

@@ -214,7 +214,7 @@ def _position(route: Route) -> tuple[Any, ...]:
 
 
 def _mesh(o: Outcome) -> tuple[Any, ...]:
-    """Return the keys of a case without those of its decomposition."""
+    """Return the keys of a case that do not concern its decomposition."""
     params = {k: v for k, v in o.first.params.items() if k not in DECOMPOSITION}
     return o.first.family, *sorted(params.items())
 

@@ -59,7 +59,7 @@ class Finding(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Competitor:
-    """A solver of a comparison, and its times relative to those of the first."""
+    """A solver of a comparison, and its times relative to the first solver."""
 
     solver: str
     outcomes: Mapping[str, Outcome]  #: outcomes by case
@@ -210,7 +210,7 @@ def _compared(
 ) -> Competitor:
     """Compare with the first on the cases that both solved, in one environment.
 
-    On each case, the ratio is that of the blocks in which both were measured. Over
+    On each case, the ratio is taken within the blocks in which both were measured. Over
     cases, Student's interval is widened to the interval of the sign-flip test if that
     is wider. Student's interval assumes that logarithms are normally distributed, the
     other that their distribution is symmetric. Neither assumption is safe for six

@@ -155,7 +155,7 @@ class Spread(NamedTuple):
 
     @property
     def digits(self) -> int:
-        """Number of digits of the energy; a single answer has those of its tolerance."""
+        """Digits of the printed energy; for one answer, as many as its tolerance."""
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 

@@ -21,7 +21,7 @@ _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 def write_records(path: Path, records: Sequence[Record]) -> Path:
     """Write one row per journal line and one column per field.
 
-    The type of a column is that of the field, not inferred from the values, so that
+    A column has the type of its field, not a type inferred from its values, so that
     tables of several result folders can be concatenated. Nested values (params,
     options, counts, quantities, …) are JSON text, since they differ between families
     and solvers. Equal records give equal bytes.

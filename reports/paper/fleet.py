@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     size: int
     outcome: Outcome
-    dofs: bool  #: the size is that of the primal problem instead of the dual
+    dofs: bool  #: True for sizes of the primal problem, False for the dual
 
     @property
     def time(self) -> Interval | None:

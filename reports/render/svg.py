@@ -22,9 +22,9 @@ class Svg:
 def inline(svg: Svg, name: str) -> str:
     """Return an <svg> element whose text and axes take the text colour of the page.
 
-    It is the drawing in the file without the paper background, within the frame of the
-    uncropped figure. Identifiers get the prefix `name`, since they must be unique in a
-    page.
+    The element is the drawing in the file without its background, within the frame of
+    the uncropped figure. Identifiers get the prefix `name`, since they must be unique
+    in a page.
     """
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", svg.text, flags=re.DOTALL)
     left, top, width, height = svg.frame

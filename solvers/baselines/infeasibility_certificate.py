@@ -38,8 +38,8 @@ def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
 def proves_unbounded(qp: QP, v: Vector) -> bool:
     """Return True if the objective is unbounded below along the feasible direction v.
 
-    That is Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, and v points to no finite bound. A feasible
-    point need not exist.
+    The conditions are Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, and v points to no finite bound.
+    A feasible point need not exist.
     """
     if not v.any() or not np.isfinite(v).all():
         return False

@@ -92,7 +92,7 @@ class PDAS:
     unbounded variables are condensed), changes of single constraints, one-at-a-time
     exchanges, moves of the proximal centre, and products with P.
 
-    It starts from the point of the box nearest to zero, which means no contact in the
+    The start is the point of the box nearest to zero, which means no contact in the
     primal and in the dual. (On the duals of contact problems, a start with all
     variables free took between one solve fewer and seven more.)
     """

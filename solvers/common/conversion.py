@@ -30,7 +30,7 @@ CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: residuals are then so large that every relative residual is small
 DIVERGED = 1e12
 #: ‖q‖∞ for solvers that compare with max(1, size): with sizes of about 1e4 the 1 has no
-#: effect, and their tests are relative as those of the harness
+#: effect, and their tests are relative, like the tests of the harness
 OBJECTIVE_SIZE = 1e4
 
 
@@ -55,7 +55,7 @@ def needs_independent_rows(qp: QP) -> str | None:
 def csc(M: Matrix) -> csc_matrix:
     """Return a writable csc_matrix copy with sorted indices and no duplicates.
 
-    It is not a csc_array: OSQP warns about these and qpsolvers takes them for dense.
+    A csc_array would not do: OSQP warns about it, and qpsolvers takes it for dense.
     """
     copy = csc_matrix(M, dtype=np.float64, copy=True)
     copy.sum_duplicates()

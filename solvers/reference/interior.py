@@ -9,8 +9,8 @@ Trans. Math. Softw. 29), with C the rows of G and of the finite bounds. A step s
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
 for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). A step covers 0.995
-of the distance to the boundary, with a common length for x, y, z and s. A disc is the smooth
-constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the current x, and its
+of the distance to the boundary, with a common length for x, y, z and s. A disc is the
+smooth constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the current x, and its
 multiplier adds z/r to the diagonal of P. δ is the parameter
 of a proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio
 2021, Comput. Optim. Appl. 78): the solutions do not depend on it, and P may be singular
@@ -86,7 +86,7 @@ class _Problem:
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs and G at x, and the terms of discs in P's diagonal."""
+        """Return the rows of discs and G at x, and the diagonal that discs add to P."""
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:

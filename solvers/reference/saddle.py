@@ -32,8 +32,8 @@ Factorise = Callable[[Vector, Vector], Solve]
 def saddle(P: Matrix, B: Matrix) -> Factorise:
     """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    It returns the solve, (r, t) ↦ (u, v), and raises ArithmeticError if an entry is not
-    finite or a pivot is zero.
+    The function returns the solve, (r, t) ↦ (u, v), and raises ArithmeticError if an
+    entry is not finite or a pivot is zero.
 
     P : (n, n), and B : (r, n), both dense or both sparse
     """

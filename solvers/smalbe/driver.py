@@ -167,7 +167,7 @@ def _eliminated(
 ) -> Eliminated | None:
     """Eliminate the free variables of a sequence as long as one factor serves all.
 
-    If the block differs from that of the previous problem, as in Newton's method, a new
+    If the block changes from one problem to the next, as in Newton's method, a new
     factor for each problem would cost more than it saves.
     """
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (
@@ -220,7 +220,7 @@ def _estimated_spectrum(
     F: compiled.Product,
     C: compiled.Rows,
 ) -> Spectrum:
-    """Estimate the spectrum of 𝒫F𝒫, or reuse that of the previous problem.
+    """Estimate the spectrum of 𝒫F𝒫, or reuse the previous problem's spectrum.
 
     The previous spectrum is reused if the Rayleigh quotient of the start vector of the
     Lanczos process, which is always the same, has changed by less than a factor of two.
@@ -534,7 +534,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
-    """Update the count of products by those of the residuals."""
+    """Add the products of the residuals to the count of products."""
     products = task.problem.F.count
     if products == point.counts["P_products"]:
         return point
@@ -559,7 +559,7 @@ COLUMNS = (
 class History:
     """History of a run, rows in the order of `COLUMNS`.
 
-    Gradients and costs are those of the normalised problem.
+    Gradients and costs refer to the normalised problem.
     """
 
     began: float = field(default_factory=perf_counter)

@@ -85,9 +85,9 @@ class _Saddle:
 def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
     """Eliminate the variables without bounds; returns None if that is not possible.
 
-    It requires an explicit P with a positive definite P_EE, variables with and without
-    bounds, no inequality rows, and consistent equality rows whose restrictions to E are
-    either zero or well conditioned.
+    Elimination requires an explicit P with positive definite P_EE, variables with and
+    without bounds, no inequality rows, and consistent equality rows whose restrictions
+    to E are either zero or well conditioned.
 
     previous : block of an earlier problem, used if P_EE is the same
     """

@@ -27,9 +27,9 @@ Operator: TypeAlias = Callable[[Vector], Vector]
 class Step(NamedTuple):
     """State of MPRGP where the CG step x − αp would leave the box.
 
-    Costs, gradients and lengths are those of the augmented Lagrangian
+    Costs, gradients and lengths refer to the augmented Lagrangian
     ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span the
-    equality rows; without equality rows, they are those of the QP itself.
+    equality rows; without equality rows, they refer to the QP itself.
     """
 
     x: Vector  #: (n,) iterate, within the bounds

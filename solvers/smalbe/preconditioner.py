@@ -120,7 +120,7 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 def has_sparse_factor(qp: QP) -> bool:
     """Return True if an incomplete factor of the free part of P is cheap.
 
-    This requires a sparse P with a positive diagonal, stored by this process, and
+    A factor requires a sparse P with a positive diagonal, stored by this process, and
     bounds only, since a factor of P would not include the penalty of rows. The columns
     of P must have so few entries that a factor costs no more than some products.
     """

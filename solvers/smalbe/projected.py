@@ -55,7 +55,7 @@ class Projected:
     diagonal: Vector  #: diagonal of F; empty for an operator without one
     #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
-    #: preconditioner on the face; None for that of the options
+    #: preconditioner on the face; None to use the option `preconditioner`
     preconditioner: Preconditioner | None = None
     #: incomplete factor of the free part of a sparse F in scaled variables, if any
     factor: compiled.IncompleteFactor | None = None
