@@ -87,8 +87,8 @@ class Distribution:
     @property
     def side(self) -> float:
         """Subdomains along an edge of the cube."""
-        subdomains: float = self.cores * self.per_core
-        return subdomains ** (1 / 3)
+        side: float = (self.cores * self.per_core) ** (1 / 3)
+        return side
 
     @property
     def cuts(self) -> tuple[int, int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import sqrt
 
 from mortarbench.harness import Verdict
 from mortarbench.reports.data.crossover import KINDS, Map, Route, charged, memory
@@ -40,7 +41,8 @@ LETTERS = {
 }
 FAILED = "f"  #: letter of all other verdicts
 UNMEASURED = "?"
-_HEIGHT = 2.75  #: height of a row of panels, inches
+_HEIGHT = 2.75  #: of a row of panels, inches
+_LETTER = 1.7  #: ratio of values whose letters would overlap on four decades
 _LIMIT = Look(colour=INK, width=0.7, dash=DOTTED)
 _BARS = {"cap": 2.2, "width": 0.9}
 
@@ -80,7 +82,7 @@ def crossover_figure(
 def _panel(
     one: Map, quantity: Quantity, label: str, limit: float | None, title: str
 ) -> Panel:
-    marks, texts = list[Mark](), list[Text]()
+    marks, ends = list[Mark](), list[tuple[int, float, str]]()
     for route, answers in one.routes.items():
         points = [(n, quantity(o), o) for n, o in answers.items()]
         known = [(n, value) for n, value, _ in points if value is not None]
@@ -88,15 +90,34 @@ def _panel(
         letter = end_letter(one, route)
         if known and letter:
             n, last = known[-1]
-            texts.append(Text(text=letter, place=(n, last.value), offset=(6, 0)))
+            ends.append((n, last.value, letter))
     rules = () if limit is None else (Rule(axis="y", at=float(limit), look=_LIMIT),)
     return Panel(
         x=log("degrees of freedom"),
         y=log(label),
         marks=tuple(marks),
-        texts=tuple(texts),
+        texts=_letters(ends),
         rules=rules,
         title=title,
+    )
+
+
+def _letters(ends: Sequence[tuple[int, float, str]]) -> tuple[Text, ...]:
+    """Write letters at (dofs, value); those that would overlap share a place."""
+    groups = list[list[tuple[int, float, str]]]()
+    for end in sorted(ends):
+        last = groups[-1][-1] if groups else (0, 0.0, "")
+        if end[0] == last[0] and end[1] <= _LETTER * last[1]:
+            groups[-1].append(end)
+        else:
+            groups.append([end])
+    return tuple(
+        Text(
+            text=", ".join(sorted({letter for *_, letter in group})),
+            place=(group[0][0], sqrt(group[0][1] * group[-1][1])),
+            offset=(6, 0),
+        )
+        for group in groups
     )
 
 

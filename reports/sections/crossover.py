@@ -53,7 +53,7 @@ def crossover(a: Analysis) -> Iterator[Part]:
     maps = crossover_maps(a.evidence)
     if not maps:
         return
-    yield from TEXT.parts("prose", maps)
+    yield from TEXT.parts("prose", maps, [(one.title, _answer(one)) for one in maps])
     limits = (a.evidence.suite.get(f"{kind}_limit") for kind in ("time", "memory"))
     yield Picture(
         name="crossover",
@@ -68,15 +68,33 @@ def crossover(a: Analysis) -> Iterator[Part]:
         yield _stops_table(one)
 
 
-def _pays_table(one: Map) -> Table:
+def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
     """Compare every dual route with every primal one."""
-    pairs = [
+    return [
         (dual, primal, compared)
         for primal in one.routes
         for dual in one.routes
         if primal.kind in PRIMAL and dual.kind not in PRIMAL
         if (compared := one.crossover(dual, primal)) is not None
     ]
+
+
+def _answer(one: Map) -> list[tuple[str, int | None, str]]:
+    """Return each primal route with the least size from which on a dual route pays.
+
+    The size is None if no dual route pays at a common size.
+    """
+    best = dict[str, tuple[str, int | None, str]]()
+    for dual, primal, at in _comparisons(one):
+        _, least, _ = best.setdefault(primal.label, (primal.label, None, ""))
+        if at.pays is not None and (least is None or at.pays < least):
+            best[primal.label] = primal.label, at.pays, dual.label
+    return list(best.values())
+
+
+def _pays_table(one: Map) -> Table:
+    """Tabulate all comparisons of dual routes with primal ones."""
+    pairs = _comparisons(one)
 
     def pays(pair: tuple[Route, Route, Crossover]) -> Cell:
         at = pair[2]

@@ -134,6 +134,18 @@ def test_the_figure_has_a_line_per_route_and_its_measurements(evidence):
 
     time, peak = figure.panels
     assert len(time.marks) == len(peak.marks) == 4
-    assert [text.text for text in time.texts] == ["m", "?"]
+    assert [text.text for text in time.texts] == ["?, m"]
     assert {rule.at for p in figure.panels for rule in p.rules} == {120.0, 8192.0}
     assert all(len(series.runs) == len(series.x) for series in time.marks)
+
+
+def test_letters_of_lines_that_end_together_share_a_place(evidence):
+    """TFETI ends at 1000 dofs with 3 s on one rank (m) and on two (?)."""
+    maps = crossover_maps(evidence(measured()))
+    (text,) = crossover_figure(maps, 120, 8192).panels[0].texts
+    assert (text.text, text.place) == ("?, m", (1000, pytest.approx(3.0)))
+
+
+def test_the_section_opens_with_the_answer(evidence):
+    first = crossover(Analysis(evidence(measured()))).prose[0]
+    assert "against primal, dual is significantly faster from 2000 dofs on." in first
