@@ -2,7 +2,8 @@
 
 A history has columns of equal length, with any names. Reports use these:
 
-* ``step``: kind of the step, one letter: c CG, e expansion, f fallback, p proportioning
+* ``step``: kind of the step, one letter: c CG, e expansion, f fallback,
+  p proportioning, n Newton
 * ``outer``: number of the outer iteration; ``products``: products with P so far
 * ``free_gradient``, ``chopped_gradient``: ‖φ‖ and ‖β‖, so that the projected gradient
   has the norm √(‖φ‖² + ‖β‖²)

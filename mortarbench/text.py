@@ -56,7 +56,8 @@ _HEADS = {
     "cost": "own cost",
 }
 _LEGEND = {
-    "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
+    "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning, "
+    "n Newton",
     "outer": "outer: number of the outer iteration",
     "products": "products: of the QP's matrix P with a vector, so far",
     "free_gradient": "‖φ‖: free gradient, of the variables that are not at a bound",

@@ -88,6 +88,7 @@ cdef class SMALBE(MPRGP):
         if problem.discs:  # CG takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
+        self.patience = FIRST_NEWTON
         self.tangents = Directions(
             self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0, self.over
         )
