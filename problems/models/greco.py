@@ -27,10 +27,10 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     ContactSides,
-    UnassembledBodies,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
@@ -129,9 +129,9 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             dofs_of(body.ends, dim, dim - 1),
         ]
     )
-    on_rigid = ContactPair(body.ground, body.ground[:0])
-    normal = (0.0, 1.0, 0.0)[:dim]
-    rigid = RigidPlane((0.0,) * dim, normal)
+    rigid = RigidPlane((0.0,) * dim, (0.0, 1.0, 0.0)[:dim])
+    clamped = np.intersect1d(body.ground, body.corner)
+    on_rigid = ContactPair(body.ground, body.ground[:0], rigid, clamped)
     return ContactProblem(
         bodies=ElasticBodies(
             shape=body.shape,
@@ -145,27 +145,12 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
-        linearise=lambda bodies, _: (
-            lambda u: rigid_rows(
-                bodies.mesh.points,
-                np.zeros_like(u),
-                bodies.pairs[0].slave,
-                rigid,
-                clamped=_corner(bodies),
-                tangential=True,
-            )
-        ),
+        linearise=lambda bodies, laws: linearisation(bodies, "nts", "dual", laws),
         results=lambda answer: {
             **published_quantities(*answer.sides, thickness=body.thickness),
             "tresca_problems": answer.problems,
         },
     )
-
-
-def _corner(bodies: UnassembledBodies | ContactSides) -> Nodes:
-    """Return the nodes of the contact side on x = 40 mm, which have no row."""
-    nodes: Nodes = bodies.pairs[0].slave_nodes
-    return np.asarray(nodes[bodies.mesh.points[nodes, 0] > SIDE * (1 - 1e-9)])
 
 
 def published_quantities(
@@ -183,8 +168,8 @@ def published_quantities(
     force at 38.75 mm in N/m; and `tangential_sum`, the magnitude of the total friction
     force in N/m.
     """
-    dim, corner = bodies.mesh.dim, _corner(bodies)
-    nodes = np.setdiff1d(bodies.pairs[0].slave_nodes, corner)  # nodes with rows
+    dim, (pair,) = bodies.mesh.dim, bodies.pairs
+    nodes = np.setdiff1d(pair.slave_nodes, pair.clamped)  # those with rows
     x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
     u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
     normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness

@@ -55,7 +55,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
-from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
+from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
 from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import NewtonPath
@@ -102,11 +102,7 @@ def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
     return ContactProblem(
         bodies=elastic,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed),
-        linearise=lambda bodies, _: (
-            lambda u: rigid_rows(
-                bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND
-            )
-        ),
+        linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
         results=results,
         exact=_curve(exact),
     )
@@ -134,9 +130,7 @@ def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
     bodies = _cylinder_on_plane(dict(items))[0].assembled
-    rows = rigid_rows(
-        bodies.mesh.points, np.zeros(bodies.mesh.dofs), bodies.pairs[0].slave, GROUND
-    )
+    rows = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 
@@ -160,7 +154,7 @@ def _cylinder_on_plane(
         force=exact.P,
         fixed=_on_axis(sides),
         forces=_pressing(shape.parts, "flat", 1.0),
-        pairs=(ContactPair(sides["arc"], np.zeros(0, dtype=np.int64)),),
+        pairs=(ContactPair(sides["arc"], sides["arc"][:0], GROUND),),
     ), exact
 
 

@@ -12,14 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from mortarbench.harness import Value, Vector
-from mortarbench.problems.contact.bodies import (
-    ContactPair,
-    ContactSides,
-    UnassembledBodies,
-)
-from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
+from mortarbench.harness import Value
+from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rigid import RigidPlane
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
@@ -48,7 +44,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     shape = StructuredSolids((mesh,), (divisions,))
     top, areas = nodal_areas(mesh.points, shape.sides["top"])
     forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
-    fixed = dofs_of(np.unique(shape.sides["bottom"]), 3)
+    right, bottom = shape.sides["right"], np.unique(shape.sides["bottom"])
+    fixed, clamped = dofs_of(bottom, 3), np.intersect1d(right, bottom)
     corner = dofs_of(np.array([len(mesh.points) - 1]), 3)
 
     def results(solution: ContactSolution) -> dict[str, Any]:
@@ -65,16 +62,9 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             force=FORCE,
             fixed=fixed,
             forces=forces,
-            pairs=(ContactPair(shape.sides["right"], np.zeros((0, 4), dtype=int)),),
+            pairs=(ContactPair(right, right[:0], WALL, clamped),),
         ),
         stages=load_steps(1, 1, forces, fixed),
-        linearise=lambda bodies, _: lambda u: wall_rows(bodies, np.zeros_like(u)),
+        linearise=lambda bodies, _: linearisation(bodies, "nts", "dual"),
         results=results,
     )
-
-
-def wall_rows(bodies: UnassembledBodies | ContactSides, u: Vector) -> ContactRows:
-    """Return the rows u_x ≤ GAP of the side x = 1 above the clamped nodes."""
-    points = bodies.mesh.points
-    clamped = np.flatnonzero(points[:, 2] == 0)
-    return rigid_rows(points, u, bodies.pairs[0].slave, WALL, clamped=clamped)

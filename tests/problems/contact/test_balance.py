@@ -98,6 +98,17 @@ def test_bodies_that_can_only_move_together_are_both_named():
     )
 
 
+def test_of_bodies_that_move_together_the_one_without_supports_is_named():
+    fixed = [("upper", "top left", "x"), ("upper", "bottom left", "x")]
+    with pytest.raises(InputError) as e:
+        check_balance(*blocks(fixed=fixed, forces=DOWN))
+
+    assert str(e.value).startswith(
+        "bodies 'lower' and 'upper': nothing balances their load in y; 'lower' has no "
+        "support;"
+    )
+
+
 def test_bodies_that_supports_hold_need_no_contact():
     bodies, rows = blocks(
         fixed=[SUPPORT, ("upper", "top", "xy")],

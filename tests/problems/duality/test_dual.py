@@ -11,7 +11,7 @@ from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.monolithic import load_path
+from mortarbench.problems.duality.monolithic import load_path, primal_qp
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -27,6 +27,7 @@ from mortarbench.problems.fem.inverse import (
 from mortarbench.problems.fem.mesh import dofs_of, half_ring, join, rectangle
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.beam_ring import model, problem
+from mortarbench.problems.models.solids.hertz_sphere import problem as sphere
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 
@@ -195,6 +196,32 @@ def test_recovered_points_of_the_duals_solve_the_primal_problem():
     assert dual.sign * dual.qp.objective(s.x) + dual.constant == pytest.approx(
         primal.objective(back.x)
     )
+
+
+def test_eliminated_supports_may_leave_rigid_motions_which_contact_balances():
+    """Hertz's sphere: the same displacement as with its supports in the dual."""
+    elastic = sphere({**PROBLEMS["hertz-sphere"].defaults, "n": 1}).bodies
+    bodies = elastic.assembled
+    rows = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    answers = []
+    for dual in (
+        dualise(primal, elastic.floating), dual_bounds(primal, elastic.supported)
+    ):  # fmt: skip
+        s = reference_solution(dual.qp)
+        back = dual.recover(s)
+        answers.append(back.x)
+        assert kkt_residuals(primal, back).worst < 1e-10
+        touched = bodies.interface
+        assert dual.interface_displacement(s)[touched] == pytest.approx(
+            back.x[touched], abs=1e-10
+        )
+        assert dual.sign * dual.qp.objective(s.x) + dual.constant == pytest.approx(
+            primal.objective(back.x)
+        )
+
+    assert dual.qp.A.shape == (1, primal.h.size)
+    assert_allclose(*answers, atol=1e-10)
 
 
 def test_equality_rows_become_free_multipliers():

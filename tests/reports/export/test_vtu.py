@@ -170,6 +170,30 @@ def test_each_contact_is_a_table_beside_the_grid(tmp_path):
     np.testing.assert_array_equal(table[["x_m", "y_m"]], FIELDS.points[SIDE.nodes])
 
 
+def test_a_table_in_space_has_areas_and_no_arc_length(tmp_path):
+    axis = (0.0, 1.0)
+    points = np.array([[x, y, z] for z in axis for y in axis for x in axis])
+        [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float
+    )
+    side = ContactSide(
+        name="cube on rigid", nodes=np.arange(4), length=np.full(4, 0.25),
+        force=np.eye(4, 3), pressure=np.ones(4), gap=np.zeros(4), shear=np.ones(4),
+        friction=np.array(["open", "stick", "slip", ""]), friction_force=np.eye(4, 3),
+    )  # fmt: skip
+    fields = Fields(
+        points=points, cells=np.array([[0, 1, 3, 2, 4, 5, 7, 6]]), bodies=np.zeros(1),
+        displacement=0 * points, contacts=(side,),
+    )  # fmt: skip
+    write_vtu(fields, tmp_path / "a.vtu")
+    table = pd.read_csv(tmp_path / "a-cube-on-rigid.csv", keep_default_na=False)
+
+    assert [*table.columns] == [
+        "x_m", "y_m", "z_m", "ux_m", "uy_m", "uz_m", "area_m2", "force_x_N",
+        "force_y_N", "force_z_N", "pressure_Pa", "gap_m", "shear_Pa", "friction",
+    ]  # fmt: skip
+    assert table.friction.tolist() == ["open", "stick", "slip", ""]
+
+
 def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_path):
     other = replace(
         SIDE, name="b on c", pressure=np.array([0.0, 7.0, 0.0]),
