@@ -52,6 +52,11 @@ def told(name, ranks):
         "number": mine.number, "own": own,
         **{key: np.asarray(getattr(share, key)) for key in ("q", "lb", "ub")},
         "A": share.A.part, "b": share.b,
+        "discs": [
+            (own[i].tolist(), r)
+            for one in share.sets[1:]
+            for i, r in zip(one.index, np.asarray(one.radius), strict=True)
+        ],
         "Fx": np.asarray(Fx),
         "component": mine.component,
     })  # fmt: skip
@@ -129,6 +134,7 @@ def compared(name, everyone):
         "bounds": [
             _bounds_off(joined(key, m), getattr(qp, key)) for key in ("lb", "ub")
         ],
+        **_discs(everyone, qp),
         "errors": {
             "B": float(abs(B_whole - whole.B).max() / abs(whole.B).max()),
             "q": _off(joined("q", m), qp.q),
@@ -138,6 +144,19 @@ def compared(name, everyone):
             "b": max(_off(e["b"], qp.b) for e in everyone),
         },
     }
+
+
+def _discs(everyone, qp):
+    """Return the components of all discs, and the largest difference of radii."""
+    discs = sorted(disc for one in everyone for disc in one["discs"])
+    known = sorted(
+        (i.tolist(), r)
+        for one in qp.sets[1:]
+        for i, r in zip(one.index, one.radius, strict=True)
+    )
+    components = [[index for index, _ in some] for some in (discs, known)]
+    radii = (np.array([r for _, r in some]) for some in (discs, known))
+    return {"discs": components, "radii": _off(*radii) if discs else 0.0}
 
 
 def _largest(M):

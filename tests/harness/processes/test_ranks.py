@@ -29,6 +29,7 @@ pytestmark = pytest.mark.together
 CASES = (
     "beam-ring/Nr=4/Nh=3/feti=4/dual",
     "membranes/S=2/n=4/glue=redundant/dual",
+    "contact-patch/lower=4/upper=3/friction=tresca/bound=1e5/feti=2/dim=3/dual",
 )
 CASE = "membranes/S=2/n=4/dual"
 SOLVE = ["solve", CASE, "--solver", "smalbe"]

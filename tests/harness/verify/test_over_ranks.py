@@ -14,6 +14,8 @@ from tests.support import ROOT, SUPPORT
 
 pytestmark = pytest.mark.together
 
+#: some discs slip and others stick
+SPACE = "greco/n=4/dim=3/depth=2/feti=2/dual"
 HELD = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
@@ -21,6 +23,7 @@ HELD = (
     "obstacle/n=10/shape=hemisphere/feti=3/dual",
     "beam-ring/Nr=2/Nh=2/steps=1/friction=coulomb/mu=0.3/feti=3/dual",
     "greco/n=8/feti=3/dual",
+    SPACE,
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 ELIMINATED = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
@@ -162,7 +165,7 @@ def test_digests_tell_qps_apart_and_not_the_ranks_that_emit_them(found):
 
 SEARCHED = (
     HELD[0], "membranes/S=3/n=2/dual", "contact-patch/ratio=0.1/feti=3/dual",
-    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual", MINDLIN,
+    "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual", MINDLIN, SPACE,
     "sliding disc", "disc under rollers", "tilted disc", "soft disc",
 )  # fmt: skip
 

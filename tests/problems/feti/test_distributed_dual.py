@@ -8,16 +8,14 @@ import sys
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError
 from mortarbench.harness.distributed import mpi
-from mortarbench.harness.distributed.vectors import single_process
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from tests.support import ROOT, SUPPORT, press
 
 pytestmark = pytest.mark.together
 
+DISCS = "contact-patch/lower=4/upper=3/friction=tresca/bound=1e5/feti=2/dim=3/dual"
 CASES = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
     "beam-ring/Nr=5/Nh=3/steps=1/feti=3/glue=redundant/friction=tresca/bound=1e5/dual",
@@ -33,6 +31,7 @@ CASES = (
     "cube-wall/n=4/feti=2/dual",
     "plate/Sx=2/Sy=2/n=2/pattern=checkerboard/jump=10/dim=3/Sz=2/dual",
     "contact-patch/lower=3/upper=2/feti=2/dim=3/distort=0.2/dual",
+    DISCS,
     "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
     "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
@@ -46,6 +45,8 @@ LATER = (
     "contact-patch/ratio=5/friction=coulomb/mu=0.3/glue=redundant/feti=3/dual",
     "hertz-cylinder/n=1/m=1/friction=coulomb/mu=0.3/Q=0.2/peak=0.6/feti=9/dual",
     "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
+    "greco/n=4/dim=3/depth=2/feti=2/dual",
+    "hertz-sphere/n=2/against=sphere/Q=0.3/feti=2/dual",
 )
 #: of which active sets alone come in circles (`solvers.reference.over_ranks`)
 CIRCLES = (
@@ -134,18 +135,17 @@ def test_problems_after_solutions_equal_those_of_one_process(ranks):
     for name, of in emitted(ranks, LATER).items():
         assert of["sizes"][0] == of["sizes"][1]
         assert of["entries"][0] == of["entries"][1]
-        assert max(*of["errors"].values(), *of["bounds"]) < SOLVED, (name, of)
+        assert of["discs"][0] == of["discs"][1]
+        errors = *of["errors"].values(), *of["bounds"], of["radii"]
+        assert max(errors) < SOLVED, (name, of)
 
 
-def test_friction_in_space_is_refused_on_ranks():
-    """Its multipliers are in discs, not between bounds."""
-    name = "contact-patch/lower=2/upper=2/friction=tresca/bound=1e5/feti=1/dim=3/dual"
-    case = parse(name, PROBLEMS)
-    emit = case.family.emission("dual", case.params)
-    with pytest.raises(
-        InputError, match="friction in space on several ranks is not built"
-    ):
-        emit(single_process(), reference_over_ranks).share()
+def test_every_disc_has_one_owner(found):
+    """Of 16 nodes, whose discs and multipliers are those of one process."""
+    of = found[DISCS]
+    assert of["discs"][0] == of["discs"][1]
+    assert len(of["discs"][0]) == 16
+    assert of["radii"] < COUPLING_ROUNDING
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
