@@ -173,8 +173,6 @@ def test_each_contact_is_a_table_beside_the_grid(tmp_path):
 def test_a_table_in_space_has_areas_and_no_arc_length(tmp_path):
     axis = (0.0, 1.0)
     points = np.array([[x, y, z] for z in axis for y in axis for x in axis])
-        [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], float
-    )
     side = ContactSide(
         name="cube on rigid", nodes=np.arange(4), length=np.full(4, 0.25),
         force=np.eye(4, 3), pressure=np.ones(4), gap=np.zeros(4), shear=np.ones(4),
