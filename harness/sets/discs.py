@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness.sets.blocks import Blocks, norms
 from mortarbench.harness.sets.convex import Limits, Sum, Vector
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +97,7 @@ class Discs(Blocks):
         rest = norms(force - (along * is_active)[:, None] * outward)
         return np.where(self.radius > 0, rest, 0 * rest)
 
-    def substituted(self, T: Any, a: Vector) -> Discs:
+    def substituted(self, T: Any, a: Vector) -> Self:
         """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
 
         Raises
