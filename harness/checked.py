@@ -27,7 +27,7 @@ def located(where: str) -> Iterator[None]:
 
 
 def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise for a key that is not in `known`."""
+    """Raise if a key of `table` is not in `known`."""
     for key in table:
         if key not in known:
             raise unknown("key", key, known)

@@ -51,7 +51,7 @@ def expand_problems(
     Raises
     ------
     InputError
-        With the place in the suite, if a block is wrong or there are too many cases.
+        If a block is wrong or there are too many cases; the message names the place.
 
     """
     cold: dict[str, CaseId] = {}
