@@ -191,10 +191,10 @@ def case_request(record: Record) -> dict[str, Any]:
 def sizes_from_ranks(
     emitted: Mapping[str, Any] | None, record: Record
 ) -> tuple[QP, Record]:
-    """Complete a record by the sizes of the QP that its ranks emitted.
+    """Add the sizes of the QP that the ranks emitted to a record.
 
-    Return with it a QP of these sizes without content. If the ranks emitted none, the
-    record is unchanged and the sizes are zero.
+    Return an empty QP of these sizes, and the completed record. If the ranks emitted no
+    QP, the sizes are zero and the record is unchanged.
     """
     if emitted is None or not emitted["sizes"]:
         return qp_of_sizes(0, 0), record

@@ -327,7 +327,7 @@ class ParallelSolver:
 
         Returns
         -------
-        a QP of its sizes without content, and the entries of the event "emitted": its
+        an empty QP of the same sizes, and the entries of the event "emitted": its
         `sizes`, its `digest` and the seconds of the slowest rank. If the emission
         fails, the sizes are zero and `declines` or `prepare` reports the failure.
 

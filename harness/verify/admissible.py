@@ -284,8 +284,8 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
     Raises
     ------
     UncertifiableError
-        When a rigid motion carries a load that contact cannot balance: the motion does
-        not change any gap, or only tensile contact forces could balance the load.
+        If contact cannot balance the load along a rigid motion: the motion does not
+        change any gap, or only tensile contact forces could balance the load.
 
     """
     exact, motions = mechanics.exact, mechanics.motions
@@ -382,7 +382,7 @@ class Balance(NamedTuple):
         Raises
         ------
         UncertifiableError
-            When only tensile contact forces could balance the load.
+            If only tensile contact forces could balance the load.
 
         """
         if not self.G.shape[1]:
@@ -460,7 +460,8 @@ def _newton(
         if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
         hessian = _curvature(forces, free, w, G).astype(np.float64)
-        # singular if all rows of a motion are at bounds; GᵀWG = I scales the shift
+        # the Hessian is singular if every row that a motion changes is at a bound; the
+        # shift is relative, because GᵀWG = I
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):

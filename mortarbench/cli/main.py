@@ -60,7 +60,7 @@ class _Parser(argparse.ArgumentParser):
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
         """Exit after a help text."""
-        # flush here, where `main` handles a reader that has closed the pipe
+        # flush here: `main` handles a closed pipe, a flush at interpreter exit fails
         print(end="", flush=True)
         super().exit(status, message)
 
@@ -124,7 +124,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
             if argv[:1] != ["run"]:  # `run` has its own message: it can be continued
                 _print_error("terminated")
             raise
-        # flush here, where `main` handles a reader that has closed the pipe
+        # flush here: `main` handles a closed pipe, a flush at interpreter exit fails
         print(end="", flush=True)
     return code
 

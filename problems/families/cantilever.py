@@ -1,4 +1,4 @@
-"""The family of the cantilever at finite strain; see `problems.models.cantilever`."""
+"""Family `cantilever`, at finite strain; see `problems.models.cantilever`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The family of the cube beside a wall; see `problems.models.solids.cube_wall`."""
+"""Family `cube-wall`, a cube beside a wall; see `problems.models.solids.cube_wall`."""
 
 from __future__ import annotations
 

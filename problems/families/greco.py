@@ -1,4 +1,4 @@
-"""The family of GRECO's plate with friction; see `problems.models.greco`."""
+"""Family `greco`: a plate with friction; see `problems.models.greco`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The family of line contact of half planes; see `problems.models.half_plane`."""
+"""Family `half-plane`, line contact; see `problems.models.half_plane`."""
 
 from __future__ import annotations
 

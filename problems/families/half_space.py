@@ -1,4 +1,4 @@
-"""The family of point contact of half-spaces; see `problems.models.half_space`."""
+"""Family `half-space`, point contact; see `problems.models.half_space`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The family of Hertzian point contact; see `problems.models.solids.hertz_sphere`."""
+"""Family `hertz-sphere`: point contact; see `problems.models.solids.hertz_sphere`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The family of two membranes in subdomains; see `problems.models.membranes`."""
+"""Family `membranes`: two membranes in subdomains; see `problems.models.membranes`."""
 
 from __future__ import annotations
 

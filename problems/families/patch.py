@@ -1,4 +1,4 @@
-"""The family of the contact patch test; see `problems.models.patch`."""
+"""Family `contact-patch`: the patch test; see `problems.models.patch`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The family of plates in subdomains; see `problems.models.plate`."""
+"""Family `plate`: Total FETI without contact; see `problems.models.plate`."""
 
 from __future__ import annotations
 

@@ -131,17 +131,18 @@ def spectra_over_ranks(
     preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
 ) -> list[Spectrum]:
-    """Compute the spectra of F for the rows of supports and gluing.
+    """Compute the extreme eigenvalues of F, once for each preconditioner.
 
-    All ranks must call this function together; each receives the same spectra.
+    F acts on the multipliers of supports and gluing. All ranks must call this function
+    together; each receives the same spectra.
 
     Parameters
     ----------
-    F, G : operator and equality rows RᵀBᵀ of the dual of a problem without contact,
-        whose supports exclude rigid motions of every body
+    F, G : operator F and equality rows RᵀBᵀ of the dual of a problem without contact;
+        the supports must exclude rigid motions of every body
     preconditioners : kind and scaling of each, see `problems.feti.operators`; None
         selects PFP without a preconditioner
-    tol : relative error bound of both eigenvalues
+    tol : bound of the relative error of both extreme eigenvalues
 
     """
     halo, ranks = F.halo, F.halo.ranks

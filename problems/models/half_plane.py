@@ -229,7 +229,7 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
 
 
 def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
-    """Return the constant part of u, in l, under the tractions Σ w·s_c of pairs (w, c).
+    """Return the constant part of u/l under the tractions Σ w·s_c of pairs (w, c).
 
     In the stick zone, u is this constant, because the parabolas −x²/c² of all
     semicircles sum to zero (or, for normal contact, to Hertz's gap).
@@ -238,7 +238,7 @@ def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
 
 
 def self_energy(semicircles: Sequence[tuple[float, float]]) -> float:
-    """Return ½∫q Fq, in F₀l, of tractions q = Σ w·s_c of pairs (w, c)."""
+    """Return ½∫q Fq / (F₀l) for the tractions q = Σ w·s_c of pairs (w, c)."""
     total = 0.0
     for v, b in semicircles:
         for w, c in semicircles:

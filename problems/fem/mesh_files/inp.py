@@ -310,8 +310,8 @@ def _elements(
         corners = table[:, 1:]
         if (bad := ~np.isin(corners, nodes)).any():
             raise InputError(
-                f"element {table[bad.any(axis=1), 0][0]} with node {corners[bad][0]}, "
-                "which is not in the file; expected nodes of *NODE"
+                f"element {table[bad.any(axis=1), 0][0]} refers to node "
+                f"{corners[bad][0]}, which is not in the file; define it under *NODE"
             )
         cells[kind], numbers[kind] = np.searchsorted(nodes, corners), table[:, 0]
     number = np.concatenate(list(numbers.values()))

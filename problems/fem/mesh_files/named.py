@@ -131,8 +131,8 @@ def check_numbers(file: FileMesh) -> None:
         # meshio assigns −1 to nodes that the file does not define
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
             raise InputError(
-                f"{path}: cells with nodes that are not in the file; expected nodes "
-                "that it defines"
+                f"{path}: cells refer to nodes that are not in the file; define these "
+                "nodes or remove the cells"
             )
 
 

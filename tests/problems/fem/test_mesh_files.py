@@ -183,7 +183,7 @@ def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
          "*NSET, *ELSET and *SURFACE alone: in Abaqus/CAE, Model, Edit Attributes, Do "
          "not use parts and assemblies in input files"),
         ("*Node", "*System\n0,0,1\n*Node", "*SYSTEM: expected a file of *NODE"),
-        ("5, 1,", "5, 99,", "element 5 with node 99, which is not in the file"),
+        ("5, 1,", "5, 99,", "element 5 refers to node 99, which is not in the file"),
         ("\n3, 1", "\n2, 1", "node 2 is defined 2 times; expected every number once"),
         ("*Element", "*Nset, nset=a\n1, 77\n*Element", "set 'a' contains 77, which is"),
         ("*Element", "*Nset, nset=a\nb\n*Element", "set 'a': unknown set 'b'; known: "),
@@ -288,7 +288,7 @@ def outside(file, step):
         (elsewhere, "arrays in other files, which are not opened; expected all data"),
         (linked, "1 meshes with 0 time steps; expected one mesh with one step"),
         (huge, "its arrays would take 183105468 MiB of memory; expected at most"),
-        (outside, "cells with nodes that are not in the file; expected nodes that it"),
+        (outside, "cells refer to nodes that are not in the file; define these"),
         (lambda file, step: step["MAI/HE8/NOD"].attrs.modify("NBR", 7),
          "not a mesh in MED format, or damaged"),
     ],
