@@ -98,7 +98,7 @@ def table(where: str, value: object, *, instead: str = "a table") -> dict[str, A
 
 
 def path(where: str, value: object) -> Path:
-    """Return a path, from a str or PathLike, that is valid in the file system."""
+    """Return a str or PathLike as a Path, which need not exist; refuse invalid ones."""
     if not isinstance(value, str | os.PathLike) or not isinstance(
         text := os.fspath(value), str
     ):

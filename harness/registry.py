@@ -248,7 +248,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return all options of a solver with their values; empty without fields."""
+    """Return all options of a solver with their values; {} if it is not a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}

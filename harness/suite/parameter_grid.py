@@ -85,7 +85,7 @@ class _Block:
     cases: list[CaseId]
     given: list[dict[str, object]]  #: keys of each case in the suite
     kind: str  #: "sequence", "growing" or ""
-    along: tuple[str, ...]  #: keys of the sequence or series; empty without
+    along: tuple[str, ...]  #: keys of the sequence or series; empty if kind is ""
 
 
 def _blocks(

@@ -522,7 +522,7 @@ _COMMANDS = {
     ),
     "new": _Command(
         "new",
-        "write a template of a solver, a problem or a suite",
+        "write a template for a solver, a problem or a suite",
         [
             _Option(
                 "kind",
