@@ -46,7 +46,7 @@ class Preconditioned(Protocol):
         Raises
         ------
         ValueError
-            When a name is unknown; the message lists the known ones.
+            If a name is unknown; the message lists the valid names.
 
         """
 

@@ -183,7 +183,7 @@ def physical(where: str, value: Any) -> float:
     Raises
     ------
     InputError
-        Unless the value is 0 or its magnitude is between MIN_SIZE and MAX_SIZE. (For
+        If the value is neither 0 nor of a magnitude between MIN_SIZE and MAX_SIZE. (For
         comparison, Young's modulus of steel is 2e11 Pa.)
 
     """

@@ -305,7 +305,7 @@ def infeasible() -> QP:
 
 
 def unbounded() -> QP:
-    """Return a QP that decreases along x₀ without curvature and without upper bound."""
+    """Return a QP that decreases linearly along x₀, which has no upper bound."""
     return QP(
         P=csr_array(np.diag([0.0] + [1.0] * 19)),
         q=-np.ones(20),

@@ -155,7 +155,7 @@ def packages_of(environment: Mapping[str, Any]) -> list[str]:
 
 
 def digest(environment: Mapping[str, Any]) -> str:
-    """Return 12 hex digits that identify an environment, without load and free memory.
+    """Return 12 hex digits that identify an environment, ignoring load and free memory.
 
     Times of environments with equal digests may be compared.
     """

@@ -183,8 +183,8 @@ def rebuild(
     ------
     InputError
         If its family is unknown or fails, or if its QP differs from that of the record.
-        A QP that ranks emitted is not compared: the digest of its shares is not that of
-        the entire QP.
+        QPs assembled by several ranks are not compared, because the digest of the
+        shares differs from that of the entire QP.
 
     """
     if r.family not in families:

@@ -1,8 +1,8 @@
 """Unit of work of a run, as plain data that can be sent to any process or machine.
 
-A block is every solver once on one case at one tolerance, in random order. A drift of
-the machine then affects all solvers of a block alike, and they are compared within
-blocks. A block of a sequence is every solver once on all steps, one after the other.
+In a block, every solver is measured once on one case at one tolerance, in random order.
+A drift of the machine then affects all solvers of a block alike, and they are compared
+within blocks. In a block of a sequence, every solver solves all steps once, in order.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ MAX_STEP_TOL = 1e-2  #: loosest tolerance of a step, far from the fixed point
 
 @dataclass(eq=False)
 class Executor:
-    """Executor of blocks, one after the other, with one worker process per solver.
+    """Sequential executor of blocks, with one worker process per solver.
 
     scratch : folder of temporary files, used by this executor alone
     cases : folder of built cases, see `harness.processes.case_folder`; executors may

@@ -118,8 +118,8 @@ def charged(o: Outcome) -> Interval | None:
 def memory(o: Outcome) -> Interval | None:
     """Return the median peak memory (MiB) of building and solving, with its interval.
 
-    The two happen in different processes, one after the other. Ranks build the case
-    themselves; their memory is that of all ranks together.
+    Building and solving take place in different processes, in sequence. Ranks build
+    the case themselves; their memory is that of all ranks together.
     """
     peaks = [
         max(r.build_peak_mib or 0.0, r.peak_mib)

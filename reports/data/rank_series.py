@@ -224,7 +224,7 @@ def _ratio(
     """Return the ratio of the times of a and b; single runs give no interval.
 
     factor : multiplies the ratio
-    paired : True if blocks of the same name were measured one after the other
+    paired : True if blocks of the same name were measured in succession
     """
     if a is None or b is None:
         return None

@@ -153,7 +153,8 @@ def cost_model(
     Raises
     ------
     ValueError
-        Without times on one rank and on several, or communication on the largest.
+        If there are no times on one rank or on several, or no communication on the
+        largest number of ranks.
 
     """
     ranks = sorted(seconds)

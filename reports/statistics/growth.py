@@ -79,7 +79,7 @@ class Growth:
         Raises
         ------
         ValueError
-            Outside the measured range, where no data support the law.
+            If n is outside the measured range, where no data support the law.
 
         """
         low, high = min(self.sizes), max(self.sizes)

@@ -21,7 +21,7 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 class PolygonalQP:
     """Approximation of a QP by another one, with polygons in place of circles."""
 
-    qp: QP  #: QP with rows of G for the sides of polygons, and without discs and cones
+    qp: QP  #: QP with rows of G for the sides of polygons instead of discs and cones
     #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius
     error: float
     #: maps a point of `qp` to the original QP; `z_box` is then normal to the polygons,

@@ -56,8 +56,8 @@ def checked(M: Operator) -> Operator:
     Raises
     ------
     ValueError
-        By the returned function: if the shapes of Mv and v differ, or vᵀMv is not a
-        positive number.
+        If, in a call of the returned function, the shapes of Mv and v differ or vᵀMv is
+        not a positive number.
 
     """
 

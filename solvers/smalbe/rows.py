@@ -334,7 +334,7 @@ class _FactoredTransposed:
 
 
 def is_sparse(G: Matrix) -> bool:
-    """Return True if rows G (m, n) are too many for an array."""
+    """Return True if G is distributed, or sparse and too large for a dense array."""
     if isinstance(G, DistributedColumns):
         return True
     return bool(issparse(G) and G.shape[0] * G.shape[1] > MAX_DENSE_ENTRIES)

@@ -46,7 +46,7 @@ class _Draft:
         return np.asarray(-(self.P @ self.x + rows + self.z_box))
 
     def widened(self, by: int, x: Vector) -> _Draft:
-        """Append free variables without cost and constraints."""
+        """Append free variables with neither cost nor constraints."""
         rows = {k: np.pad(getattr(self, k), ((0, 0), (0, by))) for k in ("A", "G")}
         far = np.full(by, np.inf)
         return replace(

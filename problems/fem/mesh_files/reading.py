@@ -41,7 +41,7 @@ def read_msh(path: Path) -> NamedMesh:
     Raises
     ------
     InputError
-        See `read_mesh_file` and `named_mesh`.
+        If `read_mesh_file` or `named_mesh` refuses the file.
 
     """
     return named_mesh(read_mesh_file(path))
