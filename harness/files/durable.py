@@ -91,7 +91,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        When the disk is full, with the file system and a remedy.
+        If the disk is full; the error names the file system and a remedy.
 
     """
     try:
@@ -111,8 +111,8 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
     Raises
     ------
     InputError
-        When the message says so, or the disk is full now, with the file system and a
-        remedy.
+        If the message names a full disk, or if the disk is full now; the error names
+        the file system and a remedy.
 
     """
     for code in FULL:
