@@ -27,7 +27,7 @@ def located(where: str) -> Iterator[None]:
 
 
 def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise for a key that is not in `known`."""
+    """Raise if a key of `table` is not in `known`."""
     for key in table:
         if key not in known:
             raise unknown("key", key, known)
@@ -98,7 +98,7 @@ def table(where: str, value: object, *, instead: str = "a table") -> dict[str, A
 
 
 def path(where: str, value: object) -> Path:
-    """Return a path, from a str or PathLike, that is valid in the file system."""
+    """Return a str or PathLike as a Path, which need not exist; refuse invalid ones."""
     if not isinstance(value, str | os.PathLike) or not isinstance(
         text := os.fspath(value), str
     ):

@@ -349,8 +349,8 @@ def check_symmetric(P: Matrix) -> None:
     Raises
     ------
     ValueError
-        For an asymmetric P, with the entries that differ most, and a hint if P is a
-        triangle.
+        If P is asymmetric; the message names the two entries that differ most, and
+        contains a hint if P is a triangle.
 
     """
     where, worst = _asymmetry(P)

@@ -129,7 +129,7 @@ class Record(Measurement):
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
     canary_seconds: float | None = (
-        None  #: time of a fixed computation just before, which shows drift
+        None  #: time of a fixed computation just before, which reveals drift
     )
     threads: int | None = None  #: largest number of any library in the worker
     cpu: int | None = None  #: CPU that the worker was bound to
@@ -148,8 +148,8 @@ class Record(Measurement):
     #: tolerance of an early step of a tightening sequence, where looser than `tol`
     step_tol: float | None = None
     accuracy: float | None = None  #: tolerance of the verdict in a sweep, if not `tol`
-    #: "null": a second copy of a solver, which shows the noise; "copies": `ranks`
-    #: independent solves at the same time
+    #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
+    #: which measures the noise; "copies": `ranks` independent solves at the same time
     role: str = ""
     primal: float | None = (
         None  #: this and the next three: residuals of harness.verify.kkt
@@ -369,7 +369,7 @@ def _check(r: Record) -> None:
     Raises
     ------
     ValueError
-        With the field, its value, and the range.
+        If a value is out of range; the message names the field, value and range.
 
     """
     if r.schema not in READABLE:

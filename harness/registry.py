@@ -76,8 +76,9 @@ class SolverSpec:
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  #: that differ from defaults
-    #: "null": a second copy of a solver, which shows the noise; "copies": `ranks`
-    #: independent solves at the same time, an upper bound for the speed of ranks
+    #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
+    #: which measures the noise; "copies": `ranks` independent solves at the same time,
+    #: an upper bound for the speed of ranks
     role: str = ""
     ranks: int = 1  #: number of MPI processes of a solve
 
@@ -130,10 +131,10 @@ class PluginFile:
         return replace(self, path=self.path.resolve())
 
     def content(self) -> Iterator[bytes]:
-        """Yield the code: the file, then its neighbours in the order of their paths.
+        """Yield the code: the file, then its neighbours, sorted by path.
 
-        Neighbours are found in the source: all modules that import statements name, at
-        any level of the code, and those that these modules import in turn.
+        The neighbours are the modules in the same folder that import statements in the
+        file name (also those inside functions), directly or through other neighbours.
 
         Raises
         ------
@@ -219,8 +220,8 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
     Raises
     ------
     InputError
-        For an unknown solver, backend or option, and for the value of an option that
-        has the wrong type or that the solver refuses.
+        If the solver, backend or an option is unknown, or the value of an option has
+        the wrong type or is refused by the solver.
 
     """
     prefix, colon, backend = spec.name.rpartition(":")
@@ -233,12 +234,12 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
 
 
 def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
-    """Raise for an unknown name of a solver, without importing any solver.
+    """Raise unless `name` is the name of a solver, without importing any solver.
 
     Raises
     ------
     InputError
-        For an unknown solver. Backends of adapters are not checked.
+        If the solver is unknown. Backends of adapters are not checked.
 
     """
     prefix, colon, _ = name.rpartition(":")
@@ -247,7 +248,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return all options of a solver with their values; empty without fields."""
+    """Return all options of a solver with their values; {} if it is not a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
@@ -671,7 +672,7 @@ def check_solver(thing: object) -> None:
     Raises
     ------
     InputError
-        With the names of the methods that a solver needs.
+        Otherwise; the message names the methods that a solver needs.
 
     """
     methods = " and ".join(_SOLVER_PARTS)

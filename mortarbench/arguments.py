@@ -60,12 +60,12 @@ def check_result_folder(folder: Path) -> Path:
 
 
 def tolerance(tol: float, where: str = "tol") -> float:
-    """Return a valid relative accuracy.
+    """Check a relative tolerance, and return it as a float.
 
     Raises
     ------
     InputError
-        If `tol` is not a number between 0 and 1, both excluded.
+        If `tol` is not a number with 0 < tol < 1.
 
     """
     if not isinstance(tol, Real) or isinstance(tol, bool) or not 0 < tol < 1:
@@ -96,12 +96,12 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
 
 
 def check_scale(scale: float, where: str = "scale") -> float:
-    """Return a valid factor of displacements in pictures.
+    """Check the magnification of displacements in pictures, and return it.
 
     Raises
     ------
     InputError
-        If `scale` is not a number of absolute value at most 1e9.
+        If the absolute value of `scale` is not at most 1e9.
 
     """
     if not abs(scale) <= MAX_SCALE:  # `not ≤` is true for NaN as well
@@ -112,7 +112,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
 
 
 def budget(seconds: float, where: str = "budget") -> float:
-    """Return a valid number of seconds.
+    """Check a time budget in seconds, and return it.
 
     Raises
     ------

@@ -79,7 +79,7 @@ def report(
         verdict became worse; ``slower``, the interval of a ratio of times lies above
         1, see docs/statistics-growth.md
     pool_forms : compare solvers over the cases of all forms together in means, ranks
-        and profiles, instead of form by form; a declined form counts as unsolved
+        and profiles, not within each form; a declined form counts as unsolved
     registries : replaces our registries, whose report function is used
 
     Raises

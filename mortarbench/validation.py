@@ -122,7 +122,8 @@ def validate(
     cases = []
     for r in records.values():
         if r.family in families:
-            # a case of another version is listed as not validated
+            # `validate_folder` has listed cases that cannot be assembled, for example
+            # those of another version, as not validated
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):

@@ -46,7 +46,7 @@ def write_report(
     Raises
     ------
     InputError
-        For an unknown format, or a folder without measurements.
+        If a format is unknown, or the folder contains no measurements.
 
     """
     for name in formats:
@@ -78,7 +78,7 @@ def figures(
     Raises
     ------
     InputError
-        For a folder without measurements.
+        If the folder contains no measurements.
 
     """
     page = compose(read_evidence(directory, factor))
@@ -97,7 +97,7 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
     Raises
     ------
     InputError
-        For a folder without measurements.
+        If the folder contains no measurements.
 
     """
     composed = opening(Analysis(read_evidence(Path(directory), factor)))
@@ -107,7 +107,7 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
     """Compose the report: the answer, then the evidence.
 
-    The answer compares combinations of solver and form, and solvers form by form;
+    The answer compares combinations of solver and form, and solvers within each form;
     `pool_forms` does not change it.
     """
     collecting = gc.isenabled()

@@ -97,7 +97,7 @@ class Problem:
     """All answers to one problem, of every solver and form; plain data."""
 
     name: str  #: the case without its form
-    truth: str  #: "reference", or the name of the best answer; empty without either
+    truth: str  #: "reference", or the name of the best answer; empty if unknown
     doubt: float | None  #: bound of the relative error of the truth in the energy norm
     closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
@@ -201,10 +201,10 @@ def _answer(
 
 
 def _contradiction(a: Answer) -> str:
-    """Describe an error that exceeds the certificate of the run; "" without one.
+    """Describe an error that exceeds the bound certified in the run, or return "".
 
-    A point with remarks, or with another verdict than in the run, is skipped: it may
-    not be the point that was certified.
+    A point with remarks, or whose verdict differs from that of the run, is skipped: it
+    may not be the point that was certified.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""

@@ -173,7 +173,7 @@ def discretisation_errors(
 
 
 def read_discretisation(folder: Path) -> dict[str, Discretisation]:
-    """Read the file of `discretisation_errors`, by physical case; empty without one.
+    """Read the file of `discretisation_errors`, by physical case; {} if it is missing.
 
     Raises
     ------

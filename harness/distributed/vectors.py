@@ -219,8 +219,8 @@ class DistributedVector(np.ndarray):
     Raises
     ------
     TypeError
-        For operations that are neither elementwise nor one of the reductions sum, min,
-        max, any, all, dot product, norm and count.
+        If an operation is neither elementwise nor one of the reductions sum, min, max,
+        any, all, dot product, norm and count.
 
     """
 

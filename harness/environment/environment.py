@@ -272,7 +272,7 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
 
 
 def _cpu_limit() -> float | None:
-    """Return the container's limit of processor time, in cores; None without one."""
+    """Return the container's CPU limit, in cores; None if unlimited or unknown."""
     quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
     if not quota:  # the older layout of control groups
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")

@@ -144,7 +144,7 @@ def check_copy(copy: Path, digest: str, remedy: str) -> None:
     Raises
     ------
     InputError
-        With the file, both digests, and the remedy.
+        Otherwise; the message names the file, both digests, and the remedy.
 
     """
     with opened(copy, "the copy of a file") as file:
@@ -168,7 +168,7 @@ def check_copies(folder: Path) -> None:
     Raises
     ------
     InputError
-        For the first copy with different content.
+        If a copy has different content; the message names the first.
 
     """
     for copy, digest, _ in copies_in(folder):
@@ -233,7 +233,7 @@ def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
     Raises
     ------
     InputError
-        For the first such case.
+        If there is such a case; the message names the copy.
 
     """
     copies = (folder / FOLDER).resolve()

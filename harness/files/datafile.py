@@ -59,7 +59,7 @@ def check_size(what: str, size: int) -> None:
     Raises
     ------
     InputError
-        With the memory needed, in MiB, and how to raise the limit.
+        If so; the message states the memory in MiB, and how to raise the limit.
 
     """
     if size > (most := max_bytes()):
@@ -139,7 +139,7 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
     Raises
     ------
     InputError
-        For every exception and warning in the block.
+        If any exception or warning is raised in the block.
 
     """
     room += _PARSER_BYTES

@@ -91,7 +91,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
     Raises
     ------
     InputError
-        If the disk is full; the error names the file system and a remedy.
+        If the disk is full; the message names the file system and a remedy.
 
     """
     try:
@@ -111,7 +111,7 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
     Raises
     ------
     InputError
-        If the message names a full disk, or if the disk is full now; the error names
+        If `failure` reports a full disk, or the disk is full now; the message names
         the file system and a remedy.
 
     """

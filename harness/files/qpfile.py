@@ -275,7 +275,7 @@ def check_dense(name: str, M: Matrix) -> None:
 def _check_foreign(
     matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
 ) -> None:
-    """Raise for an operator, which only workers read, and for too large matrices."""
+    """Raise if P is an operator, which only workers read, or a matrix is too large."""
     if "maker" in meta:
         raise ValueError(
             "holds P as an operator, which is read only where the run itself wrote it; "

@@ -11,9 +11,9 @@ It speaks `harness.processes.protocol` and answers four kinds of requests:
   ``fields``, if the case has one
 * ``{"shared": NAME}`` asks, without building the case, whether ranks can emit its QP
   themselves. Reply: ``{"event": "done", "shared": …}``
-* ``{"solve": PATH, "point": PATH}`` solves the QP in the first file by the reference,
-  for verdicts that residuals cannot decide, and writes the point to the second. Reply:
-  ``{"event": "done", "found": …}``, false if the reference fails
+* ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
+  solver, for verdicts that residuals cannot decide, and writes the point to the second.
+  Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
 
 If a case cannot be built, the reply to the first two is ``{"event": "done", "unbuilt":
 REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true beyond the last problem of

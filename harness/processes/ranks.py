@@ -60,7 +60,7 @@ from mortarbench.harness.processes import reaper
 from mortarbench.harness.qp import QP, no_rows
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution
-from mortarbench.harness.verify.measure import memory_mib
+from mortarbench.harness.verify.measure import memory_mib, reason_to_decline
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: MPI tag of the orders that rank 0 sends to the others
@@ -238,7 +238,7 @@ def follow(
                     emitted, _ = _emit_on_ranks(emit, order["case"], ranks)
                 limit(order["memory_limit"])
             elif "declines" in order and emitted is not None:
-                solver.declines(emitted.share().qp)
+                reason_to_decline(solver, emitted.share().qp)
             elif "tol" in order and emitted is not None:
                 share = emitted.share()
                 run = solver.prepare(share.qp, order["tol"])
@@ -380,7 +380,7 @@ class ParallelSolver:
             return str(self._emission_error) if is_input_error else None
         if self._emitted is not None:
             self._order({"declines": True})
-            return self._solver.declines(self._emitted.share().qp)
+            return reason_to_decline(self._solver, self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
             return "P cannot be shared by ranks; expected a case in subdomains"

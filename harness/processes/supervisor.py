@@ -10,7 +10,7 @@ The times that a worker reports are checked against the parent's clock and again
 CPU time that the kernel counts. While one worker executes a request, all others on its
 CPU are stopped by SIGSTOP, so that threads which a solver leaves running do not disturb
 another's measurement; requests from several threads are therefore serialised. Signals
-are sent to pidfds, see pidfd_open(2), never to process numbers, which the kernel
+are sent to pidfds, see pidfd_open(2), never to process IDs, which the kernel
 reuses.
 """
 
@@ -136,7 +136,7 @@ class WorkerProcess:
         self._command = command
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
-        self._worker = 0  # process number of the worker, once it is ready
+        self._worker = 0  # process ID of the worker, once it is ready
         self._reaper_fd = self._worker_fd = -1  # pidfds of both
         self._cpu = -1
         self._requests = self._replies = -1  # this process's ends of the two pipes
@@ -319,8 +319,8 @@ class WorkerProcess:
     def _start(self, memory_limit: float) -> None:
         """Start and warm up.
 
-        A solver that dies in its warm-up is restarted without one, unless something
-        else killed it; then the warm-up is repeated once.
+        A solver that dies in its warm-up is restarted without a warm-up. If something
+        else killed it, the warm-up is repeated once.
         """
         if self._process is None:
             self._spawn(memory_limit)

@@ -333,7 +333,7 @@ class Executor:
         return self._optima[entry.digest]
 
     def _reference(self, entry: StoredCase, qp: QP) -> Solution:
-        """Solve the QP of a case by the reference, in the case worker.
+        """Solve the QP of a case with the reference solver, in the case worker.
 
         Raises
         ------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,7 @@ class Discs(Blocks):
         rest = norms(force - (along * is_active)[:, None] * outward)
         return np.where(self.radius > 0, rest, 0 * rest)
 
-    def substituted(self, T: Any, a: Vector) -> Discs:
+    def substituted(self, T: Any, a: Vector) -> Self:
         """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
 
         Raises

@@ -39,7 +39,7 @@ def with_overrides(
     Raises
     ------
     InputError
-        For an unknown solver, a pattern that matches nothing, or a value out of range.
+        If a solver is unknown, a pattern matches nothing, or a value is out of range.
 
     """
     changes: dict[str, Any] = {}
@@ -52,7 +52,8 @@ def with_overrides(
                 with checked.located("--solver"):
                     resolve(chosen[name], {**resolved, **registry})
         selected = dict.fromkeys(solvers)
-        # the second copy of an A/A comparison stays with the first
+        # keep the second copy of an A/A comparison if the first is selected: without
+        # it there is no ratio
         null = [
             name
             for name in chosen

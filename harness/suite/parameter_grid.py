@@ -51,7 +51,7 @@ def expand_problems(
     Raises
     ------
     InputError
-        With the place in the suite, if a block is wrong or there are too many cases.
+        If a block is wrong or there are too many cases; the message names the place.
 
     """
     cold: dict[str, CaseId] = {}
@@ -85,7 +85,7 @@ class _Block:
     cases: list[CaseId]
     given: list[dict[str, object]]  #: keys of each case in the suite
     kind: str  #: "sequence", "growing" or ""
-    along: tuple[str, ...]  #: keys of the sequence or series; empty without
+    along: tuple[str, ...]  #: keys of the sequence or series; empty if kind is ""
 
 
 def _blocks(

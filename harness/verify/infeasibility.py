@@ -77,7 +77,7 @@ _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 
 @np.errstate(all="ignore")  # entries of 1e±300 overflow when rows are scaled
 def infeasibility_margin(qp: QP, s: Solution) -> float | None:
-    """Return the margin of a proof that `qp` is infeasible; None without a proof.
+    """Return the margin of a proof that `qp` is infeasible; None if none is found.
 
     The multipliers of `s`, which claims infeasibility, are tried first. If they prove
     nothing, a ray is searched for, once per QP. Sets other than bounds are relaxed to

@@ -140,10 +140,10 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     * complementarity: max |zᵢ(h − Gx)ᵢ|/E over rows and bounds
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
-    Dᵢ is the larger of |xᵢ| and |rᵢ|/Pᵢᵢ, the step to the minimum along i (Xᵢ for a
-    variable without curvature and cost), but at most the distance to the bound in that
-    direction. Before a residual is divided by its scale, `ROUNDING` times the sum of
-    its absolute terms, but at most `NEGLIGIBLE` of the scale, is subtracted.
+    Dᵢ = min(max(|xᵢ|, sᵢ), wᵢ), where sᵢ = |rᵢ|/Pᵢᵢ is the step to the minimum along i
+    (Xᵢ for a variable with neither curvature nor cost) and wᵢ the distance to the bound
+    in that direction. Before a residual is divided by its scale, `ROUNDING` times the
+    sum of its absolute terms, but at most `NEGLIGIBLE` of the scale, is subtracted.
 
     generous : use the largest scale of energy that can be justified, and subtract all
         rounding from energies
@@ -340,7 +340,7 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     size = t.Px_size + np.abs(qp.q) + t.forces_size
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
-    # the minimum along a variable without curvature and cost is undetermined: use Xᵢ
+    # with neither curvature nor cost, the minimum along i is undetermined: use Xᵢ
     is_idle = (t.curvature == 0) & (qp.q == 0)
     # an operator without diagonal: use its Rayleigh quotient at x, unless x is zero
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
@@ -528,7 +528,7 @@ def _scales(qp: QP, x: Vector, E: float, d: Vector, *, has_diagonal: bool) -> Sc
 def _sizes_from_rows(
     qp: QP, x: Vector, X: Vector, has_size: NDArray[np.bool_]
 ) -> Vector:
-    """Derive the sizes of variables without curvature and cost from active rows.
+    """Derive the sizes of variables with neither curvature nor cost from active rows.
 
     A row of G is active if its slack is negligible. Inactive rows are left out, since a
     distant row would excuse the violation of another one

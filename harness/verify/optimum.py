@@ -164,7 +164,7 @@ def error_at(s: Solution, optimum: Optimum) -> float:
 
 
 def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
-    """Solve a QP by the reference and prove its optimal value; return None on failure.
+    """Solve a QP with the reference solver and prove its optimum; None on failure.
 
     An operator P is assembled first; the result is None if the QP is not small.
     """
@@ -226,7 +226,7 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve by the reference; return None unless the point is optimal to rounding."""
+    """Solve with the reference; return None unless the point is optimal to rounding."""
     try:
         point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):

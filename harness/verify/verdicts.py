@@ -208,9 +208,7 @@ def evaluated_by_ranks(
         "notes": list[str](),
     }
     try:
-        found["values"] = run_collectively(
-            ranks, lambda: _values_by_ranks(emitted, s, ranks)
-        )
+        found["values"] = run_collectively(ranks, lambda: _values_by_ranks(emitted, s))
         if found["values"] is None:
             return found
         answered = run_collectively(ranks, lambda: emitted.answer(s))
@@ -233,9 +231,7 @@ def evaluated_by_ranks(
     return found
 
 
-def _values_by_ranks(
-    emitted: DistributedQP, s: Solution, ranks: Ranks
-) -> dict[str, float] | None:
+def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | None:
     """Evaluate objective and residuals; return None if they are not finite.
 
     Also returns None if a scale of energy needs the whole QP: a distributed vector

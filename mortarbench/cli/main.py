@@ -434,7 +434,7 @@ _COMMANDS = {
                 "--pool-forms",
                 "",
                 "compare solvers over the cases of all forms "
-                "together (means, ranks and profiles) instead of form by form",
+                "together (means, ranks and profiles), not within each form",
             ),
             _Option(
                 "--fail-on",
@@ -522,7 +522,7 @@ _COMMANDS = {
     ),
     "new": _Command(
         "new",
-        "write a template of a solver, a problem or a suite",
+        "write a template for a solver, a problem or a suite",
         [
             _Option(
                 "kind",

@@ -1,4 +1,4 @@
-"""The command `new`: write a template of a solver, a problem or a suite."""
+"""The command `new`: write a template for a solver, a problem or a suite."""
 
 from __future__ import annotations
 

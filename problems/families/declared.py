@@ -79,7 +79,7 @@ class DeclaredFamily(Family):
         Raises
         ------
         InputError
-            At finite strain, see `refuse_finite_strain`.
+            If the strain is finite, see `refuse_finite_strain`.
 
         """
         if "kinematics" in params:

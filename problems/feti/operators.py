@@ -229,7 +229,7 @@ class DualOperator:
         Raises
         ------
         ValueError
-            For other names.
+            If `kind` or `scaling` is none of these names.
 
         """
         if (kind, scaling) not in self._preconditioners:
@@ -262,7 +262,7 @@ class DualOperator:
         Raises
         ------
         ValueError
-            For names unknown to `preconditioner`.
+            If `kind` or `scaling` is not a name that `preconditioner` accepts.
 
         """
         for name, value, known in (

@@ -61,7 +61,7 @@ def blocks(
 def grid_positions(
     label: NDArray[np.int64], divisions: tuple[int, ...]
 ) -> NDArray[np.int64] | None:
-    """Return the positions (blocks, dim) of blocks in their grid; None without a grid.
+    """Return the positions (blocks, dim) of blocks in a grid; None if they form none.
 
     label, divisions : see `blocks`
     """

@@ -21,7 +21,7 @@ def format_of(path: Path) -> str:
     Raises
     ------
     InputError
-        For an unknown suffix.
+        If the suffix is unknown.
 
     """
     suffix = path.suffix.lower()

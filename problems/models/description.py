@@ -310,7 +310,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     kinds = [kind for kind in _LOADS if kind in entry]
     if len(kinds) != 1:
         form = ", ".join(_AXES[: named.dim])
-        raise InputError(f"expected either force or traction, [{form}]")
+        raise InputError(f"expected either force or traction = [{form}]")
     vector = _vector(kinds[0], entry[kinds[0]], named.dim)
     nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
@@ -415,7 +415,7 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
     """
     checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
     if ("master" in entry) == ("rigid" in entry):
-        raise InputError(f"expected either master, a {named.words.boundary}, or rigid")
+        raise InputError(f"expected either master (a {named.words.boundary}) or rigid")
     names = [side for side in _SIDES if side in entry]
     _keys({k: v for k, v in entry.items() if k in _SIDES}, tuple(names))
     sides = {}
@@ -541,7 +541,7 @@ def _place(
     """
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
-        raise InputError("expected either boundary or point, a name of the mesh")
+        raise InputError("expected either boundary or point, with a name from the mesh")
     _keys(entry, (*where, *others))
     if where == ["point"]:
         name = _one_of(named.spots, named.words.point, entry, "point")

@@ -392,7 +392,7 @@ def insert_midpoints(x: Vector, times: int) -> Vector:
 
 
 def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
-    """Return the nodal forces of P, distributed uniformly over a flat side."""
+    """Return nodal forces of a load P in −y, distributed uniformly over a flat side."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
     return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())

@@ -64,9 +64,9 @@ def explained(table: Table) -> Table:
 def answer_columns(
     of: Callable[[Any], Any] = lambda item: item,
 ) -> tuple[Column, ...]:
-    """Return the leading columns of tables of answers: case, solver and tolerance.
+    """Return the leading columns of a table of answers: case, solver and tolerance.
 
-    of : returns the object of an item that has these attributes; default: the item
+    of : maps an item to the object with these attributes; default: the item itself
     """
     return (
         ("case", lambda item: Cell.name(of(item).case)),

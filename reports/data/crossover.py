@@ -33,7 +33,7 @@ class Route(NamedTuple):
     """A way from the mesh to the answer, independent of the solver."""
 
     kind: str  #: one of `KINDS`
-    layout: str  #: keys of the decomposition, "feti=16"; empty without
+    layout: str  #: keys of the decomposition, "feti=16"; empty without decomposition
     ranks: int
 
     @property
@@ -68,7 +68,7 @@ class Map:
         return tuple(kind for kind in KINDS if kind not in present)
 
     def crossover(self, dual: Route, primal: Route) -> Crossover | None:
-        """Compare a dual route with a primal one; None without a common size."""
+        """Compare a dual route with a primal one; None if they have no common size."""
         a, b = self.routes[dual], self.routes[primal]
         common = sorted(a.keys() & b.keys())
         if not common:

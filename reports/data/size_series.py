@@ -38,12 +38,15 @@ class SizeSeries:
         ]
 
     def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit median total time ~ nᵖ or mᵖ; None with fewer than three sizes."""
+        """Fit median total time ~ nᵖ or mᵖ; None for fewer than three sizes."""
         timed = ((s, o.seconds("total")) for s, o in self.curve(solver, against))
         return _law((s, t and t.value) for s, t in timed)
 
     def iteration_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit iterations ~ nᵖ or mᵖ, repeats averaged; None below three sizes."""
+        """Fit iterations ~ nᵖ or mᵖ; None for fewer than three sizes.
+
+        If repeats differ, the middle of their range is fitted.
+        """
         counted = ((s, o.iterations) for s, o in self.curve(solver, against))
         return _law((s, i and sum(i) / 2) for s, i in counted)
 
@@ -53,12 +56,12 @@ class SizeSeries:
         return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
 
     def count_law(self, solver: str, name: str) -> PowerLaw | None:
-        """Fit one count ~ nᵖ, repeats averaged; None below three sizes."""
+        """Fit the mean of one count ~ nᵖ; None for fewer than three sizes."""
         return _law((n, o.counted(name)) for n, o in self.curve(solver))
 
 
 def _law(points: Iterable[tuple[int, float | None]]) -> PowerLaw | None:
-    """Fit a power law to the known positive values; None with fewer than `SIZES`."""
+    """Fit a power law to the positive values; None for fewer than `SIZES` sizes."""
     positive = [(n, v) for n, v in points if n > 0 and v is not None and v > 0]
     if len({n for n, _ in positive}) < SIZES:
         return None

@@ -67,7 +67,7 @@ Labelled = tuple[str, Sequence[Any], Look]  #: label, points and style of a curv
 
 
 class Point(NamedTuple):
-    """Point of a curve: size and time in seconds with its interval."""
+    """Point on a curve: size, and time in seconds with its interval."""
 
     x: float
     time: Interval

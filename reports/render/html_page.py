@@ -90,7 +90,7 @@ def breakable(text: str) -> Markup:
 
 
 def prose(text: str, rows: Rows) -> Markup:
-    """Render prose: formulas as MathML, breakable names, and links of run_ids."""
+    """Render prose with formulas as MathML, breakable names and linked run_ids."""
 
     def linked(match: re.Match[str]) -> str:
         run_id = match[0]

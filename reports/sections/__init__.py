@@ -43,7 +43,7 @@ class Analysis:
 
     @cached_property
     def forms(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases whose times are compared, form by form."""
+        """Groups of cases whose times are compared; each group has one form."""
         return tuple(all_groups(self.evidence))
 
     @cached_property
@@ -58,17 +58,17 @@ class Analysis:
 
     @cached_property
     def ways(self) -> Ways:
-        """The comparison of ways from the mesh to the answer, over all forms."""
+        """Comparison of ways (see `reports.data.ways`), over all forms."""
         return compare_ways(self.evidence)
 
     @cached_property
     def answers(self) -> Answers:
-        """The answer of every solver to every case, form by form."""
+        """Answer of every solver to every case, grouped by form."""
         return answers_of(self.evidence)
 
     @cached_property
     def fastest(self) -> tuple[FastestSolver, ...]:
-        """The comparison of solvers, form by form."""
+        """Comparison of solvers, separate for each form."""
         return fastest_solvers(self.answers, self.forms)
 
     @cached_property

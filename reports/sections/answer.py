@@ -95,7 +95,7 @@ def answer(a: Analysis) -> Iterator[Part]:
 
 @section(2, "forms", "Solver times, form by form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare the solvers of each form, if the first section compares ways."""
+    """Compare solvers within each form; empty if the first section already does so."""
     if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED

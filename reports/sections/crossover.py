@@ -82,12 +82,14 @@ def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
 def _answer(one: Map) -> list[tuple[str, int | None, str]]:
     """Return each primal route with the least size from which on a dual route pays.
 
-    The size is None if no dual route pays at a common size.
+    Only dual routes count that reach all sizes of the primal one. The size is None if
+    none of them pays.
     """
     best = dict[str, tuple[str, int | None, str]]()
     for dual, primal, at in _comparisons(one):
         _, least, _ = best.setdefault(primal.label, (primal.label, None, ""))
-        if at.pays is not None and (least is None or at.pays < least):
+        reaches = at.largest == max(one.routes[primal])
+        if at.pays is not None and reaches and (least is None or at.pays < least):
             best[primal.label] = primal.label, at.pays, dual.label
     return list(best.values())
 

@@ -44,7 +44,7 @@ TEXT = Sentences(__name__, PERCENTILE=PERCENTILE, SCALE=SCALE)
     "Agreement of energies: no verified answer has an energy.",
 )
 def agreement(a: Analysis) -> Iterator[Part]:
-    """Compare the energies of verified answers; empty where no case has an energy."""
+    """Compare energies of verified answers; yield nothing if no case has an energy."""
     found = spreads(a.evidence.flat)
     if not found:
         return

@@ -143,13 +143,13 @@ def _growth_table(series: SizeSeries) -> Table:
 
 
 def iteration_growth(series: SizeSeries, solver: str) -> Growth | None:
-    """Fit the iterations of one solver; None with too few verified sizes."""
+    """Fit the growth of one solver's iterations; None if too few sizes are verified."""
     curve = series.curve(solver)
     return _fit([(n, sum(o.iterations) / 2) for n, o in curve if o.iterations])
 
 
 def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
-    """Fit a power law to the positive values; None with too few sizes."""
+    """Fit a power law to the positive values; None if there are too few sizes."""
     kept = [(n, v) for n, v in points if n > 0 and v > 0]
     if len({n for n, _ in kept}) < SIZES:
         return None

@@ -114,7 +114,7 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
     "repeats, for example repeats = 3 in the suite or --repeats 3.",
 )
 def ratios(a: Analysis) -> Iterator[Part]:
-    """Tabulate ratios to the fastest verified answer; empty without repeats."""
+    """Tabulate ratios to the fastest verified answer; yield nothing without repeats."""
     if not any(len(o.records) > 1 for o in a.evidence.flat):
         return
     fastest = {key: _fastest(row) for key, row in a.evidence.outcomes.items()}
@@ -180,7 +180,7 @@ class _Twins(NamedTuple):
     "twice (null_arm).",
 )
 def precision(a: Analysis) -> Iterator[Part]:
-    """Tabulate null arms and canaries; empty where the records have neither."""
+    """Tabulate null arms and canaries; yield nothing if the records have neither."""
     if null := _null_ratios(a.evidence):
         width = median(each.ratio.half_width for each in null)
         covering = sum(each.equal for each in null)

@@ -124,8 +124,8 @@ class QTQP:
 
         def start_at(s: Solution) -> None:
             nonlocal start
-            # use the slack of this QP, not of the previous one: if x is feasible, Rx +
-            # s = r
+            # start from the slack s = r − Rx with the rows R, r of this QP, because the
+            # slack of the previous QP satisfies other rows
             x, y, slack = form.point(s)
             start = x, y * scale, slack
 

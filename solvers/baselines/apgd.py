@@ -50,7 +50,7 @@ class AcceleratedGradient:
         licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
-        phases="everything happens in solving",
+        phases="preparing does nothing; solving does all the work",
     )
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """Projected Gauss–Seidel by discs and cones, a baseline of granular dynamics.
 
-A sweep minimises the objective over one block of variables after the other, with all
-others fixed. A block is a disc, a cone, or a single variable of the box. The method is
+A sweep minimises the objective over one block of variables at a time, with all others
+fixed. A block is a disc, a cone, or a single variable of the box. The method is
 known as NSGS (nonsmooth Gauss–Seidel: Jourdan, Alart and Jean, Comput. Methods Appl.
 Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008, Chapter 13). A block problem is
 solved by projected gradient steps of length 1/λ until they become short, where λ is the
@@ -54,9 +54,9 @@ class GaussSeidel:
     about: ClassVar[About] = About(
         title="Projected Gauss–Seidel (ours)",
         licence="BSD-3-Clause",
-        method="minimises over one disc, cone or variable after the other (NSGS)",
+        method="block Gauss–Seidel over discs, cones and single variables (NSGS)",
         linear_solver="none (columns of P)",
-        phases="everything happens in solving",
+        phases="preparing does nothing; solving does all the work",
         limits=("its loop over blocks is in Python: compare sweeps, not times",),
     )
 

@@ -66,7 +66,7 @@ class ProjectedGradient:
         licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
-        phases="everything happens in solving",
+        phases="preparing does nothing; solving does all the work",
         limits=("irregular: the load steps of the benchmark take 45 to 546 products",),
     )
 

@@ -578,7 +578,7 @@ cdef class MPRGP:
 
         Returns False if that does not decrease the cost. If it does not halve the
         projected gradient, as many other steps follow as it took products, so that
-        Newton steps at most double the products of a run.
+        useless Newton steps take no more than about half of the products.
 
         most : limit of the letters of `trace`, which receives one per step of CG
         """

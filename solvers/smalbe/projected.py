@@ -52,7 +52,7 @@ class Projected:
     b: Vector
     bounds: tuple[Vector, Vector]  #: bounds of ν = x − x̃
     q: Vector  #: q of the original QP
-    diagonal: Vector  #: diagonal of F; empty for an operator without one
+    diagonal: Vector  #: diagonal of F; empty if an operator F does not have it
     #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: preconditioner on the face; None to use the option `preconditioner`
@@ -131,7 +131,7 @@ def projected_problem(
 
 
 def _diagonal(qp: QP) -> Vector:
-    """Return a copy of the diagonal of P; empty for an operator without one."""
+    """Return a copy of the diagonal of P; empty if an operator P does not have it."""
     if isinstance(qp.P, np.ndarray):
         return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()

@@ -343,8 +343,9 @@ def is_sparse(G: Matrix) -> bool:
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """Orthonormalise the rows of G (m, n), by a sparse factor if they are many.
 
-    Linearly dependent rows are treated as dense. If they are too many for that, or
-    distributed over ranks, a maximal independent subset replaces them.
+    Linearly dependent rows are treated as dense. If a dense array would exceed the
+    memory limit, or the rows are distributed over ranks, a maximal independent subset
+    replaces them.
 
     bounded : (n,) mask of components with a bound
     """

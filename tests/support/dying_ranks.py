@@ -16,7 +16,7 @@ SIGKILL = 9
 
 
 def be_rank(first, way, count, follow, folder):
-    """End first, or after that rank; ranks exchange process numbers by files."""
+    """End first, or after that rank; ranks exchange process IDs in files."""
     rank = int(os.environ["PMI_RANK"])
     with open(f"{folder}/{rank}.new", "w") as file:
         file.write(str(os.getpid()))

@@ -136,7 +136,7 @@ class Server:
         self._process.wait()
 
     def start(self, request, fds):
-        """Request a fork, adopt it, and return its process number."""
+        """Request a fork, adopt it, and return its process ID."""
         request |= {
             "cwd": os.getcwd(),
             "cpus": sorted(os.sched_getaffinity(0)),

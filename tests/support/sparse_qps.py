@@ -1,4 +1,4 @@
-"""Random QPs with a sparse P, bounds, and a KKT point that is known."""
+"""Random QPs with a sparse P, bounds, and a known KKT point."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def edges(kind: str, n: int, rng: np.random.Generator) -> tuple[Array, Array, int]:
-    """Draw the edges i, j of a grid, a line or a random graph, which may fall apart."""
+    """Draw the edges i, j of a grid, a line or a random graph, perhaps disconnected."""
     if kind == "grid":
         side = max(1, int(np.sqrt(n)))
         k = np.arange(side * side).reshape(side, side)
@@ -26,7 +26,10 @@ def edges(kind: str, n: int, rng: np.random.Generator) -> tuple[Array, Array, in
 
 
 def laplacian(kind: str, n: int, rng: np.random.Generator) -> csr_array:
-    """Draw a weighted Laplacian, weights up to six orders apart, grounded a little."""
+    """Draw a weighted Laplacian plus a nonnegative diagonal.
+
+    The weights differ by up to six orders of magnitude.
+    """
     i, j, n = edges(kind, n, rng)
     w = 10 ** rng.uniform(-rng.uniform(0, 6), 0, i.size)
     graph = csr_array((w, (i, j)), shape=(n, n))
@@ -38,7 +41,7 @@ def laplacian(kind: str, n: int, rng: np.random.Generator) -> csr_array:
 def sparse_matrix(n: int, rng: np.random.Generator) -> csr_array:
     """Draw P: a Laplacian, AᵀA, the square of a second difference, or a diagonal.
 
-    Four in ten are scaled by up to four orders on both sides, three in ten permuted.
+    40 % are scaled on both sides by up to four orders of magnitude, 30 % are permuted.
     """
     kind = rng.choice(["grid", "line", "graph", "gram", "square", "diagonal"])
     if kind == "gram":
@@ -64,7 +67,10 @@ def sparse_matrix(n: int, rng: np.random.Generator) -> csr_array:
 
 
 def qp_with_minimum(seed: int, most: int = 400) -> tuple[QP, Vector]:
-    """Draw a QP and a minimum x (n,): bounds of all kinds, a third are degenerate."""
+    """Draw a QP with bounds of all kinds, and its minimum x (n,).
+
+    About 30 % of the active bounds are degenerate (z = 0).
+    """
     rng = np.random.default_rng([36, seed])
     P = sparse_matrix(int(rng.integers(1, most)), rng)
     d, n = P.diagonal(), P.shape[0]

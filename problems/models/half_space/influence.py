@@ -180,7 +180,7 @@ class NormalInfluence(Influence):
         Raises
         ------
         ValueError
-            For any other kind.
+            If `kind` is not "dirichlet".
 
         """
         if kind != "dirichlet":

@@ -436,7 +436,7 @@ def _shear_quantities(
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None
     assert side.push is not None
-    sticks = side.friction == "stick"
+    sticks = np.asarray(side.friction == "stick")
     total = -copies * side.force[:, 0].sum()
     limit, a = exact.mu * exact.normal.P, exact.normal.a
     r2 = (solution.sides.bodies.mesh.points[side.nodes, :2] ** 2).sum(axis=1)

@@ -142,6 +142,27 @@ def test_bodies_in_space_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_p
         assert answer.record.objective == pytest.approx(objective, rel=1e-9)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "contact-patch/lower=4/upper=3/friction=coulomb/mu=0.3/feti=2/dim=3/dual",
+        "greco/n=4/dim=3/depth=2/feti=2/dual",
+        "hertz-sphere/n=1/against=sphere/Q=0.3/feti=2/dual",
+    ],
+)
+def test_friction_in_space_has_the_same_displacement_on_all_numbers_of_ranks(name):
+    """Spectral steps amplify rounding, so that later steps may differ."""
+    whole = name.replace("/feti=2", "")
+    alone = mb.solve(whole, "smalbe", tol=TOL)
+    for ranks in (1, 2, 4):
+        answer = mb.solve(name, "smalbe", tol=TOL, ranks=ranks)
+        assert answer.verdict == "verified"
+        assert answer.energy_bound <= 10 * TOL
+        objective = alone.record.objective
+        assert answer.record.objective == pytest.approx(objective, rel=10 * TOL)
+
+
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
     """Node-to-segment rows do not resist rolling, so equality rows are dependent."""

@@ -1,4 +1,4 @@
-"""Concurrent threads, forks, closed streams, and reused process numbers."""
+"""Concurrent threads, forks, closed streams, and reused process IDs."""
 
 import json
 import os

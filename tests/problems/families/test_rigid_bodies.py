@@ -166,8 +166,8 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
     ("toml", "old", "new", "message"),
     [
         (TOML, 'slave = "foot"', 'slave = "foot"\nmaster = "top"',
-         "expected either master, a physical surface, or rigid"),
-        (TOML, f"rigid = {{ {PLANE} }}", "", "expected either master, a physical surf"),
+         "expected either master (a physical surface) or rigid"),
+        (TOML, f"rigid = {{ {PLANE} }}", "", "expected either master (a physical surf"),
         (TOML, f"{{ {PLANE} }}", '"plane"', "rigid = 'plane'; expected a table"),
         (TOML, 'shape = "plane"', 'shape = "plain"',
          "rigid: unknown shape 'plain'; did you mean 'plane'? known: cylinder, plane"),

@@ -46,7 +46,6 @@ LATER = (
     "hertz-cylinder/n=1/m=1/friction=coulomb/mu=0.3/Q=0.2/peak=0.6/feti=9/dual",
     "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
     "greco/n=4/dim=3/depth=2/feti=2/dual",
-    "hertz-sphere/n=2/against=sphere/Q=0.3/feti=2/dual",
 )
 #: of which active sets alone come in circles (`solvers.reference.over_ranks`)
 CIRCLES = (

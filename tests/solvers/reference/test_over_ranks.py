@@ -39,8 +39,8 @@ def balance(q, force, moment):
     q, lb, ub = vectors
     return QP(
         P=Identity(3, ranks), q=q, A=DistributedColumns(G, ranks),
-        b=np.array([force, moment]), G=DistributedColumns(no_rows(3), ranks),
-        h=np.zeros(0), lb=lb, ub=ub,
+        b=np.array([force, moment]), h=np.zeros(0), lb=lb, ub=ub,
+        G=DistributedColumns(no_rows(3), ranks),
     )  # fmt: skip
 
 
