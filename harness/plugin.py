@@ -319,7 +319,7 @@ class Family(ABC):
     def with_copies(self, folder: Path) -> Family:
         """Return the family with the copied files of a result folder.
 
-        The copies replace files that are missing here or have another content.
+        The copies replace files that are missing here or have different content.
         """
         return self
 

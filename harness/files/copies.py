@@ -81,7 +81,7 @@ class Copies:
         Raises
         ------
         InputError
-            When both are missing, or the copy has another content.
+            If both are missing, or the copy has different content.
 
         """
         here = _digest_if_there(Path(source.path))
@@ -168,7 +168,7 @@ def check_copies(folder: Path) -> None:
     Raises
     ------
     InputError
-        If a copy has other content; the message names the first.
+        If a copy has different content; the message names the first.
 
     """
     for copy, digest, _ in copies_in(folder):

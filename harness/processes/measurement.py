@@ -283,8 +283,8 @@ def single_worker(
 
     command : starts the worker; two file descriptors are appended to it
     serve : main function of a fork of this process, which replaces the command if a
-        fork is safe. It is forked at once, before data that it does not need are in
-        memory
+        fork is safe. The fork starts immediately, before data that it does not need are
+        in memory
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")

@@ -248,7 +248,7 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
     # the factorisation may not detect this: rounding can make a singular K regular
     if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
-            "the supports leave a rigid motion of some body, so dual-bounds does not "
+            "the supports allow a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"
         )
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), prescribed)

@@ -85,7 +85,7 @@ def spectrum(
     F : symmetric, positive definite on the range of P
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
-    tol : relative error bound of both eigenvalues
+    tol : bound of the relative error of both extreme eigenvalues
     rows : components on this rank; None for all n components
     total : sums arrays (k,) over all ranks and returns the sum on each rank
 

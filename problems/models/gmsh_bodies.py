@@ -68,7 +68,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     # next linearisation
     if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
-            f"{p['path']}: supports and friction leave a rigid motion of some body, "
+            f"{p['path']}: supports and friction allow a rigid motion of some body, "
             "which load steps and re-linearisations do not allow; expected steps=1 "
             "and relin=1"
         )

@@ -286,7 +286,7 @@ def test_another_version_on_the_same_machine_is_what_one_compares(folders):
 
     assert said[0] == (
         "The machine is the same, but the environments differ in versions.osqp. A "
-        "change below may be due to this difference, or to the run."
+        "change below may be due to this or to another difference between the two runs."
     )
     assert any("two: 1.5" in line and "slower" in line for line in said)
 

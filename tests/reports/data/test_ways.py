@@ -159,7 +159,7 @@ def test_where_problems_decide_differently_more_repeats_are_no_remedy(record, ev
     ]  # fmt: skip
     statements = compose(evidence(records)).sections[0].statements
     assert (
-        "which is faster depends on the case, and more repeats will not decide"
+        "which is faster depends on the case, and more repeats will not change this"
         in (statements[0].claims[0])
     )
 
