@@ -195,7 +195,9 @@ def evaluated_by_ranks(
     All ranks call this function, and a failure on one rank is a failure on all
     (`harness.distributed.failures`).
 
-    Returns ------- `values`: objective and residuals, None if they need the whole QP;
+    Returns
+    -------
+    `values`: objective and residuals, None if they need the whole QP;
     `bounds`: fields of `certified`; `quantities`, None if they need the whole QP;
     `recover_seconds`: time of the evaluation of the quantities; `notes` on failures.
 
