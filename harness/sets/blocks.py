@@ -83,7 +83,7 @@ class Blocks:
             )
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the Euclidean distance (k,) of z to the normal cone at x in each block.
+        """Return the distance (k,) of z to the normal cone at x in each block.
 
         tol : relative slack below which x counts as a point of the boundary
         """

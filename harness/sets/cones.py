@@ -60,7 +60,7 @@ class Cones(Blocks):
         return lower, upper
 
     def project(self, x: Vector) -> Vector:
-        """Project x (n,) on the cones; points of a polar cone are moved to the apex."""
+        """Project x (n,) on the cones; the polar cones are mapped to the apex."""
         nearest = x.copy()
         normal, tangent = x[self.index[:, 0]], x[self.index[:, 1:]]
         parts = _projection(normal, tangent, np.ones_like(self.slope), self.slope)

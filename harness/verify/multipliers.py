@@ -69,7 +69,7 @@ class _Scales(NamedTuple):
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300
+@np.errstate(all="ignore")  # a point may contain 1e300
 def with_multipliers(
     qp: QP,
     x: Vector,

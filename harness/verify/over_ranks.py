@@ -212,7 +212,7 @@ class MPIReduction:
         return csr_array(whole - S_all.T @ scaled_rows(S_all, np.max(weights, axis=0)))
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300, as in `certify`
+@np.errstate(all="ignore")  # a point may contain 1e300, as in `certify`
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:

@@ -1,6 +1,5 @@
 """Operations of convex sets, against what defines them; and QPs that have several."""
 
-import re
 from dataclasses import dataclass, replace
 
 import numpy as np
