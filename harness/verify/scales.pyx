@@ -1,8 +1,8 @@
 # cython: language_level=3, cdivision=True
-"""Scales and errors of KKT residuals for arrays, component by component.
+"""Componentwise scales and errors of KKT residuals for arrays.
 
-The formulas are in `scales.h`. Here they are NumPy ufuncs, which also accept vectors
-distributed over ranks. The module is compiled when the package is installed;
+The formulas are in `scales.h`. This module provides them as NumPy ufuncs, which also
+accept vectors distributed over ranks. The module is compiled when the package is installed;
 `scales.pyi` declares its types.
 """
 

@@ -130,7 +130,9 @@ def judged(
             else f"no feasible point: Farkas certificate with a margin of {margin:.1e}",
         )
     elif s.status is Status.INFEASIBLE:
-        record = noted(record, "claims of infeasibility are not examined in parallel")
+        record = noted(
+            record, "claims of infeasibility are not examined for distributed QPs"
+        )
     if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
     decided_by = "residuals" if error is None else "reference"
