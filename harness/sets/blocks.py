@@ -13,11 +13,10 @@ from mortarbench.harness.sets.convex import Vector
 
 
 class Blocks:
-    """Base of dataclasses with the variables and one number of each of k blocks.
+    """Base of dataclasses that define a convex set on each of k blocks of variables.
 
     The first field is `index` (k, d), whose rows list the variables of the blocks; the
-    second field contains the numbers (k,). Both arrays are copied. Subclasses define
-    the convex set in a block.
+    second field contains one number for each block (k,). Both arrays are copied.
     """
 
     prefix: ClassVar[str]  #: prefix of the names of arrays in files
@@ -83,7 +82,7 @@ class Blocks:
             )
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the distance (k,) of z to the normal cone at x in each block.
+        """Return the distance (k,) of z from the normal cone at x in each block.
 
         tol : relative slack below which x counts as a point of the boundary
         """

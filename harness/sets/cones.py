@@ -96,7 +96,7 @@ class Cones(Blocks):
         return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the Euclidean distance (k,) of z to the normal cone at x of each cone.
+        """Return the Euclidean distances (k,) of z from the normal cones of cones at x.
 
         At the apex, the normal cone is the polar cone. Elsewhere, it is a ray on the
         boundary of a cone of positive slope, and {0} inside. A block of x whose norm is

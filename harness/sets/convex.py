@@ -30,7 +30,7 @@ class Limits(NamedTuple):
     slack: Vector  #: distance to the limit, negative if violated
     size: Vector  #: absolute value of the limit
     terms: Vector  #: sum of the absolute terms of the variables in the slack
-    sized: Callable[[Vector], Vector]  #: returns `terms` for absolute values (n,)
+    sized: Callable[[Vector], Vector]  #: maps absolute values (n,) to `terms`
 
 
 class Sum(NamedTuple):

@@ -18,7 +18,7 @@ class Discs(Blocks):
     """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
 
     At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
-    radius 0 it is arbitrary. A QP turns discs of one variable (d = 1) into bounds.
+    radius 0 it is arbitrary. A `QP` converts discs of one variable (d = 1) to bounds.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Discs(Blocks):
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the Euclidean distance (k,) of z to the normal cone at x of each disc.
+        """Return the Euclidean distances (k,) of z from the normal cones of discs at x.
 
         The distance is ‖z_I − max(z_Iᵀn, 0)n‖ with n = x_I/‖x_I‖ at a boundary point,
         ‖z_I‖ inside the disc, and 0 for radius 0.

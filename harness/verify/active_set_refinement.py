@@ -62,8 +62,8 @@ class ActiveSet(NamedTuple):
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
     """Solve K u = force with u = 0 on fixed components; return u and its error.
 
-    u (n,) is in extended precision and has no rigid motion. The error is its energy
-    norm √(rᵀK⁺r), where r is the residual.
+    u (n,) is in extended precision and has no rigid motion. The error is given in
+    the energy norm, √(rᵀK⁺r) with the residual r.
     """
     K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)

@@ -73,7 +73,7 @@ def admissible(
 class _Rows(NamedTuple):
     """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
 
-    B: Any  #: (m, n), extended
+    B: Any  #: (m, n) in extended precision
     c: Extended  #: (m,)
     contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
 
@@ -315,7 +315,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     """Return True if the load along a motion that leaves all gaps unchanged is nonzero.
 
-    Loads up to their rounding count as zero.
+    Loads that do not exceed their rounding count as zero.
 
     Parameters
     ----------
@@ -353,10 +353,10 @@ def supported_and_floating(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Split the space of rigid motions (p,) into supported and floating ones.
 
-    A motion ν is supported if the rows, weighted by w (m,) ≤ 1, resist it: with the
-    change Gν (m,) of the gaps, ‖√w Gν‖ is at most SUPPORT_THRESHOLD times its maximum
-    for floating motions. Returns orthonormal bases (p, h) of supported and (p, p − h)
-    of floating motions.
+    Rows resist a motion ν through the change Gν (m,) of their gaps, with weights
+    w (m,) ≤ 1. A motion is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times the
+    maximum over motions of the same norm. Returns orthonormal bases (p, h) of supported
+    and (p, p − h) of floating motions.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
@@ -367,14 +367,14 @@ def supported_and_floating(
 class Balance(NamedTuple):
     """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    They state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
+    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
     """
 
     G: Extended  #: (m, p)  BR
     G_terms: Extended  #: (m, p) sums of the absolute terms of G
     load: Extended  #: (p,)  Rᵀf
-    load_terms: Extended  #: (p,) sums of its absolute terms
-    bent: Extended  #: (p,) (KR)ᵀu, nonzero only by rounding
+    load_terms: Extended  #: (p,) sums of the absolute terms of `load`
+    bent: Extended  #: (p,) (KR)ᵀu, nonzero only because of rounding
     forces: AdmissibleForces  #: Λ, set of admissible multipliers
 
     def near(self, multipliers: Extended) -> Extended:
@@ -399,12 +399,12 @@ class Balance(NamedTuple):
             if (balanced := self._solved(multipliers, shares)) is not None:
                 return balanced
         raise UncertifiableError(
-            "contact would have to pull to balance the load: the load moves some body "
+            "contact would have to pull to balance the load, which moves some body "
             "away from its contacts, and no support holds the body"
             if self.forces.contact.all()
             else "contact would have to pull, or friction to exceed its bound, to "
-            "balance the load: the load moves some body away from its contacts or "
-            "along them, and no support holds the body"
+            "balance the load, which moves some body away from its contacts or along "
+            "them, and no support holds the body"
         )
 
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:

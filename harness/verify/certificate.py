@@ -20,10 +20,9 @@ side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of frictio
 the work of λ̂_t. For Coulomb's law, g_t is fixed: the certificate holds for the last
 Tresca problem of the fixed-point iteration.
 
-The gap g is not evaluated as J − D: J and D share as many digits as the answer has, so
-that their difference would consist of rounding for errors below 1e-8. The midpoint M of
-û and u_λ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). For any other point u,
-therefore,
+The gap g is not evaluated as J − D: the difference would consist of rounding if the
+error is below 1e-8, since J and D then agree in all digits. The midpoint M of û and u_λ
+satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). Hence, for any other point u,
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
@@ -51,10 +50,10 @@ where the last two terms are rounding. Inequality (R3) bounds them by ‖e'‖ a
 (R4) bounds γ by the contact conditions.
 
 If P is not a stored stiffness matrix, as for half-spaces, a proven lower bound μ > 0 of
-its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at
-x̂, and r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies (Px* +
-q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. Their sum yields ‖x̂ − x*‖²_P ≤
-rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
+its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at x̂, and
+r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies
+(Px* + q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. The two inequalities
+imply ‖x̂ − x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
     ‖x̂ − x*‖_P ≤ ‖r‖/√μ                                                          (5)
 """
@@ -134,7 +133,7 @@ class Certificate:
     claimed: float  #: bound (3) of the error of the answer
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if bodies can move rigidly, with errors not bounded
+    seminorm: bool  #: True if bodies can move rigidly; see the module
 
     @property
     def equilibrium(self) -> Extended:
@@ -517,7 +516,7 @@ def _root(square: float) -> float:
 def _charge(
     reach: _Reach, known: Rounding, pull: Vector, theta: float, square: float
 ) -> float:
-    """Bound the rounding terms (R3) of (4) by a fixed point iteration.
+    """Bound the rounding terms (R3) of (4) by a fixed-point iteration.
 
     The rounding terms depend on the bounds of the errors, which depend on the rounding
     terms. Each iterate is increased by 1 %, so that the iteration ends above the fixed

@@ -5,9 +5,9 @@ no x satisfies both the rows and lb ≤ x ≤ ub if
 
     V = bᵀy + hᵀz − Σ min(cⱼlbⱼ, cⱼubⱼ) < 0,
 
-since cᵀx ≤ bᵀy + hᵀz at every x that satisfies the rows. In the convention of
-`harness.qp`, z_box = −c. Such multipliers are called a ray here, since their positive
-multiples are equivalent. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is
+since cᵀx ≤ bᵀy + hᵀz at every x that satisfies the rows. Such multipliers are called a
+ray here, since their positive multiples are equivalent. In the convention of
+`harness.qp`, z_box = −c. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is
 infinite, however small cⱼ is. An approximate ray therefore proves nothing. It is first
 corrected such that cⱼ = 0 holds exactly for these j, either in rational arithmetic or
 by an enclosure of an exact ray, which is proven to exist. V is then evaluated in
@@ -41,8 +41,9 @@ from mortarbench.harness.verify.rational import (
     solutions,
 )
 
-#: Smallest margin of a proof. Consistent redundant rows contradict one another by a
-#: smaller margin if their right-hand sides are rounded sums of thousands of terms.
+#: Smallest margin of a proof. Redundant rows that are consistent before rounding may
+#: contradict one another by a smaller margin if their right-hand sides are rounded sums
+#: of thousands of terms.
 MIN_MARGIN = 1e-12
 #: Multipliers below these fractions of the largest one, in scaled rows, are dropped;
 #: the fractions are tried in turn. Iterative solvers return small multipliers for rows

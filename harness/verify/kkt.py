@@ -132,9 +132,9 @@ class _Terms:
 def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     """Return the scale-free residuals of `s` in the KKT conditions of `qp`.
 
-    Let E be the scale of energy, Xⱼ the sizes of the variables (`scales_at`), v⁺ and v⁻
-    the positive and negative parts of v, and r = Px + q + Aᵀy + Gᵀz⁺ + z_box without
-    the multipliers of absent bounds. Each residual is the largest of these quantities:
+    Let E be the scale of energy, Xⱼ the sizes of the variables (`scales_at`), and
+    r = Px + q + Aᵀy + Gᵀz⁺ + z_box without the multipliers of absent bounds, where
+    v⁺ = max(v, 0) and v⁻ = min(v, 0). Each residual is the largest of these quantities:
 
     * primal: violations of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, divided by |bᵢ| + Σ|aᵢⱼ|Xⱼ
       or, if bᵢ ≠ 0 and this is smaller, by 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ do not
@@ -396,10 +396,9 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
 
     E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|, where σ is the support
     function of the sets. The third sum is not split, since multipliers that cancel
-    could make its terms arbitrarily large. E is at most
-    `MAX_CANCELLATION` times the objective (`energy_scale` in scales.h), and at least
-    `LEAST_ENERGY` times the smallest natural energy of a variable
-    (`_natural_energies`).
+    could make its terms arbitrarily large. E is at most `MAX_CANCELLATION` times the
+    objective (`energy_scale` in scales.h), and at least `LEAST_ENERGY` times the
+    smallest natural energy of a variable (`_natural_energies`).
 
     generous : do not limit E by `MAX_CANCELLATION`; use the median of the natural
         energies instead of the smallest, and return it if the energy of the point is
@@ -417,7 +416,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         qp, t.curvature, bounds, by_length=by_length or not qp.q.any()
     )
     natural = pick(energies)
-    if E < LEAST_ENERGY * natural:  # rarely true, which saves expensive tightening
+    if E < LEAST_ENERGY * natural:  # rare: tightening bounds is expensive
         energies = _natural_energies(qp, t.curvature, tightened(qp), by_length=True)
         natural = pick(energies)
     if not natural < np.inf:
@@ -583,9 +582,9 @@ def verdict(
     """Return the verdict on a point, which follows from its residuals.
 
     A point is verified if every residual is at most factor·tol, whatever the solver
-    claimed. Otherwise, the claim determines the kind of failure. If `error` is given,
-    the error relative to a proven optimum, it replaces all residuals. A refuted claim
-    of success is `inaccurate` if the point has at least half of the requested digits
+    claimed. Otherwise, the claim determines the kind of failure. The error relative to
+    a proven optimum, `error`, replaces all residuals if it is given. A refuted claim of
+    success is `inaccurate` if the point has at least half of the requested digits
     (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
     above 0.1 is not verified at any tolerance.
 
@@ -611,13 +610,13 @@ def verdict(
 
 
 def rejudged(record: Record, factor: float) -> Verdict:
-    """Recompute the verdict on a stored measurement with factor·tol for 10·tol.
+    """Recompute a stored verdict with the tolerance factor·tol instead of 10·tol.
 
     The verdict follows from the stored claim and residuals, or from the error relative
     to a proven optimum if that error decided the stored verdict (`Record.decided_by`).
     Verdicts that do not follow from these numbers are returned unchanged: those on
     limits, crashes and steps after the end of a sequence, and proofs of infeasibility,
-    which have no tolerance.
+    which do not depend on a tolerance.
     """
     if record.claimed is None:
         return record.verdict

@@ -6,8 +6,8 @@ At x, with g = Px + q, the multipliers minimise
 
 where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
 and 1/wᵢ the scale of the stationarity residual; z_box has the sign required by the
-bound. The second sum measures complementarity. With it, no threshold between active and
-inactive rows is needed: the slack of a nearly active row limits its multiplier.
+bound. The second sum measures complementarity and makes a threshold between active and
+inactive rows unnecessary: the slack of a nearly active row limits its multiplier.
 
 If the remaining terms of the stationarity condition require a force f from a disc or
 cone with projection Π, this set contributes z = (v − Π(v))/τ with v = x + τf. This z is
@@ -40,14 +40,14 @@ from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 from mortarbench.harness.verify.optimum import EPS
 
 #: Rows are left out if a multiplier that changes the stationarity residual by ε would
-#: change the complementarity residual by more than this multiple of ε: due to the large
-#: slack, their multipliers cannot reduce both residuals.
+#: change the complementarity residual by more than this multiple of ε. Because of the
+#: large slack, such a multiplier cannot reduce both residuals.
 MAX_COMPLEMENTARITY_RATIO = 100.0
 #: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
 #: 8, a residual of 6e-7 remains for rows whose variables are all in balls
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
-STEP = 2.0**-26  #: step of difference quotients of Π
+STEP = 2.0**-26  #: relative step of difference quotients of Π
 #: A column counts as linearly dependent if its norm after elimination is at most this
 #: fraction of the largest norm.
 RANK_TOLERANCE = 1e-12
@@ -140,7 +140,7 @@ class _Linearisation:
     ]  #: (n,) mask of the variables of the sets; all False if z_box is prescribed
     x: Vector  #: (n,)
     tau: float  #: step τ of the natural map
-    force: Vector | None = None  #: (n,); None if the sets can balance any force
+    force: Vector | None = None  #: (n,); None: sets balance any force
     #: True for damped steps, which apply the derivative to the residual as well: they
     #: converge more slowly than Newton's method, but from more distant points
     is_careful: bool = True

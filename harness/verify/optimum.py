@@ -428,11 +428,11 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
     """Return `s` with the least multipliers that balance the gradient.
 
-    Only rows and bounds with a nonzero multiplier in `s` receive multipliers λᵢ. These
-    minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute terms of row i. A row whose
-    multiplier would change its sign receives the multiplier zero. `s` is returned
-    unchanged if the remaining rows do not balance the gradient up to a negligible part,
-    or if the QP has sets other than bounds.
+    Equality rows, fixed variables, and rows and bounds with a nonzero multiplier in `s`
+    receive multipliers λᵢ. These minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute
+    terms of row i. A row whose multiplier would change its sign is left out. `s` is
+    returned unchanged if the remaining rows do not balance the gradient up to a
+    negligible part, or if the QP has sets other than bounds.
     """
     if len(qp.sets) > 1:
         return s

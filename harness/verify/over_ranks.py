@@ -11,8 +11,8 @@ products with Rᵀ are reductions in extended precision. The equilibrium of λ̂
 load (`harness.verify.admissible.Balance`) requires only the load along R and the
 replicated motion of the contact rows.
 
-K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so the certificate
-contains no rounding of its assembly.
+K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so that the
+certificate includes no rounding from assembly.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Contact:
     """Contact rows, then friction rows with a positive bound; replicated on ranks."""
 
     rows: csr_array  #: (m, n) rows, with global components as columns
-    c: Vector  #: (m,)
+    c: Vector  #: (m,) right-hand sides
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows of each tangential vector
 
@@ -139,7 +139,7 @@ class MPIReduction:
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other ranks to components `at` (t,), or to all."""
+        """Add contributions of other ranks to v at components `at` (t,), or all."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)
@@ -177,7 +177,7 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of global components (w,), and which of them exist."""
+        """Return local positions of components `at` (w,), and a mask of local ones."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at
@@ -342,7 +342,7 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
 class _RigidMotions:
     """Rigid motions that the supports allow, and the equilibrium of loads along them.
 
-    Columns are orthonormal in extended precision, with the inner product over the
+    Columns are orthonormal in extended precision, in the inner product over the
     components of all ranks. Products of K_T with these motions are exactly zero.
     """
 
@@ -451,8 +451,8 @@ def _largest(local: LocalBodies, R: Any) -> Extended:
 class _OnRanks:
     """Bodies distributed over ranks; see `harness.verify.substructured.Split`.
 
-    K is not assembled. The residual is that of TᵀK_T T, with the exact kernels of the
-    subdomains. E is estimated by sampling the rounding of double precision.
+    K is not assembled. Residuals are evaluated with TᵀK_T T and the exact kernels of
+    the subdomains. E is estimated by sampling the rounding of double precision.
     """
 
     def __init__(self, local: LocalBodies) -> None:

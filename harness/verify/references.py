@@ -1,11 +1,11 @@
-"""Reference solutions of contact problems, more accurate than those of solvers.
+"""Reference solutions of contact problems, with certified error bounds.
 
 An injected reference solver, which is not under test, solves the dual QP of the contact
 and friction rows. Its solution identifies the closed rows, which hold with equality:
 contacts that touch and friction that sticks. `harness.verify.active_set_refinement`
 then computes the solution in extended precision, and `harness.verify.certificate`
 bounds its error. The cache contains only the states of the rows and the multipliers,
-which determine the directions of slip. They serve as an initial guess for a later run.
+which determine the directions of slip. These serve as an initial guess for a later run.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-MAX_CACHED_BOUND = 1e-7  #: cached states that yield a larger error are discarded
+MAX_CACHED_BOUND = 1e-7  #: cached states that yield a larger bound are discarded
 #: Names and types of the cached arrays.
 STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 

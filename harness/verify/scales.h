@@ -11,7 +11,7 @@ enum {
        `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails. */
     MAX_CANCELLATION = 10000,
     /* Violations and errors of the objective are divided by this factor times their terms:
-       they are refuted above 100·tol times the terms, since residuals may be 10·tol.
+       since residuals of up to 10·tol are accepted, so are errors of 100·tol of the terms.
        With 100, `test_a_narrow_box_lends_no_length_to_a_row` fails. */
     TERMS_FACTOR = 10,
     /* Largest size of a variable, in units of the length over which the energy changes
@@ -88,8 +88,8 @@ FORMULA beyond(double error, double rounding)
 }
 
 /* |rᵢ| relative to `own`, the largest of its terms, or the energy |rᵢ|Dᵢ relative to E if
-   that ratio is smaller. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i, but no
-   more than the `room` to the bound in that direction. */
+   that ratio is smaller. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i,
+   but no more than the `room` to the bound in that direction. */
 FORMULA balance_error(double error, double own, double step, double x, double room,
                       double energy)
 {

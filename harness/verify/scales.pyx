@@ -2,8 +2,8 @@
 """Componentwise scales and errors of KKT residuals for arrays.
 
 The formulas are in `scales.h`. This module provides them as NumPy ufuncs, which also
-accept vectors distributed over ranks. The module is compiled when the package is installed;
-`scales.pyi` declares its types.
+accept vectors distributed over ranks. The module is compiled when the package is
+installed; `scales.pyi` declares its types.
 """
 
 cimport cython

@@ -97,7 +97,7 @@ class Split(Protocol):
         """Return the sums Tᵀb (n,) over the copies of each component."""
 
     def averaged(self, v: Extended) -> Extended:
-        """Average the copies v (N,) of each component, after `Sharing.matched`: (n,)."""
+        """Average the copies v (N,) of components (n,), after `Sharing.matched`."""
 
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
@@ -118,7 +118,10 @@ class Split(Protocol):
         """
 
     def scattered(self, v: Extended) -> Extended:
-        """Return √((R∘R)ᵀ(v∘v)) (r,), the deviation of Rᵀv for random signs of v."""
+        """Return the standard deviation (r,) of Rᵀv for random signs of v (n,).
+
+        This is √((R∘R)ᵀ(v∘v)).
+        """
 
     def noise(self, u: Extended) -> Extended:
         """Return a sample (n,) of the rounding of Ku − f in `residual`."""
@@ -198,7 +201,7 @@ def length(split: Split, force: Extended) -> float:
 def sample(
     variances: Vector, u: Extended, components: NDArray[np.int64], real: Any
 ) -> Extended:
-    """Return a sample (n,) of the rounding of a product with u in the precision `real`.
+    """Return a sample (n,) of the rounding of Ku in the precision `real`.
 
     The error of each sum is a few units in the last place of √`variances`, the root of
     the sum of the squared terms. It has two parts: RANDOM_ULPS with a random sign,
@@ -249,10 +252,10 @@ class _Stored(ABC):
         return v
 
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
-        """Return Ku, and the energy vᵀKv of the deformation v = u − Rα, and v.
+        """Return Ku, the energy vᵀKv of the deformation v = u − RRᵀu, and v.
 
-        Ku is evaluated as Kv + (KR)α. The terms of KR cancel, so that KR is stored with
-        twice the digits.
+        Ku is evaluated as Kv + (KR)Rᵀu. The terms of KR cancel, so that KR is stored
+        with twice the digits.
         """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u
@@ -320,7 +323,7 @@ class Undivided(_Stored):
         return np.asarray(self.mechanics.apply_inverse(rho), dtype=np.float64)
 
     def noise(self, u: Extended) -> Extended:
-        """Return a sample of the rounding of Kv, v = u − Rα."""
+        """Return a sample (n,) of the rounding of Kv with v = u − RRᵀu."""
         K = csc_array(self.mechanics.primal.P).power(2)
         deformed = without_rigid_motion(self, u)
         variances = K @ deformed.astype(np.float64) ** 2

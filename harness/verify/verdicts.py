@@ -157,7 +157,7 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     try:
         with np.errstate(all="ignore"):  # a point may contain 1e300
             return plain(case.quantities(s)), ""
-    except Exception as e:  # code of the family must not lose the record
+    except Exception as e:  # errors of the family must not lose the record
         return {}, note_of("quantities", e)
 
 
@@ -244,7 +244,7 @@ def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | 
     """Evaluate objective and residuals; return None if they are not finite.
 
     The result is also None if a scale of energy requires the whole QP: a distributed
-    vector raises TypeError for operations that require other than its local slice.
+    vector raises TypeError for operations that its local slice does not determine.
     """
     qp = emitted.share().qp
     try:
@@ -269,7 +269,7 @@ def _certified(
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"
-    except Exception as e:  # code of the family must not lose the record
+    except Exception as e:  # errors of the family must not lose the record
         return {}, note_of("energy_bound", e)
     return {
         "energy_bound": bound.bound,
