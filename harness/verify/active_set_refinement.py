@@ -9,8 +9,8 @@ with prescribed multipliers λ_N of the other rows, and are refined with residua
 extended precision. The multiplier of a row that is not closed is on the boundary of the
 set Λ of admissible multipliers: an open contact has λ = 0, and a slipping node has
 ‖λ‖ = g with the friction bound g. As in a primal-dual active set method, a closed row
-is exchanged if its multiplier is not in Λ, and another row if its motion contradicts
-its multiplier (for contact, if the gap is negative), until no such row is left.
+leaves A if its multiplier is not in Λ, and another row enters A if its motion
+contradicts its multiplier (for contact, if the gap is negative), until A is unchanged.
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def _corrected(
 
 
 def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | None:
-    """Bound a change of w (k,) after which Mᵀw = 0 is exact; None if not proven.
+    """Bound a change of w (k,) after which Mᵀw = 0 holds exactly; None if unproven.
 
     Columns are scaled by their terms and rows by w. Let X be an approximate right
     inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is

@@ -29,7 +29,7 @@ from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: approximate least total time of repetitions; see `measure`
+SAMPLE_SECONDS = 0.005  #: approximate total time of repetitions; see `measure`
 MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
@@ -137,7 +137,7 @@ class _Preparation:
 
 
 class ReasonError(Exception):
-    """Error of a solver whose `accepts` or `declines` has a wrong type."""
+    """Error of a solver whose `accepts` or result of `declines` has a wrong type."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:

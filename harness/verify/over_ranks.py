@@ -128,7 +128,8 @@ class MPIReduction:
         first = np.full(interface.size, comm.size)
         first[self._place[local.shared]] = comm.rank
         lowest = np.min(comm.allgather(first), axis=0)
-        #: (n,) mask of the components that this rank counts: no lower rank stores them
+        #: (n,) mask of the components that no lower rank stores: this rank adds them to
+        #: sums
         self.is_owner = np.ones(local.components.size, dtype=bool)
         self.is_owner[local.shared] = lowest[self._place[local.shared]] == comm.rank
 

@@ -162,7 +162,7 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
 
 
 def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Bound the error of a point; return fields of its record, and a note on failure.
+    """Bound the error of a point; return fields of a record, and a note on failure.
 
     ``energy_bound`` bounds the errors of the answer and of the displacements û and u_λ
     that prove the bound (`harness.verify.certificate`). ``certificate`` contains the
