@@ -1,9 +1,10 @@
-"""Sets other than bounds as the named arrays that files store.
+"""Conversion of discs and cones to and from the named arrays in files.
 
-The first set of a kind has `disc_index, disc_radius` or `cone_index, cone_slope`. A
-further one of the same kind, such as discs of another dimension, has a number after the
-kind: `disc2_index, disc2_radius`, `disc3_index`, … Discs are read before cones. Indices
-start at 0. Vectors and matrices may be stored in other shapes (`further_sets`).
+The first set of discs is stored as `disc_index` and `disc_radius`, the first set of
+cones as `cone_index` and `cone_slope`. The names of further sets of the same class,
+such as discs of another dimension, contain a number: `disc2_index`, `disc2_radius`,
+`disc3_index`, … Discs are read before cones. Indices start at 0. `further_sets` states
+which shapes are accepted.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.harness.sets.discs import Discs
 
 KINDS: tuple[type[Discs] | type[Cones], ...] = (Discs, Cones)
-#: Names of all arrays of sets.
+#: Pattern of the names of all arrays of discs and cones.
 SET_ARRAY = re.compile(r"(disc|cone)[0-9]*_(index|radius|slope)")
 
 
 def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of sets other than bounds by their names in files.
+    """Return the arrays of discs and cones, keyed by their names in files.
 
     Raises
     ------
     InputError
-        When a set consists of neither discs nor cones.
+        If a set consists of neither discs nor cones.
 
     """
     arrays: dict[str, NDArray[Any]] = {}
@@ -41,8 +42,8 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
     for one in sets:
         if not isinstance(one, KINDS):
             raise InputError(
-                f"no file holds sets of the kind {type(one).__name__}; expected "
-                "bounds, Discs and Cones"
+                f"sets of the kind {type(one).__name__} cannot be stored in files; "
+                "expected bounds, Discs and Cones"
             )
         counts[type(one)] += 1
         here = _prefix(type(one), counts[type(one)])
@@ -52,16 +53,16 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
 
 
 def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
-    """Return the sets other than bounds whose arrays are among `arrays`.
+    """Return the discs and cones whose arrays are in `arrays`.
 
-    Vectors may be rows or columns, as in .mat files, and an index may be flat, row by
-    row, as in Parquet.
+    Vectors may be stored as rows or columns, as in .mat files. An index may be
+    flattened in row-major order, as in Parquet files.
 
     Raises
     ------
     InputError
-        When an array of a set is missing, a name belongs to no set, or arrays do not
-        define a valid set.
+        If only one of the two arrays of a set is present, an array belongs to no set,
+        or the arrays of a set are invalid.
 
     """
     sets: list[ConvexSet] = []
@@ -71,7 +72,7 @@ def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
         while parts := _parts(kind, _prefix(kind, count), arrays, names):
             sets.append(kind(**parts))
             count += 1
-    if names:  # without this set the QP would be a different problem
+    if names:  # without this array the QP would be a different problem
         raise InputError(
             f"{min(names)} belongs to no set; expected disc_index and disc_radius, "
             "cone_index and cone_slope, then disc2_index, …"
@@ -86,9 +87,10 @@ def _prefix(kind: type[Discs] | type[Cones], count: int) -> str:
 def _parts(
     kind: Any, prefix: str, arrays: Mapping[str, Any], names: set[str]
 ) -> dict[str, Any]:
-    """Return the arguments of a set, or an empty dict if `arrays` has no such set.
+    """Return the constructor arguments of a set; empty if `arrays` does not contain it.
 
-    names : names of the arrays not yet assigned to a set; those of this set are removed
+    names : names of the arrays that are not yet assigned to a set; the names of this
+        set are removed in place
     """
     both = {f"{prefix}_{field.name}": field.name for field in fields(kind)}
     here = names.intersection(both)

@@ -1,4 +1,4 @@
-"""Sets of one kind on disjoint blocks of variables: the base of discs and cones."""
+"""Base class of discs and cones: convex sets on disjoint blocks of variables."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ from mortarbench.harness.sets.convex import Vector
 
 
 class Blocks:
-    """Base of dataclasses with a field `index` (k, d) and one number for each block.
+    """Base of dataclasses that define a convex set on each of k blocks of variables.
 
-    Both arrays are copied. Subclasses add the geometry of a kind of sets.
+    The first field is `index` (k, d), whose rows list the variables of the blocks; the
+    second field contains one number for each block (k,). Both arrays are copied.
     """
 
     prefix: ClassVar[str]  #: prefix of the names of arrays in files
-    least: ClassVar[int]  #: smallest d
-    columns: ClassVar[str]  #: meaning of the d columns, for messages
-    #: True for sets over ranks, which all ranks keep even if some have no blocks
+    least: ClassVar[int]  #: smallest number d of variables in a block
+    columns: ClassVar[str]  #: meaning of the columns of `index`, for messages
+    #: True for sets distributed over ranks: a rank without blocks keeps an empty set
     may_be_empty: ClassVar[bool] = False
 
-    index: NDArray[np.int64]  #: (k, d)
+    index: NDArray[np.int64]  #: (k, d) variables of each block
 
     def __post_init__(self) -> None:
         """Copy and check both arrays.
@@ -32,8 +33,8 @@ class Blocks:
         Raises
         ------
         InputError
-            When shapes disagree, an index is not an integer, or a number is negative or
-            not finite.
+            If the shapes do not match, an index is not an integer, or a number is
+            negative or not finite.
 
         """
         kind, size = type(self).__name__, fields(self)[1].name  # type: ignore[arg-type]
@@ -48,7 +49,7 @@ class Blocks:
                 f"{kind}: {size} has shape {sizes.shape}; expected {index.shape[:1]}, "
                 "one number per row of index"
             )
-        with np.errstate(invalid="ignore"):  # NaN, or beyond the range of integers
+        with np.errstate(invalid="ignore"):  # NaN, or out of the range of int64
             whole = index.astype(np.int64)
         if not np.array_equal(whole, index):
             raise InputError(f"{kind}: index holds a number that is not an integer")
@@ -67,7 +68,7 @@ class Blocks:
         return np.sort(self.index.ravel())
 
     def check(self, n: int) -> None:
-        """Raise ValueError for an index out of range, or a variable in two blocks."""
+        """Raise ValueError if an index is not in 0 … n − 1 or occurs twice."""
         kind, block = type(self).__name__, self.block
         outside = block[(block < 0) | (block >= n)]
         if outside.size:
@@ -81,24 +82,26 @@ class Blocks:
             )
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the distances (k,) of z to the normal cones at x, block by block.
+        """Return the distance (k,) of z from the normal cone at x in each block.
 
-        tol : relative slack below which x is on the boundary
+        tol : relative slack below which x counts as a point of the boundary
         """
         raise NotImplementedError
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the fields by their names in files, such as `disc_index`."""
+        """Return the fields, keyed by their names in files, such as `disc_index`."""
         names = (field.name for field in fields(self))  # type: ignore[arg-type]
         return {f"{self.prefix}_{name}": getattr(self, name) for name in names}
 
     def entries(self, T: Any, a: Vector) -> tuple[NDArray[np.int64], Vector]:
-        """Return columns and entries (k, d) of T in the rows of the blocks.
+        """Return columns and entries of T in the rows of the blocks, (k, d) each.
+
+        T has a single entry in each row and column, and x = T x' + a is substituted.
 
         Raises
         ------
         ValueError
-            When a (n,) moves a block.
+            If a (n,) is nonzero at a variable of a block.
 
         """
         if a[self.index].any():
@@ -110,12 +113,12 @@ class Blocks:
 
 
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
-    """Return the Euclidean norm (k,) of each row of (k, d), in its precision."""
+    """Return the Euclidean norms (k,) of the rows of (k, d), in the same precision."""
     return np.asarray(np.linalg.norm(blocks, axis=1))
 
 
 def _numbers(one: Blocks, name: str) -> NDArray[Any]:
-    """Return a copy of a field as an array of numbers."""
+    """Check that the field `name` is an array of numbers, and return a copy."""
     value = getattr(one, name)
     try:
         array = np.array(value)

@@ -15,7 +15,7 @@ from mortarbench.harness.sets.convex import Limits, Sum, Vector
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Bounds lower ≤ x ≤ upper, component by component; ±inf for absent bounds.
+    """Componentwise bounds lower ≤ x ≤ upper, where ±inf stands for an absent bound.
 
     Examples
     --------
@@ -29,22 +29,22 @@ class Box:
 
     """
 
-    lower: Vector  #: (n,) less than inf
-    upper: Vector  #: (n,) greater than -inf
+    lower: Vector  #: (n,) lower bounds, less than inf
+    upper: Vector  #: (n,) upper bounds, greater than -inf
 
     @classmethod
     def unbounded(cls, n: int) -> Box:
-        """Return the box of all x (n,)."""
+        """Return the box without bounds on n variables."""
         return cls(np.full(n, -np.inf), np.full(n, np.inf))
 
     @property
     def block(self) -> NDArray[np.int64]:
-        """The variables with a finite bound."""
+        """Indices of the variables with a finite bound, in ascending order."""
         is_bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
-        return np.flatnonzero(np.asarray(is_bounded))  # of a distributed vector: local
+        return np.flatnonzero(np.asarray(is_bounded))  # local slice if distributed
 
     def check(self, n: int) -> None:
-        """Raise ValueError for other shapes, NaN, or a lower bound above an upper."""
+        """Raise ValueError if bounds have a wrong shape, are NaN or exclude all x."""
         for name, bound in (("lb", self.lower), ("ub", self.upper)):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
@@ -54,7 +54,7 @@ class Box:
             raise ValueError("QP bounds cross: lb > ub in some component")
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
-        """Return the bounds."""
+        """Return the bounds: a box is its own hull."""
         return self.lower, self.upper
 
     def project(self, x: Vector) -> Vector:
@@ -62,7 +62,7 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks of the finite lower, then of the finite upper bounds."""
+        """Return the slacks of the finite lower bounds, then those of upper bounds."""
         size, limits = np.abs(x), list[Limits]()
         for bound, sign in ((self.lower, 1), (self.upper, -1)):
             is_finite = np.isfinite(bound)
@@ -79,13 +79,13 @@ class Box:
         return limits
 
     def admissible(self, z: Vector) -> Vector:
-        """Return z (n,) without multipliers of absent bounds."""
+        """Return z (n,) with the multipliers of absent bounds set to zero."""
         above = np.where(np.isfinite(self.upper), np.maximum(z, 0), 0)
         below = np.where(np.isfinite(self.lower), np.maximum(-z, 0), 0)
         return above - below
 
     def support(self, z: Vector) -> Sum:
-        """Evaluate ubᵀz⁺ − lbᵀz⁻ over the finite bounds."""
+        """Evaluate ubᵀmax(z, 0) − lbᵀmax(−z, 0) over the finite bounds."""
         sides = [*self._sides(z)]
         return Sum(
             sum(sign * (bound @ part) for bound, part, sign in sides),
@@ -93,25 +93,28 @@ class Box:
         )
 
     def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
-        """Multiply the slack of each finite bound by its multiplier."""
+        """Return the products of slack and multiplier of all finite bounds."""
         return [
             Sum(part * limit.slack, part * (limit.terms + limit.size))
             for (_, part, _), limit in zip(self._sides(z), limits, strict=True)
         ]
 
     def substituted(self, T: Any, a: Vector) -> Box:
-        """Return the box of x' for x = T x' + a; a negative entry swaps the bounds."""
+        """Return the box of all x' such that x = T x' + a is in this box.
+
+        A negative entry of T swaps the bounds of a variable.
+        """
         inverse = T.copy()
         inverse.data = 1 / T.data
         ends = [inverse.T @ (bound - a) for bound in (self.lower, self.upper)]
         return Box(np.minimum(*ends), np.maximum(*ends))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return `lb` and `ub`."""
+        """Return the bounds, keyed by their names in files, `lb` and `ub`."""
         return {"lb": self.lower, "ub": self.upper}
 
     def _sides(self, z: Vector) -> Iterator[tuple[Vector, Vector, int]]:
-        """Yield finite lower, then upper bounds, with the part of z ≥ 0 at each."""
+        """Yield finite bounds, multipliers ≥ 0 and the sign of z: lower, then upper."""
         for bound, sign in ((self.lower, -1), (self.upper, 1)):
             is_finite = np.isfinite(bound)
             if is_finite.any():

@@ -1,4 +1,4 @@
-"""Second-order cones ‖x_T‖ ≤ μ x_N: Coulomb's law of friction in space."""
+"""Second-order cones ‖x_T‖ ≤ μ x_N of contact forces: Coulomb's law in space."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ class Cones(Blocks):
 
     Parameters
     ----------
-    index : (k, d) variables of each cone, from 0, the normal one first; d ≥ 2, and no
-        variable occurs twice
+    index : (k, d) variables of each cone, counted from 0, with the normal component
+        first; d ≥ 2, and no variable occurs twice
     slope : (k,) coefficient of friction μ, finite and not negative
 
     Raises
     ------
     InputError
-        When shapes disagree, an index is not an integer, or a slope is negative or not
-        finite.
+        If the shapes do not match, an index is not an integer, or a slope is negative
+        or not finite.
 
     Examples
     --------
@@ -44,15 +44,15 @@ class Cones(Blocks):
 
     """
 
-    index: NDArray[np.int64]  #: (k, d)
-    slope: Vector  #: (k,)
+    index: NDArray[np.int64]  #: (k, d) variables, the normal component first
+    slope: Vector  #: (k,) coefficients of friction
 
     prefix: ClassVar[str] = "cone"
     least: ClassVar[int] = 2
     columns: ClassVar[str] = "1 + tangents"
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
-        """Return x_N ≥ 0, and x_T = 0 for slope 0."""
+        """Return the bounds x_N ≥ 0, and x_T = 0 for cones of slope 0."""
         lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
         lower[self.index[:, 0]] = 0.0
         flat = self.index[self.slope == 0, 1:]
@@ -60,7 +60,7 @@ class Cones(Blocks):
         return lower, upper
 
     def project(self, x: Vector) -> Vector:
-        """Return the nearest points of the cones, their apex for the polar cones."""
+        """Project x (n,) on the cones; the polar cones are mapped to the apex."""
         nearest = x.copy()
         normal, tangent = x[self.index[:, 0]], x[self.index[:, 1:]]
         parts = _projection(normal, tangent, np.ones_like(self.slope), self.slope)
@@ -68,7 +68,7 @@ class Cones(Blocks):
         return nearest
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks μx_N − ‖x_T‖, then x_N."""
+        """Return the slacks μx_N − ‖x_T‖ of all cones, then their slacks x_N."""
         normal, tangents = x[self.index[:, 0]], norms(x[self.index[:, 1:]])
         pull, zero = self.slope * normal, np.zeros_like(normal)
         return [
@@ -91,14 +91,16 @@ class Cones(Blocks):
         return Sum(0.0, 0.0)
 
     def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
-        """Evaluate −zᵀx of each cone, for the admissible part of z."""
+        """Evaluate −zᵀx for each cone, with the admissible part of z."""
         work = (self.admissible(z) * x)[self.index]
         return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return the distances of z to normal cones: polar cones at apices, else rays.
+        """Return the Euclidean distances (k,) of z from the normal cones of cones at x.
 
-        A block shorter than `tol` times the longest block counts as the apex.
+        At the apex, the normal cone is the polar cone. Elsewhere, it is a ray on the
+        boundary of a cone of positive slope, and {0} inside. A block of x whose norm is
+        at most `tol` times the largest norm counts as the apex.
         """
         at, force = x[self.index], z[self.index]
         sizes, tangents = norms(at), norms(at[:, 1:])
@@ -115,19 +117,19 @@ class Cones(Blocks):
         return np.where(is_apex, off_polar, rest)
 
     def substituted(self, T: Any, a: Vector) -> Cones:
-        """Return the cones of x' for x = T x' + a, if T scales tangents evenly.
+        """Return the cones of all x' such that x = T x' + a is in these cones.
 
         Raises
         ------
         ValueError
-            When T scales tangents of a cone differently or reverses its normal, or a
-            moves them.
+            If T scales the tangential components of a cone differently or reverses its
+            normal component, or if a is nonzero on a cone.
 
         """
         columns, entries = self.entries(T, a)
         normal, tangents = entries[:, 0], np.abs(entries[:, 1:])
         if (tangents != tangents[:, :1]).any() or (normal < 0).any():
-            raise ValueError("Cones cannot be scaled unevenly, nor reversed")
+            raise ValueError("Cones cannot be scaled unevenly or reversed")
         return Cones(columns, self.slope * normal / tangents[:, 0])
 
     def _terms(self, v: Vector) -> Vector:
@@ -142,9 +144,11 @@ class Cones(Blocks):
 def _projection(
     normal: Vector, tangent: Vector, a: Vector, b: Vector
 ) -> tuple[Vector, Vector]:
-    """Project (k,), (k, d − 1) on cones a‖t‖ ≤ bn, n ≥ 0; their polars are b‖t‖ ≤ −an.
+    """Project normals n (k,) and tangents t (k, d − 1) on the cones a‖t‖ ≤ bn, n ≥ 0.
 
-    a, b : (k,) not negative, not both zero
+    The polar cones are b‖t‖ ≤ −an.
+
+    a, b : (k,) nonnegative, not both zero
     """
     sizes, root = norms(tangent), np.hypot(a, b)
     is_inside = (a * sizes <= b * normal) & (normal >= 0)

@@ -1,4 +1,4 @@
-"""Discs ‖x_I‖ ≤ r: bounds of friction forces in space."""
+"""Discs ‖x_I‖ ≤ r: bounds on friction forces in space."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class Discs(Blocks):
     """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
 
     At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
-    radius 0 it is arbitrary. A QP turns discs of one variable (d = 1) into bounds.
+    radius 0 it is arbitrary. A `QP` converts discs of one variable (d = 1) to bounds.
 
     Parameters
     ----------
-    index : (k, d) variables of each disc, from 0; no variable occurs twice
+    index : (k, d) variables of each disc, counted from 0; no variable occurs twice
     radius : (k,) finite and not negative
 
     Raises
     ------
     InputError
-        When shapes disagree, an index is not an integer, or a radius is negative or not
-        finite.
+        If the shapes do not match, an index is not an integer, or a radius is negative
+        or not finite.
 
     Examples
     --------
@@ -41,21 +41,21 @@ class Discs(Blocks):
 
     """
 
-    index: NDArray[np.int64]  #: (k, d)
-    radius: Vector  #: (k,)
+    index: NDArray[np.int64]  #: (k, d) variables of each disc
+    radius: Vector  #: (k,) radii
 
     prefix: ClassVar[str] = "disc"
     least: ClassVar[int] = 1
     columns: ClassVar[str] = "d"
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
-        """Return −r and r on the discs."""
+        """Return the bounds −r and r at the variables of the discs."""
         size = np.full(n, np.inf)
         size[self.index] = self.radius[:, None]
         return -size, size
 
     def project(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Shorten the blocks outside their discs, in the precision of x."""
+        """Project x (n,) on the discs, in the precision of x."""
         sizes = self._norms(x)
         is_outside = sizes > self.radius
         x, outside = x.copy(), self.index[is_outside]
@@ -69,24 +69,28 @@ class Discs(Blocks):
         return [Limits(self.radius - sizes, self.radius, sizes, self._norms)]
 
     def admissible(self, z: Vector) -> Vector:
-        """Return the components of z (n,) on discs."""
+        """Return z (n,) with the components outside the blocks set to zero."""
         part = np.zeros_like(z)
         part[self.index] = z[self.index]
         return part
 
     def support(self, z: Vector) -> Sum:
-        """Evaluate Σ r‖z_I‖."""
+        """Evaluate Σ r‖z_I‖ over all discs."""
         value = self.radius @ self._norms(z)
         return Sum(value, value)
 
     def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
-        """Evaluate r‖z_I‖ − z_Iᵀx_I of each disc."""
+        """Evaluate r‖z_I‖ − z_Iᵀx_I for each disc."""
         work = (z * x)[self.index]
         value = self.radius * self._norms(z)
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
-        """Return ‖z_I − max(zᵀn, 0)n‖ with n = x_I/‖x_I‖, or ‖z_I‖ inside a disc."""
+        """Return the Euclidean distances (k,) of z from the normal cones of discs at x.
+
+        The distance is ‖z_I − max(z_Iᵀn, 0)n‖ with n = x_I/‖x_I‖ at a boundary point,
+        ‖z_I‖ inside the disc, and 0 for radius 0.
+        """
         at, force, sizes = x[self.index], z[self.index], self._norms(x)
         outward = at / np.where(sizes > 0, sizes, 1)[:, None]
         along = np.maximum((force * outward).sum(axis=1), 0)
@@ -95,12 +99,12 @@ class Discs(Blocks):
         return np.where(self.radius > 0, rest, 0 * rest)
 
     def substituted(self, T: Any, a: Vector) -> Self:
-        """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
+        """Return the discs of all x' such that x = T x' + a is in these discs.
 
         Raises
         ------
         ValueError
-            When T scales variables of a disc differently, or a moves them.
+            If T scales the variables of a disc differently, or a is nonzero on a disc.
 
         """
         columns, entries = self.entries(T, a)

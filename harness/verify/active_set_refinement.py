@@ -1,13 +1,16 @@
-"""Solution for given closed rows in extended precision, and exchange of closed rows.
+"""Solution for prescribed closed rows in extended precision, and exchange of rows.
 
-For a set A of closed rows, displacement and multipliers solve linear equations,
+For a set A of closed rows, which hold with equality, displacement u and multipliers λ
+solve linear equations,
 
-    K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,   λ_N prescribed elsewhere,
+    K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,
 
-and are refined with residuals in extended precision. A row that is not closed has its
-multiplier on the boundary of Λ: an open contact has λ = 0, and slip has ‖λ‖ = g. As in
-a primal-dual active set method, rows are exchanged whose multiplier leaves Λ, or whose
-motion contradicts its multiplier (a negative gap), until no such row is left.
+with prescribed multipliers λ_N of the other rows, and are refined with residuals in
+extended precision. The multiplier of a row that is not closed is on the boundary of the
+set Λ of admissible multipliers: an open contact has λ = 0, and a slipping node has
+‖λ‖ = g with the friction bound g. As in a primal-dual active set method, a closed row
+leaves A if its multiplier is not in Λ, and another row enters A if its motion
+contradicts its multiplier (for contact, if the gap is negative), until A is unchanged.
 """
 
 from __future__ import annotations
@@ -28,12 +31,13 @@ from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.verify.admissible import closing
 
 MAX_EXCHANGES = 60  #: largest number of exchanges of active sets
-#: refinements of a solution, each with a residual in extended precision
+#: Number of refinements of a solution, each with a residual in extended precision.
 REFINEMENTS = 6
 
 States = NDArray[np.int8]  #: (m,) state of each row
-#: States: multiplier at its lower bound, row closed (multiplier free), multiplier at
-#: its upper bound. A friction vector of several rows is UPPER anywhere on its circle.
+#: States of a row: multiplier at its lower bound, row closed (multiplier free), or
+#: multiplier at its upper bound. For a friction vector of several rows, UPPER denotes
+#: any point of the circle ‖λ‖ = g.
 LOWER, CLOSED, UPPER = -1, 0, 1
 
 _EPS = Real(np.finfo(Real).eps)
@@ -42,8 +46,8 @@ _EPS = Real(np.finfo(Real).eps)
 class ActiveSet(NamedTuple):
     """States of the rows, and the multipliers of rows that are not closed."""
 
-    states: States
-    limits: Extended  #: (m,) on the boundary of Λ for rows that are not closed
+    states: States  #: (m,)
+    limits: Extended  #: (m,) multipliers on the boundary of Λ; unused for closed rows
 
     @property
     def closed(self) -> NDArray[np.bool_]:
@@ -56,10 +60,10 @@ class ActiveSet(NamedTuple):
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
-    """Solve K u = force with u = 0 on fixed components.
+    """Solve K u = force with u = 0 on fixed components; return u and its error.
 
-    Returns u (n,) in extended precision, without rigid motion, and the energy norm
-    √(rᵀK⁺r) of its error, where r is the residual.
+    u (n,) is in extended precision and has no rigid motion. The error is given in
+    the energy norm, √(rᵀK⁺r) with the residual r.
     """
     K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
@@ -89,10 +93,10 @@ def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
 
 
 def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
-    """Guess the states from a pair: rows with λ + v/D inside Λ are closed.
+    """Guess the states from a pair (u, λ): rows with λ + v/D inside Λ are closed.
 
-    v = Bu − c, and D is the compliance of the row. A primal-dual active set method
-    predicts its next active set by the same rule.
+    Here, v = Bu − c, and D is the compliance of the row. Primal-dual active set methods
+    determine the next active set by the same rule.
     """
     return predicted(exact.forces, multipliers, exact.compliance, exact.motion(u))
 
@@ -100,9 +104,13 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
 def predicted(
     forces: AdmissibleForces, multipliers: Any, softness: Any, v: Any
 ) -> ActiveSet:
-    """Return the states (m,): closed if λ + v/D is inside Λ; its projection otherwise.
+    """Return the states of rows: closed if λ + v/D is inside Λ.
 
+    For other rows, `limits` of the result is the projection of λ + v/D on Λ.
+
+    multipliers : λ (m,)
     softness : (m,) compliances D ≥ 0 of the rows
+    v : (m,) motion Bu − c
     """
     discs = forces.discs
     states = np.where(multipliers * softness <= -v, LOWER, CLOSED)
@@ -111,7 +119,7 @@ def predicted(
     push = multipliers[discs.index] * soft + v[discs.index]
     size = norms(push)[:, None]
     slips = size >= discs.radius[:, None] * soft
-    # if λ + v/D gives no direction, that of λ is used
+    # if λ + v/D is zero, slip has the direction of λ
     limits[discs.index] = np.where(
         size > 0,
         push / np.where(size > 0, size, 1) * discs.radius[:, None],
@@ -131,11 +139,11 @@ def _sides(limits: Extended) -> States:
 def exchanged(
     mechanics: Mechanics, active: ActiveSet, rounds: int = MAX_EXCHANGES
 ) -> tuple[Extended, Extended, ActiveSet]:
-    """Exchange rows, starting from a guess; return u (n,), multipliers (m,), the set.
+    """Exchange rows, starting from a guess; return u (n,), λ (m,) and the active set.
 
-    Friction vectors that slip keep their direction. If a set recurs, or after `rounds`
-    exchanges, the last set is returned. It need not be optimal; a certificate has to
-    bound its error.
+    The direction of slipping friction vectors is fixed. If an active set recurs, or
+    after `rounds` exchanges, the last active set is returned. It need not be optimal;
+    a certificate has to bound the error of u and λ.
     """
     exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):
@@ -173,7 +181,7 @@ def _next(
 
 
 def _solved(mechanics: Mechanics, active: ActiveSet) -> tuple[Extended, Extended]:
-    """Solve with equality on the closed rows; return u (n,) and multipliers (m,)."""
+    """Solve with equality on the closed rows; return u (n,) and λ (m,)."""
     exact, motions, closed = mechanics.exact, mechanics.motions, active.closed
     R = motions.constrained
     close = closing(mechanics, closed)

@@ -1,7 +1,8 @@
 """Admissible pairs near an answer: no penetration, and forces in equilibrium.
 
-Moving slave nodes alone cannot remove every penetration: end nodes of an arc may be
-prescribed, and a mortar row couples several nodes.
+Moving each slave node separately cannot remove every penetration: end nodes of an arc
+may be prescribed, and a mortar row couples several nodes. Corrections are therefore
+computed for a set of rows together.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
 #: Largest number of rows for which F_VV is assembled. For more rows, CG applies it.
 MAX_DENSE_ROWS = 2000
 #: A combination of rigid motions counts as floating if its singular value in √W G is
-#: below this fraction of the largest one.
+#: at most this fraction of the largest one (`supported_and_floating`).
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of its absolute terms.
@@ -54,11 +55,12 @@ class UncertifiableError(Exception):
 def admissible(
     mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
 ) -> Extended | None:
-    """Return û near u with Bû ≤ c and equality on the rows `closed`, or None.
+    """Return û near u with Bû ≤ c and equality on the rows `closed`; None on failure.
 
-    û is the point nearest to u in the energy norm that satisfies the rows V with
-    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Initially V holds
-    the rows `closed`. It is extended until Bû ≤ c.
+    û is the point nearest to u in the energy norm that satisfies a set V of rows with
+    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα, the compliance
+    F_VV = B_V K⁺B_Vᵀ of the rows, and rigid motions R. V initially consists of the rows
+    `closed` and is extended until Bû ≤ c.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
@@ -71,7 +73,7 @@ def admissible(
 class _Rows(NamedTuple):
     """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
 
-    B: Any  #: (m, n), extended
+    B: Any  #: (m, n) in extended precision
     c: Extended  #: (m,)
     contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
 
@@ -97,7 +99,8 @@ def _feasible_near(
     θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction rows belong to V
     only if they are closed, that is, if they stick.
 
-    nearest : returns, for rows V, the map from violations t (v,) to δ with B_V δ = −t
+    nearest : returns, for rows V, the map from violations t (v,) to a
+        correction δ with B_V δ = −t
     """
     B, c, contact = rows
     enforced = np.zeros_like(closed)
@@ -168,14 +171,17 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : exact data whose columns of B are the w components in the rows
+    exact : contact and friction rows; B has a column for each of the w components that
+        occur in rows
     R : (w, p) rigid motions that change gaps; they cost no energy
     softness : (w,) 1/Kᵢᵢ, zero at prescribed components
-    u : (w,)
+    u : (w,) displacement of these components
+    closed : (m,) mask of the rows to satisfy with equality
 
     Returns
     -------
-    (w + p,) displacement of these components, followed by the coefficients of R in it
+    (w + p,) displacement of these components, followed by the coefficients of R in it;
+    None on failure
 
     """
     none = csr_array((exact.c.size, R.shape[1]))
@@ -190,8 +196,8 @@ def _nearest_at_rows(
 ) -> Callable[[Vector], Vector]:
     """Return the map from t to (δ + Rα, α) with B_V(δ + Rα) = −t and least δ.
 
-    The norm of δ is that of diag(1/softness), infinite at prescribed components. The
-    rigid motion Rα does not count.
+    The norm of δ is induced by diag(1/softness), which is infinite at prescribed
+    components. The rigid motion Rα does not contribute to it.
     """
     B_V = csr_array(B[np.flatnonzero(rows)])
     moved = csr_array((B_V * softness).T)
@@ -223,7 +229,7 @@ def closing(
     zero along motions that do not change the gaps of the rows V. F_VV may be singular,
     since K⁺ is zero on fixed components; it is therefore replaced by F_VV + ρUUᵀ,
     where U spans the range of G_V. Rows are scaled to similar compliance, since the
-    stiffness of bodies may differ by orders of magnitude.
+    stiffnesses of bodies may differ by orders of magnitude.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
@@ -253,9 +259,9 @@ def _compliance(
 ) -> Callable[[Vector], Vector]:
     """Return the solver for F_VV + ρUUᵀ: Cholesky, or CG beyond MAX_DENSE_ROWS rows.
 
-    The matrix may be singular up to rounding, so its diagonal is shifted in the last
-    digits; the next round of `_feasible_near` corrects the resulting error. CG is
-    preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    The matrix may be singular up to rounding, so its diagonal is shifted by 1e-13 of
+    its largest entry; the next round of `_feasible_near` corrects the resulting error.
+    CG is preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:
@@ -309,7 +315,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     """Return True if the load along a motion that leaves all gaps unchanged is nonzero.
 
-    Loads up to their rounding count as zero.
+    Loads that do not exceed their rounding count as zero.
 
     Parameters
     ----------
@@ -323,16 +329,16 @@ def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
 def driven(pushed: Extended, names: Sequence[str]) -> str:
     """Return the error message for a load that neither contact nor supports balance.
 
-    pushed : (r,) load along the rigid motions, body by body
+    pushed : (r,) load along each rigid motion, ordered by body
     """
     most = int(np.abs(pushed).argmax()) if pushed.size else 0
     per_body = pushed.size // len(names) if names else 1
-    directions = ("along x", "along y", "turning")
+    directions = ("along x", "along y", "in rotation")
     which = f"body {names[most // 3]}" if per_body == 3 else "some body"
     return (
         f"nothing balances the load of {which} "
         f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
-        "contact does not resist that motion, and no support holds it"
+        "contact does not resist this motion, and no support prevents it"
     )
 
 
@@ -347,9 +353,10 @@ def supported_and_floating(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Split the space of rigid motions (p,) into supported and floating ones.
 
-    A motion ν is supported if the rows with weights w ≤ 1 resist it. Returns
-    orthonormal bases (p, h) of supported and (p, p − h) of floating motions. On
-    floating motions, ‖√w Gν‖ is at most SUPPORT_THRESHOLD times its maximum.
+    Rows resist a motion ν through the change Gν (m,) of their gaps, with weights
+    w (m,) ≤ 1. A motion is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times the
+    maximum over motions of the same norm. Returns orthonormal bases (p, h) of supported
+    and (p, p − h) of floating motions.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
@@ -360,24 +367,24 @@ def supported_and_floating(
 class Balance(NamedTuple):
     """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    They state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
+    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
     """
 
     G: Extended  #: (m, p)  BR
     G_terms: Extended  #: (m, p) sums of the absolute terms of G
     load: Extended  #: (p,)  Rᵀf
-    load_terms: Extended  #: (p,) sums of its absolute terms
-    bent: Extended  #: (p,) (KR)ᵀu, nonzero only by rounding
-    forces: AdmissibleForces  #: Λ
+    load_terms: Extended  #: (p,) sums of the absolute terms of `load`
+    bent: Extended  #: (p,) (KR)ᵀu, nonzero only because of rounding
+    forces: AdmissibleForces  #: Λ, set of admissible multipliers
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
         λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
-        boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections across wide gaps or
-        against slip would do work. Along motions that λ does not support
+        boundary of Λ (for contact, wᵢ ≈ λᵢ), since corrections at open gaps or slipping
+        nodes would do work. Along motions that λ does not support
         (`supported_and_floating`), the load must vanish up to rounding; otherwise all
-        rows receive corrections, with equal weights in the last attempt.
+        rows are corrected, in the last attempt with equal weights.
 
         Raises
         ------
@@ -392,19 +399,19 @@ class Balance(NamedTuple):
             if (balanced := self._solved(multipliers, shares)) is not None:
                 return balanced
         raise UncertifiableError(
-            "contact would have to pull to balance the load: some body is driven away "
-            "from all that touches it, and no support holds it"
+            "contact would have to pull to balance the load, which moves some body "
+            "away from its contacts, and no support holds the body"
             if self.forces.contact.all()
             else "contact would have to pull, or friction to exceed its bound, to "
-            "balance the load: some body is driven away, or along, and no support "
-            "holds it"
+            "balance the load, which moves some body away from its contacts or along "
+            "them, and no support holds the body"
         )
 
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Solve with corrections of the rows with w > 0; return None if that fails.
 
-        λ̂ is the projection of λ + WGν onto Λ, where ν minimises a convex function with
-        one variable per motion.
+        λ̂ is the projection of λ + WGν on Λ with W = diag(w), where ν minimises a convex
+        function with one variable per motion.
         """
         supported, floating = supported_and_floating(self.G, w)
         basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
@@ -442,8 +449,8 @@ def _newton(
 ) -> Extended | None:
     """Solve the equilibrium equations, scaled to GᵀWG = I; return None on failure.
 
-    This is damped Newton's method for the dual function of `Balance.near`. Rows with
-    w = 0 keep their multipliers.
+    Newton's method with damping is applied to the dual function of the minimisation in
+    `Balance.near`. Rows with w = 0 keep their multipliers.
     """
     on = w > 0
 
@@ -476,7 +483,7 @@ def _newton(
 def _curvature(
     forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
 ) -> Extended:
-    """Return GᵀWΠ'(λ)G (p, p), with the projection Π onto Λ at the trial point λ (m,).
+    """Return GᵀWΠ'(λ)G (p, p), with the projection Π on Λ, at a trial point λ (m,).
 
     Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
     radius g.

@@ -1,7 +1,7 @@
-"""Proven bound of the error of an answer, whatever solver it comes from.
+"""Proven bound of the error of an answer, independent of the solver.
 
-Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the equilibrium
-under λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
+Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the displacement
+in equilibrium with λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
 
     ½‖û − u*‖² + ½‖u_λ − u*‖² + λ̂ᵀ(c − Bu*) + λ*ᵀ(c − Bû) = J(û) − D(λ̂)
                                                 = ½‖û − u_λ‖² + λ̂ᵀ(c − Bû)     (1)
@@ -13,15 +13,16 @@ solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
-Friction with bounds g adds the work Σ g‖v‖ of the slip v = Tu − s to the energy. Its
-multipliers satisfy ‖λ̂_t‖ ≤ g. In (1) this adds the nonnegative terms Σ(g‖v*‖ −
-λ̂_tᵀv*) and Σ(g‖v̂‖ − λ_t*ᵀv̂) on the left. On the right it adds Σ(g‖v̂‖ − λ̂_tᵀv̂),
-the frictional work at the bound less that of λ̂_t. For Coulomb's law, g is fixed: the
-certificate holds for the last Tresca problem of the fixed point iteration.
+Friction with bounds g_t adds the work Σ g_t‖v‖ of the slip v to the energy, and its
+multipliers satisfy ‖λ̂_t‖ ≤ g_t. The left-hand side of (1) then has the further terms
+Σ(g_t‖v*‖ − λ̂_tᵀv*) and Σ(g_t‖v̂‖ − λ_t*ᵀv̂), which are nonnegative. The right-hand
+side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of friction at its bound less
+the work of λ̂_t. For Coulomb's law, g_t is fixed: the certificate holds for the last
+Tresca problem of the fixed-point iteration.
 
-(g is not computed as J − D: the two agree to as many digits as the answer has, and
-their difference would be rounding below 1e-8.) For any other point u, the midpoint M of
-û and u_λ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2), hence
+The gap g is not evaluated as J − D: the difference would consist of rounding if the
+error is below 1e-8, since J and D then agree in all digits. The midpoint M of û and u_λ
+satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). Hence, for any other point u,
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
@@ -31,14 +32,16 @@ Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ less the
 This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
-rigid motions R; otherwise D(λ̂) = −∞. Then ‖·‖ is a seminorm, that of v − RRᵀv, and the
-error of the rigid motion itself is not bounded. Motions that do not change any gap
-(BR = 0 up to rounding), or that λ̂ does not support, are disregarded, and so is the
-rounding of K and f along them.
+rigid motions R; otherwise D(λ̂) = −∞. In this case ‖v‖ is a seminorm, the energy norm of
+v − RRᵀv, and the error of the rigid motion itself is not bounded. Motions that do not
+change any gap (BR = 0 up to rounding), or that λ̂ does not support, are disregarded, and
+so is the rounding of K and f along such motions.
 
-The bounds are evaluated for the stored K = TᵀK_T T + E, with one or more subdomains;
-see `harness.verify.substructured`. With e = û − u* = e' + Rγ, ρ = Kû − f + Bᵀλ̂, any d,
-and u_λ = Tû − d, (1) becomes, by (R2) of docs/certificates.md,
+The bounds are evaluated for the stored K = TᵀK_T T + E, where T maps displacements to
+those of one or more subdomains, K_T contains the stiffness of the subdomains and E is
+rounding (`harness.verify.substructured`). Let the error e = û − u* = e' + Rγ consist of
+a deformation and a rigid motion, let ρ = Kû − f + Bᵀλ̂ and u_λ = Tû − d with any d. By
+(R2) of docs/certificates.md, (1) becomes
 
     ‖Te‖² + ‖Te − d‖² + 2λ̂ᵀ(c − Bu*) + 2λ*ᵀ(c − Bû)
         = ‖d‖² + 2λ̂ᵀ(c − Bû) + 2eᵀ(ρ − TᵀK_T d) − 2eᵀEe                          (4)
@@ -46,11 +49,11 @@ and u_λ = Tû − d, (1) becomes, by (R2) of docs/certificates.md,
 where the last two terms are rounding. Inequality (R3) bounds them by ‖e'‖ and γ, and
 (R4) bounds γ by the contact conditions.
 
-If P does not stem from a stored stiffness, as on half-spaces, a proven lower bound μ >
-0 of its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at
-x̂, and r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies (Px* +
-q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. Their sum is ‖x̂ − x*‖²_P ≤
-rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
+If P is not a stored stiffness matrix, as for half-spaces, a proven lower bound μ > 0 of
+its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at x̂, and
+r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies
+(Px* + q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. The two inequalities
+imply ‖x̂ − x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
     ‖x̂ − x*‖_P ≤ ‖r‖/√μ                                                          (5)
 """
@@ -97,10 +100,10 @@ COMBINATION_RESIDUAL = 1e-9
 #: logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002, Theorem
 #: 24.2, with errors of the weights of 2⁻⁵³).
 PRODUCT_ROUNDING = 2.0**-46
-#: Factor by which power iteration may underestimate ‖P‖.
+#: Safety factor, since power iteration underestimates ‖P‖.
 POWER_ITERATION_FACTOR = 2.0
-#: A pair is sharp if its work is less than this times the squared distance: without
-#: work, the bound √(d² + 2·work) would decrease by only 5 %.
+#: A certificate is sharp if its `work` is at most this fraction of its squared
+#: `distance` d: without work, the bound √(d² + 2·work) would decrease by only 5 %.
 SHARP_WORK = 0.05
 SHARP_BOUND = 1e-7  #: bound below which no further pair is tried
 #: Largest bound for which the closed rows are taken from the answer. With a larger
@@ -114,7 +117,8 @@ EXCHANGE_ROUNDS = 5
 class Certificate:
     """An admissible pair (û, λ̂) near an answer, and the bounds that it proves.
 
-    All norms are the non-dimensional ‖·‖_K. The module derives equations (1) to (5).
+    All norms are energy norms ‖·‖_K of non-dimensional displacements. Equations (1) to
+    (5) are derived in the docstring of the module.
     """
 
     u: Extended  #: û (n,)
@@ -122,14 +126,14 @@ class Certificate:
     off: Extended  #: û − u_λ (n,); with subdomains, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
-    work: float  #: λ̂ᵀ(c − Bû) + Σ(g‖v̂‖ − λ̂_tᵀv̂) ≥ 0
-    sliding: float  #: the second term of `work`
+    work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
+    sliding: float  #: the frictional part of `work`, its second term
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
-    stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, with the norm of K_T
-    claimed: float  #: bound (3) of the answer itself
+    stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
+    claimed: float  #: bound (3) of the error of the answer
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if a body can move rigidly; that motion is not bounded
+    seminorm: bool  #: True if bodies can move rigidly; see the module
 
     @property
     def equilibrium(self) -> Extended:
@@ -143,7 +147,7 @@ class Certificate:
 
     @property
     def pair(self) -> float:
-        """√(2g): bound (2) of both errors together."""
+        """√(2g), bound (2) of the errors of û and u_λ together."""
         return _root(2 * self.gap)
 
     @property
@@ -195,7 +199,7 @@ class EigenvalueCertificate(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """Bound relative to ‖x*‖_P; infinite if that is not proven to be nonzero."""
+        """Bound relative to ‖x*‖_P; infinite if x* is not proven to be nonzero."""
         return self._relative(self.error)
 
     @property
@@ -214,12 +218,12 @@ class EigenvalueCertificate(NamedTuple):
         return length / least if least > 0 else np.inf
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
+@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
-    """Bound the error of x over convex sets by an eigenvalue of P, with (5).
+    """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
-    x̂ is a projected gradient step, Π(t) with t = x − (Px + q)/L, and z = L(t − x̂) is
-    normal at x̂ for any L > 0; multipliers of the answer are not used. If rounding
+    With the projection Π, x̂ = Π(t) is the projected gradient step t = x − (Px + q)/L,
+    and z = L(t − x̂) is normal at x̂ for any L > 0. Multipliers are not used. If rounding
     leaves ‖x̂_I‖ = (1 + δ)r on a disc I of radius r, then x̂ and z are exact for the
     radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ, which the
     bound covers as part of the rounding of the residual (docs/certificates.md).
@@ -229,7 +233,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     Raises
     ------
     UncertifiableError
-        When the answer holds NaN or inf or is too large, or the QP has rows.
+        If the answer holds NaN or inf or is too large, or the QP has rows.
 
     """
     if not np.isfinite(s.x).all():
@@ -258,11 +262,12 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     return certificate
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
+@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
-    Up to four pairs are tried, and the certificate with the smallest bound is returned:
+    Up to four pairs (û, λ̂) are tried, and the certificate with the smallest bound is
+    returned:
 
     1. the pair of the answer, changed as little as admissibility requires;
     2. if most of g is work, as for an interior point with positive multipliers and
@@ -275,7 +280,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     Raises
     ------
     UncertifiableError
-        When the answer holds NaN or inf, or no admissible pair is found near it.
+        If the answer holds NaN or inf, or no admissible pair is found near it.
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
@@ -299,13 +304,14 @@ def sharpest(
 
     Parameters
     ----------
-    tried : certificates of pairs near the answer, or reasons for missing certificates
-    at_rest : evaluates the pair near zero; called if no other pair proves a bound
+    tried : certificates of pairs near the answer, or reasons why pairs have none
+    at_rest : returns the certificate of the pair near zero, or the reason why it has
+        none; called if no other pair proves a bound
 
     Raises
     ------
     UncertifiableError
-        When no pair proves a bound; the message contains the first reason.
+        If no pair proves a bound; the message contains the first reason.
 
     """
     outcomes = list(tried)
@@ -353,7 +359,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
-    """Return the certificate of the pair near u = 0, λ = 0, or the reason for none."""
+    """Return the certificate of the pair near u = 0, λ = 0, or why it has none."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
@@ -383,10 +389,13 @@ def proof(
 ) -> Certificate:
     """Evaluate the bounds (4) and (3) for an admissible pair near u and λ.
 
+    claimed : (n,) displacement of the answer
+    closed : (m,) mask of the rows that û satisfies with equality
+
     Raises
     ------
     UncertifiableError
-        When no admissible pair is obtained.
+        If no admissible pair is found.
 
     """
     mechanics = split.mechanics
@@ -415,18 +424,21 @@ def proven(
     at_rows: Extended,
     multipliers: Extended,
 ) -> Certificate:
-    """Evaluate (4) and (3) for an admissible pair, in one process or over ranks.
+    """Evaluate (4) and (3) for an admissible pair, in one process or on ranks.
 
     Parameters
     ----------
-    exact : rows, restricted to the w components of `at_rows`
+    exact : contact and friction rows, restricted to the w components of `at_rows`
     G : (m, p) derivative of the gaps with respect to the rigid motions that change them
-    u, at_rows : û (n,), and its values at the components (w,) in the rows
+    claimed : (n,) displacement of the answer
+    u, at_rows : û (n,), and its values (w,) at the components that occur in rows
+    multipliers : λ̂ (m,)
 
     Raises
     ------
     UncertifiableError
-        When the answer is so large that its energy overflows.
+        If the answer is so large that its energy overflows, or that the rounding of the
+        stiffness outweighs the contact forces.
 
     """
     lam, motion = multipliers, exact.motion(at_rows)
@@ -446,7 +458,7 @@ def proven(
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    # a small û, even zero with θ = 0, does not determine the θ of the error
+    # a small û does not determine the θ of the error; for û = 0, its own θ is 0
     if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)
@@ -475,7 +487,7 @@ def proven(
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
-    # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the rest of the solve
+    # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the residual of the solve
     least = _root(u_u - u_d + 0.25 * d_d) - around
     certificate = Certificate(
         u=u,
@@ -504,13 +516,14 @@ def _root(square: float) -> float:
 def _charge(
     reach: _Reach, known: Rounding, pull: Vector, theta: float, square: float
 ) -> float:
-    """Bound the rounding terms (R3) of (4) by a fixed point iteration.
+    """Bound the rounding terms (R3) of (4) by a fixed-point iteration.
 
-    The rounding terms depend on bounds of the errors, and conversely. Each step is
-    increased by 1 %, so that the iteration ends above the fixed point.
+    The rounding terms depend on the bounds of the errors, which depend on the rounding
+    terms. Each iterate is increased by 1 %, so that the iteration ends above the fixed
+    point.
 
     pull : (h,) magnitudes of Rᵀ(ρ − TᵀK_T d) along the supported motions
-    square : 2g without these terms
+    square : 2g without the rounding terms
     """
 
     def charged(square: float) -> float:
@@ -527,14 +540,14 @@ def _charge(
 
 
 class _Reach(NamedTuple):
-    """Bounds of the rigid part of û − u* as functions of the errors of the pair."""
+    """Bounds of the rigid part of û − u*, as functions of the errors of û and u_λ."""
 
-    gaps: Vector  #: (h,) constant term
-    error: Vector  #: (h,) factor of ‖û − u*‖
-    square: Vector  #: (h,) factor of the sum of the squares of both errors
+    gaps: Vector  #: (h,) constant terms, due to open gaps
+    error: Vector  #: (h,) coefficients of ‖û − u*‖
+    square: Vector  #: (h,) coefficients of ‖û − u*‖² + ‖u_λ − u*‖²
 
     def within(self, square: float) -> Vector:
-        """Bound the motions (h,); `square` bounds the sum of the squared errors."""
+        """Return the bounds (h,), if `square` bounds the sum of the squared errors."""
         return np.asarray(
             self.gaps + self.error * np.sqrt(square) + self.square * square
         )
@@ -551,11 +564,12 @@ def _reach(
 ) -> _Reach:
     """Bound the rigid part γ of û − u* by the contact conditions (R4).
 
-    Every combination y ≥ 0 of the inequalities (R4) that equals ±γₖ gives a bound. It
-    is chosen to be small for the error `square`, with the compliance of row i
-    approximated by Bᵢdiag(K)⁻¹Bᵢᵀ; then ‖Σ±yᵢBᵢ‖ is evaluated in the dual norm. Motions
-    that λ̂ does not support are disregarded, as are motions that do not change gaps:
-    the rounding of K along them is not part of the problem.
+    Every combination of the inequalities (R4) of docs/certificates.md, with
+    coefficients y ≥ 0, whose left-hand side equals ±γₖ yields a bound. A combination
+    with a small bound is sought for the squared error `square`, with the compliance of
+    row i approximated by Bᵢdiag(K)⁻¹Bᵢᵀ; the dual norm ‖Σ±yᵢBᵢ‖ of the result is then
+    evaluated. Motions that λ̂ does not support are disregarded, and so are motions that
+    do not change gaps: the rounding of K along them is not part of the problem.
     """
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))

@@ -1,20 +1,21 @@
-"""Certificates of infeasibility, by Farkas' lemma, without rounding.
+"""Certificates of infeasibility from Farkas' lemma, without rounding.
 
 Multipliers y and z ≥ 0 of the rows Ax = b and Gx ≤ h, with c = Aᵀy + Gᵀz, prove that
 no x satisfies both the rows and lb ≤ x ≤ ub if
 
     V = bᵀy + hᵀz − Σ min(cⱼlbⱼ, cⱼubⱼ) < 0,
 
-since cᵀx ≤ bᵀy + hᵀz at every feasible x. In the convention of `harness.qp`, z_box =
-−c. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is infinite, however
-small cⱼ is. An approximate ray therefore proves nothing. It is first corrected such
-that cⱼ = 0 holds exactly for these j, either in rational arithmetic or by an enclosure
-of an exact ray, which is proven to exist. V is then evaluated in rational arithmetic
-from the doubles of the QP.
+since cᵀx ≤ bᵀy + hᵀz at every x that satisfies the rows. Such multipliers are called a
+ray here, since their positive multiples are equivalent. In the convention of
+`harness.qp`, z_box = −c. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is
+infinite, however small cⱼ is. An approximate ray therefore proves nothing. It is first
+corrected such that cⱼ = 0 holds exactly for these j, either in rational arithmetic or
+by an enclosure of an exact ray, which is proven to exist. V is then evaluated in
+rational arithmetic from the doubles of the QP.
 
-Right-hand sides are rounded numbers. So −V has to exceed `MIN_MARGIN` times the sum of
-the absolute terms of V. That ratio, the margin, does not depend on the units of rows
-and variables.
+The margin of a ray is the ratio of −V to the sum of the absolute terms of V; it does
+not depend on the units of rows and variables. Since right-hand sides are rounded
+numbers, the margin of a proof must exceed `MIN_MARGIN`.
 """
 
 from __future__ import annotations
@@ -40,23 +41,28 @@ from mortarbench.harness.verify.rational import (
     solutions,
 )
 
-#: Smallest margin of a proof. Redundant rows contradict one another by less if their
-#: right-hand sides are rounded sums of thousands of terms.
+#: Smallest margin of a proof. Redundant rows that are consistent before rounding may
+#: contradict one another by a smaller margin if their right-hand sides are rounded sums
+#: of thousands of terms.
 MIN_MARGIN = 1e-12
 #: Multipliers below these fractions of the largest one, in scaled rows, are dropped;
 #: the fractions are tried in turn. Iterative solvers return small multipliers for rows
 #: that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
-MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
+#: Largest |cⱼ| that counts as an approximation of 0, relative to the sum of its
+#: absolute terms.
+MAX_CANCELLED = 1e-3
 #: Largest number of entries of A and G; for larger QPs no proof is attempted.
 MAX_ENTRIES = 10**6
 #: Largest number of pivots of an elimination in rational arithmetic (about 1 s).
 MAX_PIVOTS = 40
-#: Largest number of entries of a rational linear program; it takes seconds.
+#: Largest number of entries of a linear program in rational arithmetic; a program of
+#: this size takes seconds.
 MAX_TABLEAU = 1500
 MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
 #: Bounds larger than this multiple of the largest right-hand side are left out of the
-#: first search, since the linear program cannot resolve costs of so different size.
+#: first search, since the linear program cannot resolve costs of such different
+#: magnitudes.
 MAX_BOUND_RATIO = 1e6
 LP_SECONDS = 20.0  #: time limit of the search for a ray
 EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
@@ -66,12 +72,13 @@ class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
     rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
-    centre: Any  #: (k,) fractions
-    radius: Any  #: (k,) fractions: |ray − centre| is at most this
+    centre: Any  #: (k,) fractions, approximate multipliers
+    radius: Any  #: (k,) fractions, bounds of |multipliers − centre|
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 
-#: Margins from `_searched` (None without a proof), independent of the solver's point.
+#: Cached margins from `_searched`, which do not depend on an answer; None if the
+#: search found no proof.
 _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 
 
@@ -80,12 +87,13 @@ def infeasibility_margin(qp: QP, s: Solution) -> float | None:
     """Return the margin of a proof that `qp` is infeasible; None if none is found.
 
     The multipliers of `s`, which claims infeasibility, are tried first. If they prove
-    nothing, a ray is searched for, once per QP. Sets other than bounds are relaxed to
-    their smallest enclosing box; an infeasible relaxation implies an infeasible QP.
+    nothing, a ray is searched for, once per QP object. Sets other than bounds are
+    relaxed to their smallest enclosing box; an infeasible relaxation implies an
+    infeasible QP.
 
     Returns
     -------
-    −V over the sum of the absolute terms of V, above `MIN_MARGIN`
+    the ratio of −V to the sum of the absolute terms of V if it exceeds `MIN_MARGIN`
 
     """
     claimed = np.concatenate([s.y, s.z])
@@ -118,7 +126,7 @@ def _searched(qp: QP, M: csr_array, row: Vector, column: Vector) -> float | None
 
 
 def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | None:
-    """Prove infeasibility by a ray near w; return the margin, or None."""
+    """Prove infeasibility by a ray near w (k,); return its margin, or None."""
     w = w.copy()
     w[qp.b.size :] = np.maximum(w[qp.b.size :], 0)
     sizes = abs(M) @ diags_array(column)
@@ -149,7 +157,7 @@ def _corrected(
     if cⱼ is small and has the wrong sign. Three rays are tried: w itself, a ray with
     cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ = 0 only where required.
 
-    M, w : entries and multipliers of the rows with a nonzero multiplier
+    M, w : rows with a nonzero multiplier, and their multipliers
     """
     exact = rational(w)
     zero = 0 * exact
@@ -170,7 +178,7 @@ def _corrected(
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
         if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
-            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots are first
+            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
@@ -181,11 +189,11 @@ def _corrected(
 
 
 def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | None:
-    """Bound a change of w (k,) that makes Mᵀw = 0 exact; return None without a proof.
+    """Bound a change of w (k,) after which Mᵀw = 0 holds exactly; None if unproven.
 
     Columns are scaled by their terms and rows by w. Let X be an approximate right
     inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
-    regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δ| ≤ |X|·1·‖c‖∞/(1 − α).
+    regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δᵢ| ≤ Σⱼ|Xᵢⱼ|·‖c‖∞/(1 − α).
 
     M : (k, n) columns of the variables with cⱼ = 0
     c : (n,) Mᵀw
@@ -264,7 +272,8 @@ def _solved(
 ) -> Vector | None:
     """Solve the linear program of `_rays`; return None if its minimum is not negative.
 
-    M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
+    M, rhs, lb, ub : scaled rows, right-hand sides of at most 1, and bounds; the first m
+        rows are equations
     reach : bounds of larger absolute value are omitted
     """
     from scipy.optimize import linprog  # imported here because it loads slowly

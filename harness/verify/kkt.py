@@ -1,11 +1,11 @@
 """Optimality of a primal-dual point, measured independently of the solver.
 
-Every residual is scale-free: it does not change when the objective, a row or the unit
-of a variable is multiplied by a constant, so that one threshold suits every problem.
+All residuals are scale-free: they do not change if the objective, a row or the unit of
+a variable is multiplied by a constant, so that one threshold suits every problem.
 All four residuals vanish exactly at a KKT point. A KKT point is a solution if P is
 positive semidefinite, which is not examined here. docs/verdicts.md states what small
-residuals prove about the objective. Where they prove too little,
-`harness.verify.optimum` compares the point with a proven optimum.
+residuals prove about the objective. If they prove too little, `harness.verify.optimum`
+compares the objective of the point with a proven optimum.
 """
 
 from __future__ import annotations
@@ -25,46 +25,49 @@ from mortarbench.harness.sets.convex import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify import scales
 
-#: Rounding of a sum, relative to the sum of its absolute terms: the error of k terms
-#: grows like √k·2⁻⁵³, and this value covers k = 256. Without it, the exact zero of a
-#: row fails (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
+#: Rounding error of a sum, relative to the sum of its absolute terms: the error of k
+#: terms grows like √k·2⁻⁵³, and this value covers k = 256. With 0, a row that is
+#: satisfied exactly is reported as violated
+#: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
-#: Share of a scale that an answer of three digits leaves undetermined. At most this
-#: share is attributed to rounding. `MAX_CANCELLATION` allows an error of 5e-4 of the
-#: objective at tol 1e-8; adding this share twice, for the uncertainty of the optimum
-#: and for rounding, keeps the error below 1e-3. With 2e-3,
+#: Largest error, as a fraction of its scale, that may be attributed to rounding.
+#: `MAX_CANCELLATION` allows a relative error of 5e-4 of the objective at tol 1e-8. This
+#: fraction is added twice, for the uncertainty of the optimum and for rounding; the sum
+#: is below 1e-3, so that three digits of the objective are correct. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
 #: `test_what_is_left_when_terms_cancel_is_known_exactly` fails.
 NEGLIGIBLE = 2e-4
-#: Least scale of energy, relative to a natural energy. If the energy of a solution is
-#: below this share, as for a vanishing solution, errors are divided by this share of
-#: the natural energy. With 1e-3,
+#: Smallest scale of energy, as a fraction of a natural energy (`_natural_energies`).
+#: If the energy of a point is smaller, as it is near x = 0, errors are divided by this
+#: fraction of the natural energy. With 1e-3,
 #: `test_rounding_errors_about_a_zero_solution_are_small` fails.
 LEAST_ENERGY = 1e-2
-#: With generous scales, a point whose energy is below this multiple of a natural energy
-#: is compared with the natural energy. With 1, `test_the_code_of_your_own_solver`
-#: fails: answers with residuals of 1.2e-2 and 3.6e-2 are then passed to the proven
-#: optimum at tol 1e-3, which verifies them.
+#: With generous scales, if the energy of a point is below this fraction of a natural
+#: energy, its errors are divided by the natural energy. With 1,
+#: `test_the_code_of_your_own_solver` fails: answers with residuals of 1.2e-2 and 3.6e-2
+#: are then compared with the proven optimum at tol 1e-3 and verified.
 NO_ENERGY = 1e-6
-#: Rounding of a load, relative to the largest load: 400 terms of 2⁻⁵² each. Without it,
-#: loads of 1e-17 count (`test_a_right_point_is_verified_by_its_residuals`, case 11).
+#: Loads (entries of q) below this fraction of the largest load are attributed to
+#: rounding: about 400 errors of 2⁻⁵². With 0, loads of 1e-17 determine the scale
+#: (`test_a_right_point_is_verified_by_its_residuals`, case 11).
 LOAD_ROUNDING = 1e-13
-#: Largest number of passes over the rows. Each pass gives a size to variables without
-#: curvature and cost that share a row with variables of known size. The limit bounds
-#: the time. `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails with 3.
+#: Largest number of passes over the rows. Each pass determines the sizes of variables
+#: without curvature and cost that share a row with variables of known size. The limit
+#: bounds the time. With 3,
+#: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails.
 MAX_PASSES = 100
-#: Power iterations for the largest eigenvalue of P. The estimate is a few percent low,
-#: which changes the natural map by as much.
+#: Number of power iterations for the largest eigenvalue of P. They underestimate it by
+#: a few percent, which changes the natural map by a similar percentage.
 POWER_STEPS = 20
 
 
 class Residuals(NamedTuple):
-    """Scale-free KKT residuals; NaN where the point holds NaN."""
+    """Scale-free KKT residuals; NaN if the point contains NaN."""
 
-    primal: float  #: worst violation of a row or bound
-    dual: float  #: stationarity and multiplier signs
-    complementarity: float  #: worst |multiplier·slack|
-    gap: float  #: |primal − dual objective|
+    primal: float  #: largest violation of a row, bound or other set
+    dual: float  #: largest error of stationarity or of the sign of a multiplier
+    complementarity: float  #: largest |multiplier·slack|, relative to the energy
+    gap: float  #: |primal − dual objective|, relative to the energy
 
     @property
     def worst(self) -> float:
@@ -73,22 +76,22 @@ class Residuals(NamedTuple):
 
 
 class Normality(NamedTuple):
-    """Distances from optimality over discs and cones; NaN at a point with NaN.
+    """Distances from optimality for discs and cones; NaN if the point contains NaN.
 
     The complementarity of a disc, r‖z‖ − zᵀx, is of second order in the angle between z
-    and x, whereas these distances are of first order. They do not affect verdicts,
-    which bound the error of the objective, also of second order.
+    and x, whereas these distances are of first order. They do not affect verdicts:
+    verdicts bound the error of the objective, which is of second order as well.
     """
 
-    natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖
-    #: distance of z_box to the normal cones at x, relative to forces
+    natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖, see `normality`
+    #: largest distance of z_box from a normal cone at x, relative to forces
     normal_distance: float
 
 
 class Scales(NamedTuple):
     """Units in which the errors of a point are measured."""
 
-    energy: float  #: E
+    energy: float  #: E, scale of errors of the objective
     x: Vector  #: Xⱼ (n,), size of each variable
 
 
@@ -103,50 +106,53 @@ class _Constraints(NamedTuple):
         """Yield inequality rows, if there are any, then the limits of the sets."""
         if self.inequalities.size.size:
             yield self.inequalities
-        for limits in self.sets:  # collective: also if this rank has no such component
+        for limits in self.sets:  # collective: even without local components
             yield from limits
 
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Products of the QP with a point, and sums of the absolute terms in them."""
+    """Products of the matrices with a point, and sums of their absolute terms."""
 
     x: Vector  #: |x|
     constraints: _Constraints
     Px: Vector
     Px_size: Vector  #: upper bound of Σ|Pᵢⱼ||xⱼ|
-    curvature: Vector  #: Pᵢᵢ, zero for an operator without diagonal
-    has_diagonal: bool  #: False for an operator without diagonal
+    curvature: Vector  #: Pᵢᵢ; zero if an operator P has no `diagonal`
+    has_diagonal: bool  #: False if an operator P has no `diagonal`
     forces: Vector  #: Aᵀy + Gᵀz + z_box
-    forces_size: Vector
-    residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, less multipliers of absent bounds
-    excess: Vector  #: z_box minus its admissible part (absent bounds)
-    energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + bounds
-    energies_size: float
+    forces_size: Vector  #: sums of the absolute terms of `forces`
+    residual: Vector  #: r in `kkt_residuals`: Px + q + Aᵀy + Gᵀz⁺ + admissible z_box
+    excess: Vector  #: multipliers of absent bounds: z_box minus its admissible part
+    energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + σ(z_box)
+    energies_size: float  #: sum of the absolute terms of the three energies
 
 
-@np.errstate(all="ignore")  # a point may hold NaN, inf, or 1e300
+@np.errstate(all="ignore")  # a point may contain NaN, inf, or 1e300
 def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
-    """Measure how far `s` is from satisfying the KKT conditions of `qp`.
+    """Return the scale-free residuals of `s` in the KKT conditions of `qp`.
 
-    With the scale of energy E and the sizes Xⱼ of the variables (`scales_at`), and
-    r = Px + q + Aᵀy + Gᵀz⁺ + z_box less multipliers of absent bounds:
+    Let E be the scale of energy, Xⱼ the sizes of the variables (`scales_at`), and
+    r = Px + q + Aᵀy + Gᵀz⁺ + z_box without the multipliers of absent bounds, where
+    v⁺ = max(v, 0) and v⁻ = min(v, 0). Each residual is the largest of these quantities:
 
-    * primal: violation of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, relative to |bᵢ| + Σ|aᵢⱼ|Xⱼ;
-      where bᵢ ≠ 0, also relative to ten times its own terms (`own_sizes`)
-    * dual: |rᵢ| relative to S, the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and
-      √(E·min Pⱼⱼ), and relative to its own |Px|ᵢ, |qᵢ|, |Aᵀy + Gᵀz + z_box|ᵢ unless
-      |rᵢ|Dᵢ/E is smaller; zᵢ⁻‖gᵢ‖∞/S
-    * complementarity: max |zᵢ(h − Gx)ᵢ|/E over rows and bounds
+    * primal: violations of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, divided by |bᵢ| + Σ|aᵢⱼ|Xⱼ
+      or, if bᵢ ≠ 0 and this is smaller, by 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ do not
+      depend on energies (`own_size` in scales.h)
+    * dual: |rᵢ|/S, |zᵢ⁻|‖gᵢ‖∞/S and multipliers of absent bounds divided by S, where S
+      is the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and √(E·min Pⱼⱼ); the smaller
+      of |rᵢ|Dᵢ/E and the ratio of |rᵢ| to the largest of |Px|ᵢ, |qᵢ| and
+      |Aᵀy + Gᵀz + z_box|ᵢ
+    * complementarity: |zᵢ(h − Gx)ᵢ|/E, and the same products for bounds
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
     Dᵢ = min(max(|xᵢ|, sᵢ), wᵢ), where sᵢ = |rᵢ|/Pᵢᵢ is the step to the minimum along i
     (Xᵢ for a variable with neither curvature nor cost) and wᵢ the distance to the bound
     in that direction. Before a residual is divided by its scale, `ROUNDING` times the
-    sum of its absolute terms, but at most `NEGLIGIBLE` of the scale, is subtracted.
+    sum of its absolute terms, but at most `NEGLIGIBLE` times the scale, is subtracted.
 
-    generous : use the largest scale of energy that can be justified, and subtract all
-        rounding from energies
+    generous : use the largest scale of energy that can be justified, and subtract the
+        rounding of energies even if it exceeds `NEGLIGIBLE` times the scale
 
     Examples
     --------
@@ -178,17 +184,19 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     )
 
 
-@np.errstate(all="ignore")  # a point may hold NaN, inf, or 1e300
+@np.errstate(all="ignore")  # a point may contain NaN, inf, or 1e300
 def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
-    """Measure a point over discs and cones; None if the QP has bounds only.
+    """Return distances of a point from optimality; None without discs and cones.
 
-    * The natural map at g = Px + q + Aᵀy + Gᵀz, with the projection Π onto all sets and
-      an estimate L of the largest eigenvalue of P. It does not depend on z_box. If
-      q = 0, it is relative to the largest of ‖Px‖ and ‖Aᵀy + Gᵀz‖.
-    * The largest Euclidean distance of z_box on a disc or cone to the normal cone of
-      the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and ‖Aᵀy + Gᵀz + z_box‖∞.
+    * `natural_map` is ‖x − Π(x − g/L)‖·L/‖q‖ with g = Px + q + Aᵀy + Gᵀz, the
+      projection Π onto all sets and an estimate L of the largest eigenvalue of P. It
+      does not depend on z_box. If q = 0, it is relative to the larger of ‖Px‖ and
+      ‖Aᵀy + Gᵀz‖.
+    * `normal_distance` is the largest Euclidean distance of z_box on a disc or cone
+      from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
+      ‖Aᵀy + Gᵀz + z_box‖∞.
 
-    tol : relative slack of a disc or cone below which it is active
+    tol : a disc or cone is active if its relative slack is at most this
 
     Examples
     --------
@@ -230,7 +238,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
 
 
 def largest_eigenvalue(qp: QP) -> float:
-    """Estimate the largest eigenvalue of P from below, by power iteration."""
+    """Estimate the largest eigenvalue of P from below by power iteration."""
     v = np.random.default_rng(0).standard_normal(qp.q.size)
     for _ in range(POWER_STEPS):
         v = qp.P @ (v / np.linalg.norm(v))
@@ -296,7 +304,7 @@ def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constrai
 
 
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
-    """Return the worst relative violation of a row or bound, as in `kkt_residuals`.
+    """Return the largest relative violation of a row or bound; see `kkt_residuals`.
 
     X : (n,) sizes of the variables from the scale of energy
     own : (n,) sizes of the variables from their values (`own_sizes`)
@@ -325,8 +333,8 @@ def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
 def own_sizes(qp: QP, x: Vector) -> Vector:
     """Return sizes (n,) of the variables at x (n,) that do not depend on energies.
 
-    The size is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other
-    variables shift the minimum along j.
+    The size of variable j is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ with k ≠ j, the
+    distance by which the other variables shift the minimum along j.
     """
     shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
     sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
@@ -346,7 +354,7 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
     lower, upper = hull(qp.sets, qp.q.size)
-    room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # downhill
+    room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # along the descent
     signed = (s.z >= 0).all()  # False if z contains NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
@@ -362,7 +370,7 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
 
 
 def _rayleigh(x: Vector, Px: Vector) -> Vector:
-    """Return xᵀPx/xᵀx for each variable (n,), 0 where x is zero."""
+    """Return the Rayleigh quotient xᵀPx/xᵀx in every component (n,); 0 if x = 0."""
     squared = float(x @ x)
     return float(x @ Px) / squared + 0 * x if squared > 0 else 0 * x
 
@@ -379,21 +387,22 @@ def _complementarity(
 
 
 def energy_at(qp: QP, s: Solution, *, generous: bool = False) -> float:
-    """Return the scale of energy at a point, see `_energy`."""
+    """Return the scale of energy at a point; see `_energy`."""
     return _energy(qp, _terms(qp, s), generous)
 
 
 def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     """Return the scale of energy E at a point.
 
-    E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + bounds|. Sums are used because
-    multipliers that cancel could make single terms arbitrarily large. E is at most
-    `MAX_CANCELLATION` times the objective (`energy_scale` in scales.h), and at least
-    `LEAST_ENERGY` times the smallest natural energy of a variable
-    (`_natural_energies`).
+    E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|, where σ is the support
+    function of the sets. The third sum is not split, since multipliers that cancel
+    could make its terms arbitrarily large. E is at most `MAX_CANCELLATION` times the
+    objective (`energy_scale` in scales.h), and at least `LEAST_ENERGY` times the
+    smallest natural energy of a variable (`_natural_energies`).
 
-    generous : ignore cancellation, and use the median of the natural energies; do not
-        multiply it by `LEAST_ENERGY` if the energy of the point is negligible
+    generous : do not limit E by `MAX_CANCELLATION`; use the median of the natural
+        energies instead of the smallest, and return it if the energy of the point is
+        negligible (`NO_ENERGY`)
     """
     terms = _sup(t.energies)
     if np.isnan(terms):
@@ -407,7 +416,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         qp, t.curvature, bounds, by_length=by_length or not qp.q.any()
     )
     natural = pick(energies)
-    if E < LEAST_ENERGY * natural:  # rarely true; tightening bounds is expensive
+    if E < LEAST_ENERGY * natural:  # rare: tightening bounds is expensive
         energies = _natural_energies(qp, t.curvature, tightened(qp), by_length=True)
         natural = pick(energies)
     if not natural < np.inf:
@@ -417,7 +426,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
 
 
 def _least(values: Vector) -> float:
-    """Return the least value over all ranks of a distributed vector; inf if empty."""
+    """Return the least value, over all ranks if distributed; inf if empty."""
     return float(values.min(initial=np.inf))
 
 
@@ -429,16 +438,16 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """Return the energy that each variable alone can gain, where it is determined.
+    """Return the energies that single variables can gain, as far as determined.
 
-    This is |½Pᵢᵢxᵢ² + qᵢxᵢ| at the minimum of the variable within its bounds. If the
-    minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ is
-    the width of the feasible interval.
+    The energy of variable i is |½Pᵢᵢxᵢ² + qᵢxᵢ| at its minimum within the bounds. If
+    the minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ
+    is the width of the feasible interval.
 
     bounds : lower and upper bounds (n,), possibly tightened by rows
-    by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² if qᵢ is
-        rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 without
-        such a length
+    by_length : limit the energies of variables without curvature to |qᵢ|lᵢ, and return
+        Pᵢᵢlᵢ² if all qᵢ are zero up to rounding; lᵢ is the least length from a row or
+        bound (`_lengths`), or 1 if no variable has such a length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)
@@ -452,7 +461,7 @@ def _natural_energies(
     flat = (d == 0) & np.isfinite(lengths)
     gain = np.where(flat, np.minimum(gain, q * lengths), gain)
     gain = np.where(np.isfinite(gain), gain, 0)
-    # energies are quadratic in q
+    # energies are quadratic in q, hence the square
     gain = gain[gain > LOAD_ROUNDING**2 * gain.max(initial=0)]
     bend: Vector = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
     if bend.size and gain.max(initial=0) <= LOAD_ROUNDING**2 * bend.min():
@@ -462,7 +471,7 @@ def _natural_energies(
 
 
 def _lengths(qp: QP) -> Vector:
-    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| per variable (n,), or inf."""
+    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| of each variable (n,), or inf."""
     least = np.full(qp.q.size, np.inf)
     for bound in hull(qp.sets, qp.q.size):
         has_length = np.isfinite(bound) & (bound != 0)
@@ -474,7 +483,7 @@ def _lengths(qp: QP) -> Vector:
 
 
 def tightened(qp: QP) -> tuple[Vector, Vector]:
-    """Return lower and upper bounds (n,) each, tightened by single rows."""
+    """Return lower and upper bounds (n,), tightened by each row separately."""
     lower, upper = hull(qp.sets, qp.q.size)
     lb, ub = lower.copy(), upper.copy()
     for k, (i, j, a, rhs) in enumerate(_entries(qp)):
@@ -494,7 +503,7 @@ def tightened(qp: QP) -> tuple[Vector, Vector]:
 
 
 def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
-    """Yield rows, columns and values of A, then of G, with the right-hand side."""
+    """Yield row and column indices, values and right-hand side of A, then of G."""
     for M, rhs in ((qp.A, qp.b), (qp.G, qp.h)):
         at = csr_array(M).tocoo()
         is_entry = at.data != 0
@@ -504,10 +513,10 @@ def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
 def scales_at(qp: QP, x: Vector, E: float) -> Scales:
     """Return the sizes of the variables that follow from a scale of energy.
 
-    Over the length lⱼ, the lesser of √(E/Pⱼⱼ) and E/|qⱼ|, the energy changes by E. Xⱼ
-    is the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ, since x could be
-    arbitrarily long along a direction without cost. The size of a variable without
-    curvature and cost follows from its active rows.
+    The energy changes by E over the length lⱼ, the smaller of √(E/Pⱼⱼ) and E/|qⱼ|. Xⱼ
+    is the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ, since |xⱼ| may be
+    arbitrarily large along a direction without cost. The size of a variable with
+    neither curvature nor cost follows from its active rows.
     """
     d, has_diagonal = _curvature(qp)
     return _scales(qp, x, E, d, has_diagonal=has_diagonal)
@@ -530,8 +539,8 @@ def _sizes_from_rows(
 ) -> Vector:
     """Derive the sizes of variables with neither curvature nor cost from active rows.
 
-    A row of G is active if its slack is negligible. Inactive rows are left out, since a
-    distant row would excuse the violation of another one
+    A row of G is active if its slack is negligible. Inactive rows are left out: the
+    large right-hand side of a distant row would hide the violation of another row
     (`test_a_row_that_is_far_away_excuses_no_violation`).
     """
     size, has_size = np.abs(x), has_size.copy()
@@ -570,16 +579,17 @@ def verdict(
     error: float | None = None,
     infeasible: bool = False,
 ) -> Verdict:
-    """Judge a point by its residuals; the claim only determines the kind of failure.
+    """Return the verdict on a point, which follows from its residuals.
 
-    A point is verified if every residual is at most factor·tol, whatever was claimed.
-    An error against a proven optimum replaces all four residuals. A refuted claim of
+    A point is verified if every residual is at most factor·tol, whatever the solver
+    claimed. Otherwise, the claim determines the kind of failure. The error relative to
+    a proven optimum, `error`, replaces all residuals if it is given. A refuted claim of
     success is `inaccurate` if the point has at least half of the requested digits
     (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
     above 0.1 is not verified at any tolerance.
 
-    infeasible : the QP is proven to have no feasible point, which verifies a claim of
-        infeasibility regardless of the point
+    infeasible : True if the QP is proven to have no feasible point, which verifies a
+        claim of infeasibility regardless of the point
     """
     most = allowed(tol, factor)
     worst = residuals.worst if error is None else error
@@ -600,12 +610,13 @@ def verdict(
 
 
 def rejudged(record: Record, factor: float) -> Verdict:
-    """Judge a stored measurement again, at factor·tol instead of 10·tol.
+    """Recompute a stored verdict with the tolerance factor·tol instead of 10·tol.
 
-    Claim and residuals decide the verdict, or the error against a proven optimum if
-    that decided it before (`Record.decided_by`). Verdicts that do not follow from these
-    numbers are returned unchanged: a limit, a crash, a sequence that had ended before,
-    and a proof of infeasibility, which has no tolerance.
+    The verdict follows from the stored claim and residuals, or from the error relative
+    to a proven optimum if that error decided the stored verdict (`Record.decided_by`).
+    Verdicts that do not follow from these numbers are returned unchanged: those on
+    limits, crashes and steps after the end of a sequence, and proofs of infeasibility,
+    which do not depend on a tolerance.
     """
     if record.claimed is None:
         return record.verdict
@@ -639,7 +650,7 @@ def _abs(M: Matrix) -> Matrix:
 
 
 def _over(a: Vector | float, b: Vector) -> Vector:
-    """Return a/b, with infinity for division by zero."""
+    """Return a/b (n,), with infinity where b is not positive."""
     return np.where(b > 0, a / np.where(b > 0, b, 1), np.inf)
 
 
@@ -649,7 +660,7 @@ def _largest(*values: float) -> float:
 
 
 def _ratio(error: Vector, scale: Vector | float) -> float:
-    if isinstance(scale, float) and 0 < scale < np.inf:  # rounding is monotonic
+    if isinstance(scale, float) and 0 < scale < np.inf:  # rounded division is monotonic
         return float(np.abs(error).max(initial=0.0) / scale)
     return float(scales.excesses(error, 0.0, scale, dtype=float).max(initial=0.0))
 
@@ -660,10 +671,10 @@ def _excess(
     scale: Vector | float,
     most_rounding: float = NEGLIGIBLE,
 ) -> float:
-    """Return the largest ratio of error to scale, after rounding is subtracted.
+    """Subtract rounding from errors; return the largest ratio to their scales.
 
     size : sum of the absolute terms of the error
-    most_rounding : largest share of the scale that is subtracted as rounding
+    most_rounding : largest fraction of the scale that is subtracted as rounding
     """
     rounding = np.minimum(ROUNDING * size, most_rounding * scale)
     return float(scales.excesses(error, rounding, scale, dtype=float).max(initial=0.0))

@@ -29,12 +29,12 @@ from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: approximate least duration of a sample; see `measure`
-MAX_INNER_LOOPS = 100  #: largest number of repetitions within a sample
+SAMPLE_SECONDS = 0.005  #: approximate total time of repetitions; see `measure`
+MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
 MAX_COUNT = 2**53  #: larger integers are not exact in programs that store doubles
-MAX_MESSAGE = 1900  #: largest length of a solver's message, in characters
+MAX_MESSAGE = 1900  #: largest length of a message of a solver, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
 _VECTORS = ("x", "y", "z", "z_box")
@@ -43,8 +43,8 @@ _VECTORS = ("x", "y", "z", "z_box")
 class Timed(NamedTuple):
     """A solution, and the cost of computing it."""
 
-    solution: Solution  #: always with float vectors of the right shapes
-    cost: Measurement
+    solution: Solution  #: its vectors are floats of the right shapes
+    cost: Measurement  #: times and memory
     first_seconds: float | None = None  #: time of the first solve, if it was repeated
 
 
@@ -63,25 +63,25 @@ def measure(
 ) -> Timed:
     """Prepare and solve `qp` with `solver`, and time both.
 
-    Errors of the solver do not raise: an exception, a missing library or a malformed
-    answer becomes the status and message of a solution without a point. The call of
-    `declines` counts as preparation. If the solver cannot use an operator P
-    (`harness.needs_matrices`) with at most MAX_ASSEMBLED_ROWS rows, P is assembled,
-    which also counts as preparation.
+    Errors of the solver are not raised: after an exception, a missing library or a
+    malformed answer, the result is a solution without a point, with a status and a
+    message. The call of `declines` counts as preparation. If the solver cannot use an
+    operator P (`harness.needs_matrices`) and P has at most MAX_ASSEMBLED_ROWS rows, P
+    is assembled, which also counts as preparation.
 
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
         `harness.plugin.Chained`
-    sample_seconds : a solve that takes less time is repeated, including its
-        preparation, until the repetitions together take this time. The answer is that
-        of the first repetition; the times are means of the others, since the first one
-        runs with cold caches. Every repetition gets a QP of new objects, so that a
-        solver cannot recognise it by identity
+    sample_seconds : if preparation and solve take less than half of this time, they are
+        repeated until the repetitions together take about this time. The answer is that
+        of the first solve; the times are means over the repetitions, since the first
+        solve runs with cold caches. Every repetition receives a QP of new objects, so
+        that the solver cannot recognise the QP by identity
     starts, ends : called just before the clock starts and just after it stops
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
         starts()
-        try:  # only code of the solver, so that no bug here counts as its failure
+        try:  # only code of the solver, so that bugs of the harness are raised
             answer, seconds, peaks = _timed(preparation, qp)
             first = sum(seconds)
             inner = _inner(first, sample_seconds)
@@ -119,7 +119,7 @@ def measure(
 
 @dataclass(frozen=True)
 class _Preparation:
-    """The timed preparation of a solver: `declines`, assembly of P, and `prepare`."""
+    """Timed preparation by a solver: call of `declines`, assembly of P, `prepare`."""
 
     solver: Solver
     prepare: Prepare
@@ -137,20 +137,20 @@ class _Preparation:
 
 
 class ReasonError(Exception):
-    """Error of a solver whose `accepts` or `declines` has a wrong type."""
+    """Error of a solver whose `accepts` or result of `declines` has a wrong type."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     """Return the reason why `solver` does not accept `qp`, or None if it does.
 
-    A set of a class that is not in `accepts` is a reason. A solver without `accepts`
-    accepts bounds only.
+    A solver does not accept a QP with a set whose class is not in `accepts`. A solver
+    without the attribute `accepts` accepts bounds only.
 
     Raises
     ------
     ReasonError
-        When `accepts` is not a tuple of classes, or `declines` returns neither None nor
-        a string, such as False.
+        If `accepts` is not a tuple of classes, or if `declines` returns neither None
+        nor a string (for instance False).
 
     """
     accepted = getattr(solver, "accepts", (Box,))
@@ -172,7 +172,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
 
 
 def _explicit(qp: QP) -> QP:
-    """Return the QP with its operator P as a matrix; decline if P is too large."""
+    """Return the QP with its operator P as a matrix; raise if P is too large."""
     n = qp.q.size
     if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
         raise _DeclinedError(
@@ -191,8 +191,8 @@ def _timed(
 ) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
     """Prepare and solve once.
 
-    Returns the answer, then the seconds of preparation and solve, then the memory peaks
-    (MiB) of both.
+    Returns the answer, the times of preparation and solve (s), and the memory peaks of
+    preparation and solve (MiB; None if not measured).
     """
     reset = peaks and reset_peak()
     start = perf_counter()
@@ -210,7 +210,7 @@ def _timed(
 
 
 def _fresh_copy(qp: QP) -> QP:
-    """Return a QP of new objects that share the numbers of this one."""
+    """Return a QP of new objects that share the data of `qp`."""
 
     def other(M: Any) -> Any:
         if isinstance(M, tuple):
@@ -230,8 +230,8 @@ def _fresh_copy(qp: QP) -> QP:
 
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
-    """Copy a dataclass, with `other` applied to each attribute."""
-    new = copy(whole)  # without __init__, whose checks may outlast a solve
+    """Copy a dataclass, and apply `other` to each attribute of the copy."""
+    new = copy(whole)  # without __init__, whose checks may take longer than a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
@@ -244,20 +244,21 @@ def _inner(seconds: float, sample_seconds: float) -> int:
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:
-    """Return VmRSS (resident memory) or VmHWM (its peak) in MiB; None if unavailable.
+    """Return VmRSS (resident memory) or VmHWM (its peak), MiB; None if unavailable.
 
-    ``ru_maxrss`` is not a substitute: it is inherited from the parent, even by exec.
+    ``ru_maxrss`` is not a substitute: a process inherits it from its parent, even after
+    exec.
     """
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
     except OSError:
         return None
     values = [line.split()[1] for line in lines if line.startswith(f"{key}:")]
-    return int(values[0]) / 1024 if values else None  # the kernel counts in KiB
+    return int(values[0]) / 1024 if values else None  # the file is in KiB
 
 
 def reset_peak() -> bool:
-    """Reset VmHWM to the resident memory; return False if that fails."""
+    """Reset VmHWM to the resident memory; return False on failure."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # proc(5)
     except OSError:
@@ -271,7 +272,7 @@ def _without_point(qp: QP, status: Status, message: str) -> Timed:
 
 
 def one_line(message: object) -> str:
-    """Return a text as one line of limited length, with lone surrogates escaped."""
+    """Return a text as one line of limited length; lone surrogates are escaped."""
     whole = " ".join(str(message).split())
     text = whole.encode(errors="backslashreplace").decode()
     return text if len(text) <= MAX_MESSAGE else f"{text[:MAX_MESSAGE]}…"
@@ -280,9 +281,9 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    File name and line are those of the last call in the file of the solver's class, as
-    in ``KeyError: 'rho' (mine.py:24)``. They are omitted if the traceback does not
-    contain this file.
+    File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, are those of the
+    innermost call in the file that defines the class of the solver. They are omitted if
+    the traceback does not contain this file.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))
@@ -295,10 +296,10 @@ def failure(solver: Solver, e: BaseException) -> str:
 
 
 def _file_of(kind: type) -> str:
-    """Return the file that defines the methods of a class, or "" if there is none.
+    """Return the file that defines the methods of a class; "" if no file is found.
 
-    The module of the class is not used: after a copy by cloudpickle, it may exist only
-    in another process.
+    The module of the class is not used: if cloudpickle has copied the class, the module
+    may exist only in another process.
     """
     for one in kind.__mro__:
         for part in vars(one).values():
@@ -319,11 +320,11 @@ def _text_of(e: BaseException) -> str:
 
 
 def _checked(answer: object, qp: QP) -> Solution:
-    """Return a solution that fits `qp`, whatever the solver returned."""
+    """Check that an answer is a solution of matching shapes; else return a failure."""
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)
-    try:  # attributes of the solver's objects may run its code
+    try:  # reading attributes may run code of the solver
         if (mismatch := answer.mismatch(qp)) is not None:
             return Solution.without_point(qp, Status.FAILED, mismatch)
         return _plain(answer)
@@ -333,7 +334,7 @@ def _checked(answer: object, qp: QP) -> Solution:
 
 
 def _plain(s: Solution) -> Solution:
-    """Convert all fields to plain types."""
+    """Convert all fields of a solution to built-in types and float arrays."""
     history, objection = usable_history(s.history)
     vectors = {name: _numbers(name, getattr(s, name)) for name in _VECTORS}
     iterations = None if s.iterations is None else _count("iterations", s.iterations)
@@ -353,7 +354,7 @@ def _plain(s: Solution) -> Solution:
 
 
 def _numbers(name: str, values: object) -> Vector:
-    """Return a vector of doubles; other types than real numbers are refused."""
+    """Check that `values` are real numbers, and return them as doubles."""
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")

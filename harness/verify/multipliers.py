@@ -1,22 +1,23 @@
-"""Multipliers for a point without multipliers.
+"""Best multipliers for a primal point.
 
 At x, with g = Px + q, the multipliers minimise
 
     Σᵢ wᵢ²(g + Aᵀy + Gᵀz + z_box)ᵢ²  +  Σⱼ (zⱼsⱼ/E)²    over y, z ≥ 0 and z_box,
 
 where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
-and 1/wᵢ that of the stationarity residual; z_box has the sign of its bound. The second
-sum is the complementarity residual. It replaces a threshold between active and inactive
-rows: the slack of a nearly active row limits its multiplier.
+and 1/wᵢ the scale of the stationarity residual; z_box has the sign required by the
+bound. The second sum measures complementarity and makes a threshold between active and
+inactive rows unnecessary: the slack of a nearly active row limits its multiplier.
 
-Another convex set contributes z = (v − Π(v))/τ with v = x + τf for a force f. This z is
-normal to the set at Π(v). As τ grows, the rest f − z becomes smaller and the
-complementarity residual larger. The multipliers of rows are first fitted as if such
-sets could balance any force. Newton's method for f − z, with the derivative of Π, then
-corrects them.
+If the remaining terms of the stationarity condition require a force f from a disc or
+cone with projection Π, this set contributes z = (v − Π(v))/τ with v = x + τf. This z is
+normal to the set at Π(v). As τ grows, the remainder f − z becomes smaller and the
+complementarity residual larger. The multipliers of rows are first fitted as if discs
+and cones could balance any force. Newton's method for f − z, with the derivative of Π,
+then corrects them.
 
 Multipliers with small residuals prove that a point is optimal, regardless of their
-origin. Several weightings are therefore tried, and the multipliers with the smallest
+origin. Several weights w are therefore tried, and the multipliers with the smallest
 `kkt_residuals` are returned.
 """
 
@@ -38,38 +39,38 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 from mortarbench.harness.verify.optimum import EPS
 
-#: A multiplier that changes the stationarity residual by tol must not change the
-#: complementarity residual by more than this many tol. Rows with a larger slack are
-#: left out, since their multipliers cannot reduce both residuals.
+#: Rows are left out if a multiplier that changes the stationarity residual by ε would
+#: change the complementarity residual by more than this multiple of ε. Because of the
+#: large slack, such a multiplier cannot reduce both residuals.
 MAX_COMPLEMENTARITY_RATIO = 100.0
 #: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
-#: 8, the residual is 6e-7 for rows that act on balls alone
+#: 8, a residual of 6e-7 remains for rows whose variables are all in balls
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
-STEP = 2.0**-26  #: step of difference quotients of Π
-#: Largest norm, relative to the largest column, of a column that counts as linearly
-#: dependent after elimination.
+STEP = 2.0**-26  #: relative step of difference quotients of Π
+#: A column counts as linearly dependent if its norm after elimination is at most this
+#: fraction of the largest norm.
 RANK_TOLERANCE = 1e-12
-#: largest number of entries of the dense least-squares matrix: 256 MiB
+#: Largest number of entries of the dense least-squares matrix (256 MiB).
 MAX_ENTRIES = 2**25
 
 
 class _Scales(NamedTuple):
     """Weights of the two sums in the module docstring."""
 
-    w: Vector  #: (n,) 1 over the scale of stationarity; 0 at fixed variables
+    w: Vector  #: (n,) 1/(scale of stationarity); 0 at fixed variables
     E: float  #: scale E of energy, which divides the complementarity residual
 
     def reach(self) -> float:
-        """Return the parameter τ = E/S² of the natural map; S is the largest force.
+        """Return the parameter τ = E/S² of the natural map, where S = 1/min wᵢ.
 
-        If τf spans the distance of x from a limit, the natural map divides the error
-        equally between stationarity and complementarity.
+        If τf equals the distance of x from the boundary of a set, the natural map
+        divides the error equally between stationarity and complementarity.
         """
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300
+@np.errstate(all="ignore")  # a point may contain 1e300
 def with_multipliers(
     qp: QP,
     x: Vector,
@@ -77,12 +78,12 @@ def with_multipliers(
     z: Vector | None = None,
     z_box: Vector | None = None,
 ) -> Solution:
-    """Complete a point with the best multipliers in place of None.
+    """Return a solution in which multipliers that are None are replaced by the best.
 
     Raises
     ------
     InputError
-        When the least-squares problem would have more than `MAX_ENTRIES` entries.
+        If the least-squares problem would have more than `MAX_ENTRIES` entries.
 
     """
     given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
@@ -105,7 +106,7 @@ def with_multipliers(
     for one in others:
         block[one.block] = True
     steps = NEWTON_STEPS if others and unknown & {"y", "z"} else 1
-    for _ in range(2):  # relative to the largest force, then to those of each component
+    for _ in range(2):  # relative to the largest force, then to forces by component
         scales = _Scales(1 / size, E)
         linearised = _Linearisation(qp.sets[1:], block, x, scales.reach())
         for k in range(steps):
@@ -131,27 +132,26 @@ def _worst(qp: QP, s: Solution) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Linearisation:
-    """Sets other than bounds, linearised at x and at a force."""
+    """Projections on discs and cones, linearised at x + τ·force."""
 
     sets: Sequence[ConvexSet]
     block: NDArray[
         np.bool_
-    ]  #: (n,) mask of their variables; all False if their multipliers are prescribed
+    ]  #: (n,) mask of the variables of the sets; all False if z_box is prescribed
     x: Vector  #: (n,)
     tau: float  #: step τ of the natural map
-    force: Vector | None = None  #: (n,); None if the sets can balance any force
-    #: apply the derivative to the residual as well: this converges more slowly than
-    #: Newton's method, but from a larger neighbourhood
+    force: Vector | None = None  #: (n,); None: sets balance any force
+    #: True for damped steps, which apply the derivative to the residual as well: they
+    #: converge more slowly than Newton's method, but from more distant points
     is_careful: bool = True
-    #: leave the part of the force that the natural map does not assign to the sets
+    #: True to assign to the sets only the part of a force that the natural map yields
     is_shared: bool = False
 
     def normal_part(self, force: Vector, *, shared: bool = True) -> Vector:
-        """Return the part (n,) of a force that is normal to the sets near x.
+        """Return the part (n,) of a force (n,) that is normal to the sets near x.
 
-        shared : use the natural map, which leaves a part of the force if x is not on
-        the
-            boundary; otherwise, return all of the force that is normal at some point
+        shared : use the natural map, which excludes a part of the force if x is not on
+            the boundary; otherwise, return the part that is normal at some point
         """
         total = np.zeros(self.x.size)
         if self.block.any():
@@ -172,14 +172,14 @@ class _Linearisation:
         return np.where(self.block, balanced - self.force + change, g)
 
     def derivative(self, forces: Any) -> Any:
-        """Apply the derivative of f − z at f = `force` to `forces` (n, k)."""
+        """Apply the derivative of f ↦ f − z at f = `force` to `forces` (n, k)."""
         if self.force is None:
             return np.where(self.block[:, None], 0.0, forces)
         left, at = forces.copy(), self.x + self.tau * self.force
         for j, along in enumerate(forces.T):
             size = np.abs(along[self.block]).max(initial=0.0)
             if size > 0:
-                # at the common apex of all cones the length is zero
+                # the norm is zero if all cones are at their apices: use 1
                 h = STEP * (float(np.abs(at[self.block]).max()) or 1.0) / size
                 for one in self.sets:
                     ends = one.project(at + h * along), one.project(at - h * along)
@@ -195,9 +195,9 @@ def _fitted(
     unknown: set[str],
     linearised: _Linearisation,
 ) -> Solution:
-    """Minimise the two sums over the unknown multipliers, with the others from `s`.
+    """Minimise both sums over the unknown multipliers; take the others from `s`.
 
-    g : (n,) Px + q and the forces of the multipliers of `s`
+    g : (n,) Px + q + Aᵀy + Gᵀz + z_box with the multipliers of `s`
     """
     lower, upper = s.x - qp.lb, qp.ub - s.x
     is_fixed = (qp.lb == qp.ub) & ("z_box" in unknown)
@@ -245,10 +245,10 @@ def _least_squares(
 ) -> tuple[Vector, Vector]:
     """Minimise ‖w(g + free·y + columns·ζ)‖² + ‖slack·ζ/E‖² over y and ζ ≥ 0.
 
-    y is eliminated by an orthonormal basis of the range of w·free. Linearly dependent
-    columns get the multiplier zero.
+    y is eliminated with an orthonormal basis of the range of w·free. Linearly dependent
+    columns of `free` receive the multiplier zero.
     """
-    from scipy.optimize import nnls  # loads slowly, and workers do not need it
+    from scipy.optimize import nnls  # loads slowly; workers do not need it
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)
@@ -256,7 +256,7 @@ def _least_squares(
     rank = int((size > RANK_TOLERANCE * size[:1].sum()).sum())
     Q, R = Q[:, :rank], R[:rank, :rank]
     norms = np.linalg.norm(w * columns, axis=0)
-    norms[norms == 0] = 1  # sets balance all of it
+    norms[norms == 0] = 1  # sets balance the whole column
     C, target = w * columns / norms, -scales.w * g
     price = np.divide(
         np.abs(slack), scales.E * norms, out=np.zeros(slack.size), where=slack != 0
@@ -264,7 +264,7 @@ def _least_squares(
     zeta = np.zeros(slack.size)
     if slack.size:  # without columns, scipy's nnls (1.17.1) would crash Python
         reduced = C - Q @ (Q.T @ C)
-        reduced -= Q @ (Q.T @ reduced)  # repeated to remove rounding in the range of Q
+        reduced -= Q @ (Q.T @ reduced)  # again, against rounding in the range of Q
         stacked = np.vstack([reduced, np.diag(price)])
         rhs = np.concatenate([target - Q @ (Q.T @ target), np.zeros(slack.size)])
         try:
@@ -280,11 +280,11 @@ def _least_squares(
 
 
 def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
-    """Return the rows or bounds whose multiplier could help.
+    """Return the rows or bounds whose slack is small enough for a multiplier.
 
     See `MAX_COMPLEMENTARITY_RATIO`.
 
-    norms : ‖w·aⱼ‖
+    norms : norms ‖w·aⱼ‖ of the rows aⱼ, weighted by w
     """
     return np.flatnonzero(
         (norms > 0) & (slack <= MAX_COMPLEMENTARITY_RATIO * E * norms)
@@ -292,7 +292,7 @@ def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
 
 
 def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:
-    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ, componentwise."""
+    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ for each component: (n,)."""
     price = np.divide(
         slack, scales.E * scales.w, out=np.zeros(slack.size), where=slack != 0
     )
@@ -300,7 +300,7 @@ def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:
 
 
 def _norms(M: Matrix, w: Vector) -> Vector:
-    """Return ‖w·aⱼ‖ of each row aⱼ of M."""
+    """Return the Euclidean norms ‖w·aⱼ‖ (m,) of the rows aⱼ of M (m, n)."""
     return np.asarray(np.sqrt(csr_array(M).power(2) @ w**2))
 
 

@@ -1,22 +1,23 @@
 """Proof of the optimal value of a small QP, for points that residuals cannot decide.
 
-Residuals bound the error of the objective only through two unknown quantities: the
-distance of the solution, and the size of the true multipliers. A reference solve,
-independent of the solvers under test, returns a point x̂ with multipliers λ̂ ≥ 0, which
-is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian L,
-convexity implies for the solution x*
+Residuals bound the error of the objective f only through two unknown quantities: the
+distance of the solution, and the size of the true multipliers. A reference solver,
+which is not under test, returns a point x̂ with multipliers λ̂ = (ŷ, ẑ, ẑ_box), ẑ ≥ 0.
+This point is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the
+Lagrangian L, convexity implies for the solution x* and the optimal value f* = f(x*)
 
-    f(x*) ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
+    f* ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
 
-evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for a point
-x̃ that satisfies the active rows exactly and differs from x̂ by rounding. The
-difference L(x̃, λ̂) − L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) plus a square of rounding, so that
-L(x̂, λ̂) equals f* up to the sum above. Two assumptions are not proven: the bound
-`MAX_DISTANCE` of |x*ᵢ − x̂ᵢ|, and the same bound for x̃.
+where L is evaluated in extended precision. Conversely, f* ≤ f(x̃) = L(x̃, λ̂) for a
+point x̃ that satisfies the active rows exactly and differs from x̂ by rounding. The
+difference L(x̃, λ̂) − L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) plus a term quadratic in the rounding, so
+that L(x̂, λ̂) equals f* up to the sum above. Two assumptions are not proven: the bound
+`MAX_DISTANCE` of |x*ᵢ − x̂ᵢ|, and the same bound of |x̃ᵢ − x̂ᵢ|.
 
-If the terms of the objective cancel, so that the sum leaves f* too uncertain, the KKT
-equations of the rows with a multiplier are solved in rational arithmetic. If the result
-satisfies all KKT conditions exactly, its value is f*, without any assumption.
+If the terms of the objective cancel, the sum may leave f* too uncertain. In this case,
+the KKT equations of the rows with a nonzero multiplier are solved in rational
+arithmetic. If the result satisfies all KKT conditions exactly, its objective is f*,
+without any assumption.
 """
 
 from __future__ import annotations
@@ -52,25 +53,25 @@ from mortarbench.harness.verify.kkt import (
 from mortarbench.harness.verify.rational import rational, solutions
 from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
-#: Largest number of coupled variables and rows of a QP that the reference solves; its
-#: dense solve takes a few times as long as that of a solver.
+#: Largest number of coupled variables and rows of a QP that the reference solver
+#: solves; its dense solve takes several times as long as the solve under test.
 MAX_COUPLED = 400
 #: Largest number of variables of such a QP; an uncoupled variable costs one division.
 MAX_VARIABLES = 4000
-#: Largest number of variables and rows of a QP whose operator P is assembled, by one
-#: product per variable.
+#: Largest number of variables and rows of a QP whose operator P is assembled, which
+#: takes one product per variable.
 MAX_ASSEMBLED = 800
 #: Largest number of unknowns of equations that are solved in rational arithmetic; the
 #: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
 #: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
-#: energy changes by E. The quadratic term alone gains E over √2 such lengths from its
-#: minimum. `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails
-#: with 0, and without a limit.
+#: energy changes by E. Over √2 such lengths from its minimum, the quadratic term alone
+#: changes by E. With 0 and with infinity,
+#: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
-#: Largest KKT residual of a reference point, beyond rounding, and the assumed distance
-#: of x̃ from x̂: the reference solve does not reach smaller residuals. With 1e-8,
+#: Largest KKT residual, beyond rounding, with which a reference point is accepted: the
+#: reference solver does not reach smaller residuals. With 1e-8,
 #: `test_residuals_refute_no_point_between_nearly_parallel_rows` fails.
 MAX_RESIDUAL = 1e-14
 
@@ -81,12 +82,13 @@ class Optimum:
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
-    doubt: float  #: bound of the error of f*, plus the rounding of an exact answer
+    doubt: float  #: bound of the error of f*, plus the rounding of f at an exact answer
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
     own: Vector  #: (n,) sizes that do not depend on energies, see `own_sizes`
 
 
+#: Function that returns the proven optimum of a QP, or None if the proof fails.
 Proves = Callable[[QP], Optimum | None]
 
 
@@ -97,12 +99,12 @@ def decided(
     tol: float,
     prove: Proves,
 ) -> float | None:
-    """Measure a point against the proven optimum; return None if residuals decide.
+    """Return the error of a point relative to the optimum; None if residuals decide.
 
     Residuals decide if they exceed 10·tol even with the most generous scales, if the QP
     is large, or if no optimum could be proven.
 
-    prove : returns the optimum, see `proves`
+    prove : returns the optimum; see `proves`
 
     Returns
     -------
@@ -201,19 +203,19 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
         if exact is not None:
             value, doubt, s = np.longdouble(exact.value), 0.0, exact.solution
             size = min(size, _size(qp, s))
-    # rounding x moves f by EPS·size, which limits the accuracy of f*
+    # rounding of x changes f by EPS·size, which limits the accuracy of f*
     magnitude = max(abs(float(value)), (doubt + EPS * size) / NEGLIGIBLE)
     work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
     least = energy_at(qp, s)
     if abs(value) > ROUNDING * max(work, least) + doubt:
-        # a share of 100·tol of this scale is half of the error `kkt_residuals` allows
+        # 100·tol of this scale is half of the error that `kkt_residuals` allows
         scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
     elif work > NEGLIGIBLE * least:  # f* vanishes
         scale = magnitude = work
     else:  # x* vanishes
         scale = magnitude = generous
     rounding = min(ROUNDING * size, NEGLIGIBLE * magnitude)
-    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # zero if all terms vanish
+    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # 0 if all terms vanish
         return None
     return Optimum(
         qp=qp,
@@ -226,7 +228,7 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve with the reference; return None unless the point is optimal to rounding."""
+    """Solve with the reference solver; return None unless optimal up to rounding."""
     try:
         point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -249,15 +251,15 @@ class ExactOptimum(NamedTuple):
 
 
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
-    """Compute an optimum in rational arithmetic; return None without a proof.
+    """Compute an optimum in rational arithmetic; return None if the proof fails.
 
     Sets other than bounds are not treated, since their optima are rarely rational.
 
-    The rows with a multiplier in `s` become equations. Unknowns that these equations
-    leave undetermined are set to zero. If the result is not optimal, they are set to
-    multipliers close to the least ones (`_least_multipliers`), and then to the values
-    of `s`. The solution of the equations must satisfy the KKT conditions of all rows
-    exactly.
+    The rows and bounds with a nonzero multiplier in `s` become equations. Unknowns that
+    the KKT equations leave undetermined are set to zero. If the result is not optimal,
+    undetermined multipliers are set close to the least ones (`_least_multipliers`); if
+    that fails, undetermined unknowns are set to the values of `s`. The result must
+    satisfy the KKT conditions of all rows and bounds exactly.
     """
     if len(qp.sets) > 1:
         return None
@@ -272,8 +274,9 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
 def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
     """Compute an optimum in rational arithmetic by primal-dual active-set steps.
 
-    Rows with multipliers of the wrong sign leave the set, and violated rows enter it.
-    Returns None if a set recurs, since the iteration would then cycle.
+    Rows with multipliers of the wrong sign leave the active set, and violated rows
+    enter it. The result is None if an active set recurs, since the iteration would
+    cycle, or if the equations of an active set have no solution.
     """
     if len(qp.sets) > 1:
         return None
@@ -307,7 +310,7 @@ class _ExactPoint(NamedTuple):
 
 
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
-    """Solve the KKT equations of the rows with a multiplier, for three guesses.
+    """Solve the KKT equations of the rows with a nonzero multiplier, for three guesses.
 
     The guesses set undetermined unknowns to zero, to values close to the least
     multipliers, and to the values of `s`.
@@ -371,7 +374,7 @@ def _exact(qp: QP, s: Solution, point: _ExactPoint) -> ExactOptimum:
 def _with_others(
     qp: QP, s: Solution, is_coupled: NDArray[np.bool_]
 ) -> ExactOptimum | None:
-    """Return the exact optimum, with each uncoupled variable computed alone."""
+    """Return the exact optimum, minimising over each uncoupled variable separately."""
     P = csr_array(qp.P)
     part = replace(
         qp,
@@ -407,7 +410,7 @@ def _dense(M: Any) -> Any:
 
 
 def proves(solve: Reference) -> Proves:
-    """Return a function that proves the optimum of each QP object once."""
+    """Return a function that proves optima, and caches them by the identity of QPs."""
     optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
@@ -423,12 +426,13 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 
 
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
-    """Return the least multipliers if the multipliers that balance the gradient vary.
+    """Return `s` with the least multipliers that balance the gradient.
 
-    Among all multipliers of the rows with a multiplier in `s`, they minimise the sum of
-    the squares of λᵢ times the terms of row i. A row whose sign would change gets the
-    multiplier zero. Returns `s` if the remaining rows do not balance the gradient up to
-    a negligible part, or if the QP has sets other than bounds.
+    Equality rows, fixed variables, and rows and bounds with a nonzero multiplier in `s`
+    receive multipliers λᵢ. These minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute
+    terms of row i. A row whose multiplier would change its sign is left out. `s` is
+    returned unchanged if the remaining rows do not balance the gradient up to a
+    negligible part, or if the QP has sets other than bounds.
     """
     if len(qp.sets) > 1:
         return s
@@ -461,7 +465,7 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
 
 def _size(qp: QP, s: Solution) -> float:
-    """Sum the absolute terms of f and of λᵀ(Bx − c), which scale their rounding."""
+    """Sum the absolute terms of f and of λᵀ(Bx − c), which bound their rounding."""
     x = np.abs(s.x)
     rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
     work = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)

@@ -2,17 +2,17 @@
 
 The mathematics is that of `harness.verify.substructured`; MPI reductions complete the
 sums. Each rank stores the components of its subdomains. A component on several ranks
-has the same value on all of them. Two kinds of data are replicated on all ranks: the
-rows of contact and friction, about as many as there are nodes on the sides, and the
-coarse problem.
+has the same value on each of these ranks. Two kinds of data are replicated on all
+ranks: the rows of contact and friction, whose number is similar to that of the nodes of
+the contact sides, and the coarse problem.
 
 If only contact supports a body, its rigid motions R are a few distributed columns, and
 products with Rᵀ are reductions in extended precision. The equilibrium of λ̂ with the
 load (`harness.verify.admissible.Balance`) requires only the load along R and the
 replicated motion of the contact rows.
 
-K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so the certificate
-contains no rounding of its assembly.
+K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so that the
+certificate includes no rounding from assembly.
 """
 
 from __future__ import annotations
@@ -67,11 +67,11 @@ from mortarbench.harness.verify.substructured import (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contact:
-    """Contact rows, followed by friction rows with a positive bound; replicated."""
+    """Contact rows, then friction rows with a positive bound; replicated on ranks."""
 
     rows: csr_array  #: (m, n) rows, with global components as columns
-    c: Vector  #: (m,)
-    bound: Vector  #: (k,) friction bounds of the last rows
+    c: Vector  #: (m,) right-hand sides
+    bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows of each tangential vector
 
 
@@ -83,7 +83,7 @@ class FloatingBodies:
     of all ranks.
     """
 
-    motions: csr_array  #: (n, k) rigid motions, body by body, regardless of supports
+    motions: csr_array  #: (n, k) rigid motions, ordered by body, regardless of supports
     #: (k, r) coefficients of motions that do not move prescribed components
     combinations: NDArray[np.float64]
     names: tuple[str, ...]  #: names of these bodies
@@ -91,22 +91,21 @@ class FloatingBodies:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalBodies:
-    """Part of decomposed bodies that one rank stores."""
+    """Subdomains of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    #: subdomains of the body; T has a column for each of its components
+    #: local subdomains; their T has a column for each local component
     parts: Substructures
-    components: NDArray[np.int64]  #: (n,) their global numbers, ascending
-    shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
-    coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
-    motions: int  #: number of columns of R on all ranks
+    components: NDArray[np.int64]  #: (n,) global numbers of components, ascending
+    shared: NDArray[np.bool_]  #: (n,) mask of components that are also on other ranks
+    coarse: NDArray[np.int64]  #: (r,) global numbers of local rigid motions
+    motions: int  #: number of rigid motions of all subdomains
     f: Vector  #: (N,) load; the load of a component is the sum over its copies
-    fixed: NDArray[np.int64]  #: (h,) positions in `components` of the prescribed ones
+    fixed: NDArray[np.int64]  #: (h,) positions of prescribed components
     contact: Contact
     floating: FloatingBodies
-    #: (n, n) K as assembled by a single process; None on several ranks. If an answer
-    #: moves bodies together with their supports, the rounding of K is part of the
-    #: problem
+    #: (n, n) K as assembled by a single process; None on several ranks. The rounding of
+    #: this K affects the error if an answer moves bodies together with their supports
     stored: csr_array | None = None
 
     @cached_property
@@ -123,13 +122,14 @@ class MPIReduction:
         mine = local.components[local.shared]
         interface = np.unique(np.concatenate(comm.allgather(mine)))
         self._size = interface.size
-        #: (n,) position of each component among all shared ones, else -1
+        #: (n,) position of each component among all shared components; -1 if not shared
         self._place = np.full(local.components.size, -1)
         self._place[local.shared] = np.searchsorted(interface, mine)
         first = np.full(interface.size, comm.size)
         first[self._place[local.shared]] = comm.rank
         lowest = np.min(comm.allgather(first), axis=0)
-        #: (n,) mask of the components that this rank counts: no lower rank stores them
+        #: (n,) mask of the components that no lower rank stores: this rank adds them to
+        #: sums
         self.is_owner = np.ones(local.components.size, dtype=bool)
         self.is_owner[local.shared] = lowest[self._place[local.shared]] == comm.rank
 
@@ -140,7 +140,7 @@ class MPIReduction:
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other ranks to components `at` (t,), or to all."""
+        """Add contributions of other ranks to v at components `at` (t,), or all."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)
@@ -150,21 +150,21 @@ class MPIReduction:
         return complete
 
     def along(self, M: Any, v: NDArray[Any]) -> NDArray[Any]:
-        """Return the global Mᵀv (k,) for sparse columns M (n, k) and v (n,)."""
+        """Return Mᵀv (k,), summed over all ranks, for sparse M (n, k) and v (n,)."""
         return self.summed(np.asarray(M.T @ np.where(self.is_owner, v, 0)))
 
     def total(self, *numbers: float) -> list[float]:
-        """Sum numbers over all ranks."""
+        """Sum each number over all ranks."""
         return [float(x) for x in self._local.ranks.total(np.array(numbers))]
 
     def gathered(self, alpha: Vector) -> Vector:
-        """Gather the coefficients of rigid motions of all ranks."""
+        """Gather the coefficients of the rigid motions of all subdomains."""
         whole = np.zeros(self._local.motions)
         whole[self._local.coarse] = alpha
         return self.summed(whole)
 
     def local_part(self, alpha: Vector) -> Vector:
-        """Return the coefficients of the local rigid motions."""
+        """Extract the coefficients of the local rigid motions."""
         return np.asarray(alpha[self._local.coarse])
 
     def values_at(self, v: NDArray[Any], at: NDArray[np.int64]) -> Any:
@@ -178,7 +178,7 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of global components (w,), and a mask of these."""
+        """Return local positions of components `at` (w,), and a mask of local ones."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at
@@ -190,7 +190,7 @@ class MPIReduction:
         """
         r, comm = self._local.motions, self._local.ranks.comm
         place = self._place[at]
-        # components of a single rank enter its own matrix; only shared ones are sent
+        # unshared components enter the local matrix; only shared components are sent
         inner, jointly = place < 0, place >= 0
         S_inner = csr_array(S[inner])
         mine = coo_array(M - S_inner.T @ scaled_rows(S_inner, scale[inner]))
@@ -212,14 +212,14 @@ class MPIReduction:
         return csr_array(whole - S_all.T @ scaled_rows(S_all, np.max(weights, axis=0)))
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300, as in `certify`
+@np.errstate(all="ignore")  # a point may contain 1e300, as in `certify`
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
-    """Bound the error of an answer; all ranks call this and get the same bound.
+    """Bound the error of an answer; all ranks must call this and get the same bound.
 
-    The pairs tried are those of `harness.verify.certificate.certify`, except for the
-    exchange of rows.
+    The same pairs are tried as in `harness.verify.certificate.certify`, except for the
+    pair that results from an exchange of closed rows.
 
     Parameters
     ----------
@@ -228,12 +228,12 @@ def certify_over_ranks(
 
     Returns
     -------
-    a certificate; its `u` and `off` contain local components and subdomains only
+    a certificate, whose `u` and `off` contain only local components and subdomains
 
     Raises
     ------
     UncertifiableError
-        When the answer holds NaN or inf, or no admissible pair is found near it.
+        If the answer holds NaN or inf, or no admissible pair is found near it.
 
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
@@ -293,10 +293,12 @@ def _admissible_pair(
 ) -> tuple[Extended, Extended, Extended]:
     """Return û at the components in rows (w,), û at local components (n,), and λ̂.
 
+    trace : global components in rows (w,), and 1/Kᵢᵢ (w,) and u (w,) at these
+
     Raises
     ------
     UncertifiableError
-        When no admissible pair near the answer is found.
+        If no admissible pair near the answer is found.
 
     """
     at, softness, start = trace
@@ -312,7 +314,7 @@ def _admissible_pair(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows, restricted to their w components, and 1/Kᵢᵢ (w,)."""
+    """Return the rows, restricted to their w components, and 1/Kᵢᵢ (w,); 0 if fixed."""
     contact = local.contact
     B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
@@ -341,17 +343,17 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
 class _RigidMotions:
     """Rigid motions that the supports allow, and the equilibrium of loads along them.
 
-    Columns are orthonormal in extended precision, with the inner product over the
-    components of all ranks. K_T is exactly zero along them.
+    Columns are orthonormal in extended precision, in the inner product over the
+    components of all ranks. Products of K_T with these motions are exactly zero.
     """
 
     #: (n, r) sparse, at local components. The first p motions change gaps
     #: ("constrained"); the others ("free") change gaps by rounding only
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
-    together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
+    together: NDArray[np.float64]  #: (motions, r) coefficients in subdomain motions
     balance: Balance  #: equilibrium of the load along constrained motions
-    driven: str = ""  #: error message for a load along free motions, if there is one
+    driven: str = ""  #: error message if a free motion has a load, else empty
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:
         """Subtract the free motions from v (n,)."""
@@ -390,7 +392,7 @@ def _rigid_motions(
         )
 
     def at_components(R: Any) -> NDArray[Any]:
-        """Return columns (n, k) at the components `at`, over all ranks: (w, k)."""
+        """Return the rows (w, k) of distributed columns R (n, k) at components `at`."""
         columns = (R[:, [k]].toarray().ravel() for k in range(R.shape[1]))
         return np.stack([reduction.values_at(column, at) for column in columns], axis=1)
 
@@ -429,9 +431,10 @@ def _rigid_motions(
 
 
 def _orthonormal(local: LocalBodies, R: csr_array) -> Any:
-    """Orthonormalise sparse columns (n, r) that are orthonormal to double precision.
+    """Orthonormalise sparse columns R (n, r) in extended precision.
 
-    One step of R(3I − RᵀR)/2 squares their error.
+    The columns are orthonormal to double precision. One iteration, R(3I − RᵀR)/2,
+    squares the error of RᵀR = I.
     """
     R = csr_array(R.astype(Real))
     owned = R[local.reduction.is_owner]
@@ -449,14 +452,14 @@ def _largest(local: LocalBodies, R: Any) -> Extended:
 class _OnRanks:
     """Bodies distributed over ranks; see `harness.verify.substructured.Split`.
 
-    K is not assembled. The residual is that of TᵀK_T T, with the exact kernels of the
-    subdomains. E is estimated by sampling the rounding of double precision.
+    K is not assembled. Residuals are evaluated with TᵀK_T T and the exact kernels of
+    the subdomains. E is estimated by sampling the rounding of double precision.
     """
 
     def __init__(self, local: LocalBodies) -> None:
         """Compute the data that are common to all pairs."""
         self._local = local
-        #: (w,) components that the rows touch
+        #: (w,) global components that occur in rows
         self.at = np.unique(local.contact.rows.indices).astype(np.int64)
         self.exact, self.softness = _at_rows(local, self.at)
         self.rigid = _rigid_motions(local, self.exact, self.at)

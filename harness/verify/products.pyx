@@ -24,8 +24,7 @@ def times_columns(
     const double[::1] data, const index[::1] indices, const index[::1] indptr,
     const long double[::1] x, Py_ssize_t rows,
 ):
-    """Return Mx (rows,) for M in CSC, with double entries, and x in extended precision.
-    """
+    """Return Mx (rows,) for double M in CSC format and x in extended precision."""
     product = np.zeros(rows, dtype=np.longdouble)
     cdef long double[::1] y = product
     cdef long double x_j
@@ -41,7 +40,7 @@ def times_rows(
     const double[::1] data, const index[::1] indices, const index[::1] indptr,
     const long double[::1] x,
 ):
-    """Return Mx for M by rows (CSR), its entries doubles, x extended."""
+    """Return Mx for double M in CSR format and x in extended precision."""
     product = np.empty(indptr.shape[0] - 1, dtype=np.longdouble)
     cdef long double[::1] y = product
     cdef long double y_i
@@ -59,10 +58,11 @@ def projected_products(
     const double[:, ::1] R, const long long[::1] starts,
     const real[::1] v, real[::1] found,
 ):
-    """Write PMP v_s, for parts v_s (n,) of v (N,), to the same places of `found` (N,).
+    """Write PMP v_s to `found` (N,) for each slice v_s (n,) of v (N,).
 
     P = I − RRᵀ; M (n, n) in CSC format and orthonormal R (n, r), r ≤ 6, are doubles.
-    The parts begin at `starts`; `found` is not changed where a part is zero.
+    Slices of v and `found` begin at `starts`. If a slice of v is zero, the slice of
+    `found` is not changed.
     """
     cdef Py_ssize_t n = indptr.shape[0] - 1, s, first, i, j, k
     part = np.empty(n, dtype=np.double if real is double else np.longdouble)

@@ -11,14 +11,14 @@ from scipy.sparse import csr_array
 
 
 def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
-    """Solve Mx = b by Gauss-Jordan elimination; return None without a solution.
+    """Solve Mx = b by Gauss-Jordan elimination; return None if no solution exists.
 
     M, b : arrays of fractions
 
     Returns
     -------
-    a function that maps a guess (n,) to the solution that agrees with the guess in all
-    unknowns without a pivot
+    a function that maps a guess (n,) to the solution (n,) that agrees with the guess in
+    all unknowns without a pivot
 
     """
     rows, pivots = np.column_stack([M, b]), list[int]()
@@ -51,8 +51,8 @@ def nonnegative_solution(M: Any, b: Any) -> Any | None:
 
     Phase one of the method minimises the sum of one artificial variable per row.
     Bland's rule (1977) selects the first column with a negative cost and, among the
-    binding rows, the one with the first basic variable. No basis recurs, so degenerate
-    steps terminate.
+    binding rows, the row whose basic variable has the lowest index. No basis recurs, so
+    that the method terminates in spite of degenerate steps.
 
     M, b : arrays of fractions
     """
@@ -80,7 +80,7 @@ def nonnegative_solution(M: Any, b: Any) -> Any | None:
 
 
 def rational(v: Any) -> Any:
-    """Convert an array of doubles to fractions, exactly."""
+    """Convert an array of doubles to an array of exactly equal fractions."""
     exact = np.empty(v.shape, dtype=object)
     exact.ravel()[:] = [Fraction(float(value)) for value in v.ravel()]
     return exact

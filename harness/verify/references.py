@@ -1,10 +1,11 @@
-"""Reference solutions of contact problems, more accurate than those of solvers.
+"""Reference solutions of contact problems, with certified error bounds.
 
-An injected reference solver, which is not under test, identifies the closed rows from
-the dual QP of the contact rows. `harness.verify.active_set_refinement` then computes
-the solution in extended precision, and `harness.verify.certificate` bounds its error.
-Only the states of the rows and the multipliers (for the directions of slip) are cached
-in a file; when read, they serve as an initial guess.
+An injected reference solver, which is not under test, solves the dual QP of the contact
+and friction rows. Its solution identifies the closed rows, which hold with equality:
+contacts that touch and friction that sticks. `harness.verify.active_set_refinement`
+then computes the solution in extended precision, and `harness.verify.certificate`
+bounds its error. The cache contains only the states of the rows and the multipliers,
+which determine the directions of slip. These serve as an initial guess for a later run.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-MAX_CACHED_BOUND = 1e-7  #: larger error bounds discard the cached states
+MAX_CACHED_BOUND = 1e-7  #: cached states that yield a larger bound are discarded
 #: Names and types of the cached arrays.
 STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 
@@ -47,10 +48,10 @@ class UnsolvedError(Exception):
 class ReferencePoint:
     """A solution of the elastic problem, and a certified bound of its error."""
 
-    u: Extended  #: (n,) admissible
+    u: Extended  #: (n,) admissible displacement
     multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
-    equilibrium: Extended  #: u_λ (n,)
-    states: States  #: (m,) closed, or at a bound of the multiplier
+    equilibrium: Extended  #: u_λ (n,), in equilibrium with the multipliers
+    states: States  #: (m,) row closed, or multiplier at a bound
     norm: float  #: ‖u‖_K
     bound: float  #: certified relative error, as `Certificate.bound`
 
@@ -65,14 +66,15 @@ def reference_point(
 ) -> ReferencePoint:
     """Solve the elastic problem of a case, starting from cached states if available.
 
-    solve : identifies the closed rows from min ½λᵀFλ − dᵀλ with RᵀBᵀλ = Rᵀf, λ ≥ 0 for
-        contact and |λ| ≤ g for friction
-    folder : cache of the states, with a file per problem; None for no cache
+    solve : solves the dual QP, min ½λᵀFλ − dᵀλ subject to RᵀBᵀλ = Rᵀf, λ ≥ 0 for
+        contact and ‖λ‖ ≤ g for friction
+    folder : directory of cached states, with a file for each problem; None to disable
+        the cache
 
     Raises
     ------
     UnsolvedError
-        When no admissible pair is found, or `solve` fails.
+        If no admissible pair is found, or `solve` fails.
 
     """
     mechanics = mechanics.whole
@@ -107,7 +109,7 @@ def _stored(path: Path, exact: Exact) -> ActiveSet | None:
     if not fits or (np.abs(states) > 1).any() or not np.isfinite(multipliers).all():
         return None
     states = np.where(exact.contact & (states == UPPER), CLOSED, states)
-    # a large value, of which `predicted` uses only the direction
+    # the multipliers replace the motion, of which only the direction matters
     pushed = predicted(
         exact.forces, 0 * multipliers.astype(Real), exact.compliance, multipliers
     )
@@ -135,8 +137,8 @@ def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
     """Guess the states of the rows from the solution of the dual QP.
 
-    If there are no rows, or too many for a dense matrix, the guess follows from the
-    displacement without contact.
+    If there are no rows, or if supports fix all bodies and the rows are too many for a
+    dense matrix, the guess follows from the displacement without contact.
     """
     inverse = mechanics.inverse
     R, exact = (

@@ -6,15 +6,16 @@
 #include <math.h>
 
 enum {
-    /* Largest ratio of the terms of the objective to itself that counts: 10·tol of the
-       terms is then 1e-3 of the objective at tol 1e-8, three digits. Without it,
+    /* Largest ratio of the scale of energy to the objective: at tol 1e-8, 10·tol times the
+       scale is then at most 1e-3 of the objective, which is three digits. Without it,
        `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails. */
     MAX_CANCELLATION = 10000,
-    /* Violations, and errors of the objective, are compared with this times their terms:
-       an answer is wrong beyond 100·tol of its terms, and residuals are allowed 10·tol.
+    /* Violations and errors of the objective are divided by this factor times their terms:
+       since residuals of up to 10·tol are accepted, so are errors of 100·tol of the terms.
        With 100, `test_a_narrow_box_lends_no_length_to_a_row` fails. */
     TERMS_FACTOR = 10,
-    /* Largest size of a variable, in lengths over which the energy changes by all of it.
+    /* Largest size of a variable, in units of the length over which the energy changes
+       by E.
        `test_a_wrong_point_is_refuted_by_its_residuals` (case 15) fails with 1e5,
        `test_a_row_between_variables_that_are_long_is_met_to_their_digits` with 10. */
     MAX_LENGTHS = 1000
@@ -34,8 +35,8 @@ FORMULA largest(double a, double b)
 }
 
 /* The scale of energy of a point: the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|,
-   but at most MAX_CANCELLATION times the objective, or 1/MAX_CANCELLATION of itself where
-   the objective vanishes. */
+   but at most MAX_CANCELLATION times the absolute objective; if the objective vanishes,
+   1/MAX_CANCELLATION of that largest term. */
 FORMULA energy_scale(double quadratic, double linear, double work)
 {
     double terms = largest(largest(fabs(quadratic), fabs(linear)), fabs(work));
@@ -43,9 +44,9 @@ FORMULA energy_scale(double quadratic, double linear, double work)
     return least(terms, largest(MAX_CANCELLATION * value, terms / MAX_CANCELLATION));
 }
 
-/* The size of a variable: |x|, at least the length l over which the energy E is spent, the
-   least of √(E/Pⱼⱼ) and E/|qⱼ|, and at most MAX_LENGTHS·l. Infinite without curvature and
-   cost. */
+/* The size of a variable: |x|, but at least l and at most MAX_LENGTHS·l, where l is the
+   length over which the energy changes by E, the smaller of √(E/Pⱼⱼ) and E/|qⱼ|. Infinite
+   if the variable has neither curvature nor cost. */
 FORMULA variable_size(double energy, double linear, double curvature, double x)
 {
     double length = curvature > 0 ? sqrt(energy / curvature) : INFINITY;
@@ -53,21 +54,21 @@ FORMULA variable_size(double energy, double linear, double curvature, double x)
     return largest(least(fabs(x), MAX_LENGTHS * length), length);
 }
 
-/* |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which others shift the minimum along j; 0 without
-   curvature. */
+/* |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, the distance by which the other variables shift the
+   minimum along j; 0 if Pⱼⱼ = 0. */
 FORMULA minimum_shift(double Px, double curvature, double x)
 {
     return curvature > 0 ? fabs(Px - curvature * x) / curvature : 0;
 }
 
-/* The size of a variable without any energy. */
+/* The size oⱼ of a variable, computed without a scale of energy. */
 FORMULA own_size(double Px, double curvature, double x)
 {
     return TERMS_FACTOR * (fabs(x) + minimum_shift(Px, curvature, x));
 }
 
-/* The scale of the violation of a row or bound: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, if bᵢ ≠ 0, the terms of
-   the row itself if these are smaller; `sizes` and `own` are the sums for both. */
+/* The scale of the violation of a row or bound: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, if bᵢ ≠ 0 and this is
+   smaller, TERMS_FACTOR·|bᵢ| + Σ|aᵢⱼ|oⱼ. `sizes` and `own` are the two sums. */
 FORMULA row_scale(double rhs, double sizes, double own)
 {
     return rhs > 0 ? least(rhs + sizes, TERMS_FACTOR * rhs + own) : rhs + sizes;
@@ -80,15 +81,15 @@ FORMULA ratio(double error, double scale)
     return error == 0 ? 0 : size;
 }
 
-/* The excess of an error over its rounding; infinite rounding does not count. */
+/* The excess of an error over its rounding; infinite rounding is not subtracted. */
 FORMULA beyond(double error, double rounding)
 {
     return largest(fabs(error) - (rounding < INFINITY ? rounding : 0), 0);
 }
 
-/* |rᵢ| relative to the largest of its terms, `own`, or the energy |rᵢ|Dᵢ relative to E if
-   that is less. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i, but no
-   more than the `room` to the bound in that direction. */
+/* |rᵢ| relative to `own`, the largest of its terms, or the energy |rᵢ|Dᵢ relative to E if
+   that ratio is smaller. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i,
+   but no more than the `room` to the bound in that direction. */
 FORMULA balance_error(double error, double own, double step, double x, double room,
                       double energy)
 {

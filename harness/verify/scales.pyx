@@ -1,9 +1,9 @@
 # cython: language_level=3, cdivision=True
-"""Scales and errors of KKT residuals for arrays, component by component.
+"""Componentwise scales and errors of KKT residuals for arrays.
 
-The formulas are in `scales.h`. Here they are NumPy ufuncs, which also accept vectors
-distributed over ranks. The module is compiled when the package is installed;
-`scales.pyi` declares its types.
+The formulas are in `scales.h`. This module provides them as NumPy ufuncs, which also
+accept vectors distributed over ranks. The module is compiled when the package is
+installed; `scales.pyi` declares its types.
 """
 
 cimport cython

@@ -4,28 +4,30 @@ The certificate (`harness.verify.certificate`) is formulated for a stiffness
 
     K = TᵀK_T T + E,      K_T = diag(K_1 … K_S),
 
-where the kernel of every K_s consists exactly of the rigid motions of its subdomain,
-and E is rounding. For admissible û and λ̂ it requires two vectors: the residual ρ = Kû
-− f + Bᵀλ̂ on components without support, in extended precision and with the stored K,
-and a solution d of
+where T maps the n components of a displacement to their N copies in S subdomains, the
+kernel of every K_s consists exactly of the rigid motions of its subdomain, and E is
+rounding. For admissible û and λ̂, the certificate requires two vectors: the residual
+ρ = Kû − f + Bᵀλ̂ on components without support, in extended precision and with the
+stored K, and a solution d of
 
     TᵀK_T d = ρ                                                                  (5)
 
 in double precision, whose residual is measured. An undivided body is a single
 subdomain, T = I, with its supports eliminated: d = K⁺ρ (`Undivided`). For decomposed
-bodies, forces b with Tᵀb = ρ that are in equilibrium on every subdomain, R_Tᵀb = 0, are
-those of balancing domain decomposition (Mandel 1993). Copies are weighted by their
-stiffness W,
+bodies, ρ is distributed over the subdomains as in balancing domain decomposition
+(Mandel 1993). The forces b with Tᵀb = ρ are in equilibrium on every subdomain,
+R_Tᵀb = 0, where the columns of R_T are the rigid motions of subdomains. With the
+diagonal matrix W of the stiffnesses of all copies,
 
     b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
       Z = W − WT(TᵀWT)⁻¹TᵀW
 
-where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on the others: the
+where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all others: the
 range of Z contains the gluing and support forces. Then K_T d = b is a small Neumann
 problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three rows per plane
 subdomain. It is singular along motions of whole bodies that only contact resists; λ̂
 balances the load along these motions (`harness.verify.admissible.balanced`).
-Multipliers of gluing and supports in an answer are not used.
+The multipliers of gluing and supports in an answer are not used.
 """
 
 from __future__ import annotations
@@ -51,52 +53,51 @@ from mortarbench.harness.mechanics import (
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.verify.products import times_columns
 
-#: Safety factor of the relative difference of the energies in K and K_T. It is
-#: estimated at û. The difference is largest for the softest displacements, and û is
-#: among these.
+#: Safety factor for the relative difference of the energies in K and K_T, which is
+#: estimated at û. The difference is largest for soft displacements such as û.
 SAFETY = 16
-#: Error of a sum over one row of K in `sample`, in units in the last place, with random
-#: signs. The measured standard deviation is 0.4 to 0.5 for sums in extended precision,
-#: and 0.2 to 3.6 for the stored K u against TᵀK_T T u.
+#: Error of the sum over a row of K in `sample`, with a random sign, in units in the
+#: last place. The measured standard deviation is 0.4 to 0.5 for sums in extended
+#: precision, and 0.2 to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
-#: Part of that error with the sign of u, in the same unit. Random signs may miss the
-#: few soft modes of a slender body: with ¼, the error of a plate 60 : ½ exceeded its
-#: bound by 1 %.
+#: Error of the same sum with the sign of u, in units in the last place. Random signs
+#: may fail to excite the few soft modes of a slender body: with ¼, the error of a plate
+#: 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
-#: Relative size of a correction of d that ends the refinement. Bounds are reported to
-#: fewer digits.
+#: Relative norm of a correction of d below which the refinement ends. Bounds are
+#: reported to fewer digits.
 REFINEMENT_TOLERANCE = 1e-6
 
 
 class Split(Protocol):
     """Operations of the certificate with K = TᵀK_T T + E.
 
-    Vectors of components (n,) have extended precision, and are zero on fixed
-    components. Columns of R are the rigid motions that the supports allow; the first
-    ones change contact gaps.
+    Vectors (n,) of components have extended precision and are zero on fixed components;
+    vectors (N,) contain the copies of components in all subdomains. Columns of R are
+    the rigid motions that the supports allow; the first p columns change contact gaps.
     """
 
     def along(self, v: Extended) -> Extended:
-        """Return Rᵀv (r,)."""
+        """Return the coefficients Rᵀv (r,)."""
 
     def motion(self, alpha: Extended) -> Extended:
-        """Return Rα (n,)."""
+        """Return the rigid motion Rα (n,)."""
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f with the stored K, and K_T v for v = T(u − Rα)."""
+        """Return Ku − f with the stored K, and K_T v for v = T(u − RRᵀu)."""
 
     def pulled(self, multipliers: Extended) -> Extended:
-        """Return Bᵀλ (n,)."""
+        """Return the contact forces Bᵀλ (n,)."""
 
     def spread(self, u: Extended) -> Extended:
-        """Return Tu (N,)."""
+        """Return the copies Tu (N,) of u (n,)."""
 
     def joined(self, b: Extended) -> Extended:
-        """Return Tᵀb (n,)."""
+        """Return the sums Tᵀb (n,) over the copies of each component."""
 
     def averaged(self, v: Extended) -> Extended:
-        """Average copies v (N,) of components (n,), after `Sharing.matched`."""
+        """Average the copies v (N,) of components (n,), after `Sharing.matched`."""
 
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
@@ -105,26 +106,32 @@ class Split(Protocol):
         """Return a solution d (N,) of (5) in double precision, for ρ with Rᵀρ = 0."""
 
     def total(self, *numbers: float) -> list[float]:
-        """Add numbers over all subdomains."""
+        """Sum each number over all processes."""
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along `supported` (p, h) combinations of motions that change gaps."""
+        """Bound E along combinations `supported` (p, h) of motions that change gaps."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Ew (n,) and |wᵀEw| for w with Rᵀw = 0, nonzero on fixed components."""
+        """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.
+
+        Unlike other vectors, w may be nonzero on fixed components.
+        """
 
     def scattered(self, v: Extended) -> Extended:
-        """Return √((R∘R)ᵀ(v∘v)) (r,), the size of Rᵀv for random signs of v (n,)."""
+        """Return the standard deviation (r,) of Rᵀv for random signs of v (n,).
+
+        This is √((R∘R)ᵀ(v∘v)).
+        """
 
     def noise(self, u: Extended) -> Extended:
         """Return a sample (n,) of the rounding of Ku − f in `residual`."""
 
 
 class Residual(NamedTuple):
-    """Residual of a displacement u, and its product without the rigid motion Rα."""
+    """Residual of a displacement u, and products of its deformation u − RRᵀu."""
 
     rho: Extended  #: (n,)  Ku − f
-    v: Extended  #: (N,)  T(u − Rα)
+    v: Extended  #: (N,)  T(u − RRᵀu)
     Kv: Extended  #: (N,)  K_T v
     theta: float  #: estimated relative difference of the energies of u in K and K_T
 
@@ -141,14 +148,14 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) for the same e; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
 class Neighbour(NamedTuple):
-    """The equilibrium u_λ near a displacement û, given by d = Tû − u_λ."""
+    """Displacement u_λ in equilibrium, near û, represented by d = Tû − u_λ."""
 
-    d: Extended  #: (N,) computed part
+    d: Extended  #: (N,) computed approximation
     Kd: Extended  #: (N,) K_T d
     left: float  #: bound of the energy norm of the error of d
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
@@ -163,8 +170,9 @@ def without_rigid_motion(split: Split, v: Extended) -> Extended:
 def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
-    The last step is not added; it bounds the error instead. If each step is at most q
-    times the previous one, the remaining steps sum to at most size/(1 − q).
+    The last correction is not added; it bounds the error instead. If the norm of each
+    correction is at most q times that of the previous one, the norms of the omitted
+    corrections sum to at most size/(1 − q), where `size` is the norm of the last one.
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
@@ -193,14 +201,17 @@ def length(split: Split, force: Extended) -> float:
 def sample(
     variances: Vector, u: Extended, components: NDArray[np.int64], real: Any
 ) -> Extended:
-    """Return a sample (n,) of the rounding of a product with u in the precision `real`.
+    """Return a sample (n,) of the rounding of Ku in the precision `real`.
 
     The error of each sum is a few units in the last place of √`variances`, the root of
-    the sum of its squared terms. It has two parts: RANDOM_ULPS with a random sign,
-    which excites all modes, and SMOOTH_ULPS with the sign of u, which is softer than
-    most modes. The random sign is a hash of the component number (n,), so that ranks
-    agree on it. The hash is splitmix64, since signs that alternate too regularly do no
-    work along smooth modes.
+    the sum of the squared terms. It has two parts: RANDOM_ULPS with a random sign,
+    which excites all modes, and SMOOTH_ULPS with the sign of u, since u is softer than
+    most modes. The random sign is a hash of the number of the component, so that all
+    ranks use the same sign. The hash is splitmix64: signs that alternate too regularly
+    would do no work along smooth modes.
+
+    variances : (n,) sums of the squared terms
+    components : (n,) global numbers of the components
     """
     x = components.astype(np.uint64) + np.uint64(1)
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
@@ -241,9 +252,10 @@ class _Stored(ABC):
         return v
 
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
-        """Return Ku, and vᵀKv and v for v = u − Rα.
+        """Return Ku, the energy vᵀKv of the deformation v = u − RRᵀu, and v.
 
-        Ku is Kv + (KR)α. The terms of KR cancel, so it is stored with twice the digits.
+        Ku is evaluated as Kv + (KR)Rᵀu. The terms of KR cancel, so that KR is stored
+        with twice the digits.
         """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u
@@ -264,7 +276,8 @@ class _Stored(ABC):
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Kw − TᵀK_T Tw on free components, and the difference of the energies.
 
-        If w moves bodies far together with their supports, the terms of Kw cancel.
+        Kw is computed by `cancelling`: if w moves bodies far together with their
+        supports, the terms of Kw cancel.
         """
         K, v = csr_array(self.mechanics.primal.P), self.spread(w)
         Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
@@ -310,7 +323,7 @@ class Undivided(_Stored):
         return np.asarray(self.mechanics.apply_inverse(rho), dtype=np.float64)
 
     def noise(self, u: Extended) -> Extended:
-        """Return a sample of the rounding of Kv, v = u − Rα."""
+        """Return a sample (n,) of the rounding of Kv with v = u − RRᵀu."""
         K = csc_array(self.mechanics.primal.P).power(2)
         deformed = without_rigid_motion(self, u)
         variances = K @ deformed.astype(np.float64) ** 2
@@ -327,14 +340,14 @@ class Undivided(_Stored):
 
 
 class Reduction(Protocol):
-    """Completion of sums over subdomains that are stored elsewhere.
+    """Completion of sums over subdomains by contributions of other processes.
 
     Components (n,) belong to the local subdomains, coarse unknowns (r,) to all
     subdomains.
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other processes to components `at` (t,), or to all."""
+        """Add contributions of other processes to v at components `at` (t,), or all."""
 
     def gathered(self, alpha: Vector) -> Vector:
         """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
@@ -350,10 +363,10 @@ class Reduction(Protocol):
 
 
 class Sharing:
-    """Distribution of forces ρ over subdomains, such that each is in equilibrium.
+    """Distribution of forces ρ such that each subdomain is in equilibrium.
 
-    Z acts only on interfaces and fixed components: for a component with a single copy,
-    W − WT(TᵀWT)⁻¹TᵀW vanishes.
+    The matrix Z of the module docstring acts only on interfaces and fixed components:
+    for a component with a single copy, W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
 
     def __init__(
@@ -367,6 +380,7 @@ class Sharing:
 
         Parameters
         ----------
+        parts : subdomains of this process
         fixed : prescribed components
         floating : (r, q) coefficients in R_T of the motions that the supports allow
         reduction : completes sums over subdomains
@@ -420,10 +434,12 @@ class Sharing:
         return np.asarray(b)
 
     def matched(self, v: Extended) -> Extended:
-        """Subtract the rigid motions Rα that minimise jumps of v (N,), weighted by Z.
+        """Subtract from v (N,) the rigid motions of subdomains that minimise jumps.
 
-        RᵀZ(v − Rα) = 0 is the coarse problem of the balance of forces. On fixed
-        components the jump is the difference from zero.
+        A jump is the difference between copies of a component, or from zero if the
+        component is fixed; jumps are weighted by Z. The coefficients α of the motions
+        satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the coarse problem for
+        forces.
         """
         x, reduction = v[self._rows].astype(np.float64), self._reduction
         pulls = reduction.completed(self._T.T @ (self._w * x), self._at)
@@ -441,7 +457,7 @@ def scaled_rows(M: csr_array, scale: Vector) -> csr_array:
 
 
 def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
-    """Return x ↦ A⁺x for A with the given kernel (r, q), by fixing q components."""
+    """Return a generalised inverse of A with `kernel` (r, q), fixing q components."""
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     free = np.setdiff1d(np.arange(A.shape[0]), pins)
     factor = splu(

@@ -35,7 +35,8 @@ from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
 from mortarbench.harness.verify.optimum import Proves, decided
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
-#: Version of the data that form a run_id, independent of the schema of records.
+#: Version of the data from which a run_id is computed, independent of the schema of
+#: records.
 IDENTITY = 1
 
 
@@ -97,10 +98,10 @@ def judged(
     prove: Proves | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> Record:
-    """Return a record with the claims of an answer `s`, its residuals and its verdict.
+    """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
     prove : returns the proven optimum of `qp`; called if residuals cannot decide
-    values : residuals and objective, if ranks have evaluated them
+    values : residuals and objective as evaluated by ranks; None to evaluate them here
     """
     record = record.replace(
         sizes=qp.sizes,
@@ -116,7 +117,7 @@ def judged(
         residuals = Residuals(*(values[name] for name in Residuals._fields))
         objective = values["objective"]
     else:
-        with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
+        with np.errstate(all="ignore"):  # a point may contain NaN, inf, or 1e300
             residuals = kkt_residuals(qp, s)
             objective = qp.objective(s.x)
     tol, error, margin = record.judged_at, None, None
@@ -129,7 +130,9 @@ def judged(
             else f"no feasible point: Farkas certificate with a margin of {margin:.1e}",
         )
     elif s.status is Status.INFEASIBLE:
-        record = noted(record, "claims of infeasibility are not examined by ranks")
+        record = noted(
+            record, "claims of infeasibility are not examined for distributed QPs"
+        )
     if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
     decided_by = "residuals" if error is None else "reference"
@@ -145,28 +148,31 @@ def judged(
 
 
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Return the physical quantities of a point, and a note on failure."""
+    """Return the physical quantities of a point, and a note on failure.
+
+    The note is empty on success; both are empty if the answer has no finite point.
+    """
     if not has_point(s):
         return {}, ""
     try:
-        with np.errstate(all="ignore"):  # a point may hold 1e300
+        with np.errstate(all="ignore"):  # a point may contain 1e300
             return plain(case.quantities(s)), ""
-    except Exception as e:  # code of the family must not lose the record
+    except Exception as e:  # errors of the family must not lose the record
         return {}, note_of("quantities", e)
 
 
 def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Bound the error of a point; return fields of its record, and a note on failure.
+    """Bound the error of a point; return fields of a record, and a note on failure.
 
-    ``energy_bound`` bounds the errors of the answer and of û and u_λ
-    (`harness.verify.certificate`). ``certificate`` contains its components, relative to
-    a lower bound of ‖u*‖: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` =
-    √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer alone), `moved` = ‖u − û‖, and
-    `friction`, the frictional part of `work`. `seminorm` is 1 if bodies can move
-    rigidly; these motions are not bounded.
+    ``energy_bound`` bounds the errors of the answer and of the displacements û and u_λ
+    that prove the bound (`harness.verify.certificate`). ``certificate`` contains the
+    components of the bound, relative to a lower bound of ‖u*‖: `pair` = √(2(J − D)),
+    `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer
+    alone), `moved` = ‖u − û‖, and `friction`, the frictional part of `work`. `seminorm`
+    is 1 if bodies can move rigidly; the errors of these motions are not bounded.
 
-    Without mechanics, a positive `least_eigenvalue` of an operator P bounds the error
-    of x in the norm of P (`certify_by_eigenvalue`).
+    If the case has no mechanics, a positive `least_eigenvalue` of an operator P yields
+    a bound of the error of x in the norm of P (`certify_by_eigenvalue`).
     """
     if not has_point(s):
         return {}, ""
@@ -181,7 +187,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
         return certify(mechanics, mechanics.to_primal(s))
 
     result = _certified(certificate)
-    if not was_loaded and LATE_IMPORT in sys.modules:  # repeat without the import time
+    if not was_loaded and LATE_IMPORT in sys.modules:  # exclude the time of the import
         result = _certified(certificate)
     return result
 
@@ -191,15 +197,16 @@ def evaluated_by_ranks(
 ) -> dict[str, Any]:
     """Evaluate an answer on all ranks, from the local slices of the solution.
 
-    The evaluation uses a new share of the QP, which the solver cannot have modified.
-    All ranks call this function, and a failure on one rank is a failure on all
-    (`harness.distributed.failures`).
+    The evaluation uses a new copy of the local part of the QP, which the solver cannot
+    have modified. All ranks must call this function, and all of them report the failure
+    of any rank (`harness.distributed.failures`).
 
     Returns
     -------
-    `values`: objective and residuals, None if they need the whole QP;
-    `bounds`: fields of `certified`; `quantities`, None if they need the whole QP;
-    `recover_seconds`: time of the evaluation of the quantities; `notes` on failures.
+    a dict with `values`: objective and residuals, or None if they require the whole QP;
+    `bounds`: fields of `certified`, or None; `quantities`: physical quantities, or None
+    if they require the whole QP; `recover_seconds`: time to evaluate the quantities;
+    `notes`: reasons of failures
 
     """
     found: dict[str, Any] = {
@@ -236,8 +243,8 @@ def evaluated_by_ranks(
 def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | None:
     """Evaluate objective and residuals; return None if they are not finite.
 
-    Also returns None if a scale of energy needs the whole QP: a distributed vector
-    raises TypeError for operations that its slice does not determine.
+    The result is also None if a scale of energy requires the whole QP: a distributed
+    vector raises TypeError for operations that its local slice does not determine.
     """
     qp = emitted.share().qp
     try:
@@ -250,7 +257,7 @@ def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | 
     return {"objective": float(objective), **residuals._asdict()}
 
 
-LATE_IMPORT = "scipy.optimize"  #: slow import of `certify` for some bodies
+LATE_IMPORT = "scipy.optimize"  #: slow import, needed by `certify` for some bodies
 
 
 def _certified(
@@ -262,7 +269,7 @@ def _certified(
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"
-    except Exception as e:  # code of the family must not lose the record
+    except Exception as e:  # errors of the family must not lose the record
         return {}, note_of("energy_bound", e)
     return {
         "energy_bound": bound.bound,
@@ -272,14 +279,14 @@ def _certified(
 
 
 def has_point(s: Solution) -> bool:
-    """Return True if there are variables and all four vectors are finite."""
+    """Return True if x is not empty and x, y, z and z_box are finite."""
     return bool(s.x.size) and all(
         np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box)
     )
 
 
 def note_of(what: str, e: Exception) -> str:
-    """Return a note of one line on a value that could not be computed."""
+    """Return a one-line note that an exception prevented the computation of `what`."""
     return " ".join(f"no {what}: {type(e).__name__}: {e}".split())
 
 
@@ -289,7 +296,7 @@ def noted(record: Record, *notes: str) -> Record:
 
 
 def plain(data: Any) -> Any:
-    """Convert to plain data for JSON; other objects are replaced by their repr."""
+    """Convert data to JSON types; objects of other types become their repr."""
     match data:
         case np.ndarray() | np.generic():
             return plain(data.tolist())

@@ -462,7 +462,7 @@ def test_equivalent_formulations_have_the_same_residuals(trap):
 
 def test_a_reversed_or_shifted_cone_is_no_cone():
     qp = mb.QP.from_arrays(np.eye(3), [1, 1, 1], sets=[Cones([[0, 1, 2]], [1])])
-    with pytest.raises(ValueError, match="Cones cannot be scaled unevenly, nor reve"):
+    with pytest.raises(ValueError, match="Cones cannot be scaled unevenly or rever"):
         mirror(qp, [0])
     with pytest.raises(ValueError, match="Cones cannot be shifted"):
         shift_unknowns(qp, np.ones(3))
