@@ -62,8 +62,8 @@ class Inverse(Protocol):
 class Substructures(Protocol):
     """The stiffness as a sum over floating subdomains:  K = Tᵀ diag(K_1 … K_S) T.
 
-    The vector v (N,) contains the displacements of all subdomains. A component of a node
-    on an interface occurs in v once for each adjacent subdomain, in the axes of that
+    The vector v (N,) contains the displacements of all subdomains. A component on an
+    interface occurs in v once for each adjacent subdomain, in the axes of that
     subdomain. The columns of R_s are the rigid motions of subdomain s. K_s stands for
     P_s K_s P_s with P_s = I − R_sR_sᵀ: this projection removes the rounding errors in
     K_s R_s, so that the kernel of K_s is exactly the span of R_s.
@@ -102,11 +102,11 @@ class Friction:
 
         energy of friction:  Σ gᵢ‖Tᵢu − sᵢ‖,   multipliers:  ‖λᵢ‖ ≤ gᵢ
 
-    T u is the tangential displacement of the slave side relative to the master side. The
-    slip is measured from s: s = 0 for a single static load, and T u of the previous load
-    step for slip increments. A contact row i with friction has d consecutive rows Tᵢ of
-    equal bound, one for each tangential direction: d = 1 in the plane, d = 2 in space.
-    A problem without friction has zero rows.
+    T u is the tangential displacement of the slave side relative to the master side.
+    The slip is measured from s: s = 0 for a single static load, and T u of the previous
+    load step for slip increments. A contact row i with friction has d consecutive rows
+    Tᵢ of equal bound, one for each tangential direction: d = 1 in the plane, d = 2 in
+    space. A problem without friction has zero rows.
 
     The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
     the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
@@ -123,7 +123,7 @@ class Friction:
 
     @property
     def tangents(self) -> int:
-        """Number d of tangential directions, and so of friction rows per contact row."""
+        """Number d of tangential directions, i.e. of friction rows per contact row."""
         return int(np.bincount(self.row).max(initial=1))
 
     @property
@@ -152,7 +152,7 @@ class Friction:
         return np.asarray(self.cohesion + self.mu * np.maximum(normal[self.row], 0.0))
 
     def residual(self, normal: Vector) -> float:
-        """Return the relative distance of the bound g from the one that the law requires.
+        """Return the relative distance of the bound g from the one the law requires.
 
         The distance is ‖g − demanded‖₂/‖g‖₂, or without the divisor if g = 0.
 
@@ -222,8 +222,8 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
 
-    The unknown is (u, t) or (u, t, w). If no row has g > 0, `primal` itself is returned.
-    `friction_multipliers` returns the multipliers of the friction rows.
+    The unknown is (u, t) or (u, t, w). If no row has g > 0, `primal` itself is
+    returned. `friction_multipliers` returns the multipliers of the friction rows.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
@@ -268,9 +268,9 @@ def friction_multipliers(
 
     s : solution of the QP returned by `with_friction`
 
-    The multipliers λ_t (k,) of friction rows are zero where g = 0. In the plane, each of
-    the others is the difference of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s; in
-    space, λ_t is the multiplier of Tu − w = s.
+    The multipliers λ_t (k,) of friction rows are zero where g = 0. In the plane, the
+    other entries are differences of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s; in
+    space, they are the multipliers of Tu − w = s.
     """
     e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
     tangential = np.zeros(acts.size)
@@ -359,7 +359,7 @@ class Exact(NamedTuple):
         return self.forces.contact
 
     def motion(self, u: Extended) -> Extended:
-        """Return v = Bu − c (m,): penetration in contact rows, slip in friction rows."""
+        """Return v = Bu − c (m,): penetration of contact rows, slip of friction rows."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
@@ -417,9 +417,9 @@ KINDS = {
 }
 
 
-#: Corners of each facet, for each kind of cell. In the plane, the cell is on the left of
-#: the edge. In space, the corners are in anticlockwise order when seen from outside, and
-#: a triangle repeats its last corner.
+#: Corners of each facet, for each kind of cell. In the plane, the cell is on the left
+#: of the edge. In space, the corners are in anticlockwise order when seen from outside,
+#: and a triangle repeats its last corner.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),
@@ -495,7 +495,7 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # sorts repeated nodes to the end
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # sorted to the end
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
@@ -560,7 +560,7 @@ class Mechanics:
 
     @cached_property
     def program(self) -> QP:
-        """The problem as a QP (see `with_friction`), which is `primal` if frictionless."""
+        """The problem as a QP, see `with_friction`; equal to `primal` if frictionless."""
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:
@@ -627,7 +627,7 @@ class Mechanics:
 
     @cached_property
     def motions(self) -> RigidMotions:
-        """Rigid motions that the supports allow, split into constrained and free ones."""
+        """Rigid motions that the supports allow, as constrained and free motions."""
         exact, B, R = self.exact, self.rows, self.inverse.kernel
         turn, p = constrained_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
@@ -658,8 +658,9 @@ class Mechanics:
     def norm(self, v: Extended) -> float:
         """Return the energy norm ‖v‖_K, a seminorm if bodies can move rigidly.
 
-        The rigid part of v is subtracted first. KR = 0 holds only up to rounding errors;
-        if the rigid part is much larger than the deformation, they would dominate.
+        The rigid part of v is subtracted first. KR = 0 holds only up to rounding
+        errors, which would dominate if the rigid part is much larger than the
+        deformation.
         """
         v = self.without_rigid_motion(v)
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
@@ -675,7 +676,7 @@ def _orthonormal(R: NDArray[np.float64]) -> Any:
 
 
 def _largest(R: Any) -> Any:
-    """Replace the nonzeros of each column by the largest absolute value in the column."""
+    """Replace the nonzeros of each column by the column's largest absolute value."""
     columns = csc_array(abs(R))
     empty = np.zeros(R.shape[1])
     sizes = columns.max(axis=0).toarray().ravel() if columns.nnz else empty
@@ -701,7 +702,7 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
 
 
 def _leading(v: Any, size: Any, bits: int) -> Any:
-    """Round v to multiples of 2^−bits·`size`, with `size` rounded up to a power of 2."""
+    """Round v to multiples of 2^−bits·`size`, with size rounded up to a power of 2."""
     unit = np.exp2(np.ceil(np.log2(np.where(size > 0, size, 1))) - bits)
     return np.round(v / unit) * unit
 

@@ -1,8 +1,9 @@
 """Serialisable operators: plain arrays and the name of a function that builds P.
 
-P is the matrix of a QP. A matrix-free P cannot be written to a file, but the arrays from which it is built can.
-Workers receive these arrays and build the operator while the clock runs: work before
-the first product, such as a factorisation, counts as preparation of the solver.
+P is the matrix of a QP. A matrix-free P cannot be written to a file, but the arrays
+from which it is built can. Workers receive these arrays and build the operator while
+the clock runs: work before the first product, such as a factorisation, counts as
+preparation of the solver.
 
 The function that builds P, its *maker*, is looked up by name in a table: the
 ``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
