@@ -359,7 +359,7 @@ class Exact(NamedTuple):
         return self.forces.contact
 
     def motion(self, u: Extended) -> Extended:
-        """Return v = Bu − c (m,): penetration of contact rows, slip of friction rows."""
+        """Return v = Bu − c (m,), the penetration or the slip in each row."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
@@ -560,7 +560,7 @@ class Mechanics:
 
     @cached_property
     def program(self) -> QP:
-        """The problem as a QP, see `with_friction`; equal to `primal` if frictionless."""
+        """The problem as a QP, see `with_friction`; `primal` if it is frictionless."""
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:

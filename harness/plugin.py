@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 Value = int | float | str  #: value of a key in a case name
-#: Function that solves a QP accurately. It is passed in, since families import no solver.
+#: Function that solves a QP accurately; families receive it and import no solver.
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
@@ -75,7 +75,7 @@ class Solver(Protocol):
     """
 
     def declines(self, qp: QP) -> str | None:
-        """Return the reason why this solver does not accept `qp`, or None if it does."""
+        """Return the reason why this solver does not accept `qp`; None if it does."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Convert and factorise the data of `qp`, and return a function that solves it.
@@ -102,7 +102,7 @@ class Chained(Solver, Protocol):
 
 
 class Tightening(Chained, Protocol):
-    """A solver that can reuse work within a sequence of QPs with different tolerances."""
+    """A solver that can reuse work in a sequence whose QPs differ in tolerance."""
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Begin a sequence, and return a `prepare` function for its QPs.
@@ -256,7 +256,7 @@ class SourceFile:
 
     path: str  #: path as given in the name of the case
     sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
-    #: suffix of the file format, which need not be that of `path`; a copy is named by it
+    #: suffix for the name of a copy, which depends on the file format, not on `path`
     suffix: str
 
 
@@ -313,7 +313,7 @@ class Family(ABC):
         """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the params of the mesh with halved cell size, or None if there is none.
+        """Return the params for halved cell size, or None if there is no such mesh.
 
         Estimates of the discretisation error need these params, and `Mechanics.grid` of
         both cases; see `harness.crossval.discretisation`.

@@ -334,9 +334,9 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    A solver that reads entries of P should call this function in `declines`. If a solver
-    declines for this reason and P is small, the matrix is assembled on the clock, and
-    `declines` is called again.
+    A solver that reads entries of P should call this function in `declines`. If a
+    solver declines for this reason and P is small, the matrix is assembled on the
+    clock, and `declines` is called again.
 
     Examples
     --------
