@@ -115,7 +115,7 @@ class Record(Measurement):
     repeat: int  #: number of the repeat, from 0
     block: int  #: number of the work unit, whose measurements ran consecutively
     verdict: Verdict
-    claimed: str | None = None  #: status claimed by the solver; None if it returned none
+    claimed: str | None = None  #: status claimed by the solver; None if it has none
     #: message of the solver, reason to decline, or the way in which the worker ended
     message: str = ""
     iterations: int | None = None
@@ -146,8 +146,8 @@ class Record(Measurement):
     #: [mean, largest] over ranks of reduction_seconds, message_seconds and
     #: seconds_per_byte; see `harness.distributed.network`
     rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: "cold"; "sequence": results of earlier steps may be reused; "sequence, tighten=θ":
-    #: a sequence with tightening tolerances, see `Record.tighten`
+    #: "cold"; "sequence": results of earlier steps may be reused; "sequence,
+    #: tighten=θ": a sequence with tightening tolerances, see `Record.tighten`
     mode: str = "cold"
     #: tolerance of an early step of a tightening sequence; None if it is `tol`
     step_tol: float | None = None
@@ -219,9 +219,9 @@ class Record(Measurement):
     def to_json(self) -> str:
         """Return one line of strict JSON.
 
-        NaN, inf and integers beyond 64 bits become null. Fields that do not occur in old
-        journals are omitted if they have their defaults, so that an old line is written
-        unchanged.
+        NaN, inf and integers beyond 64 bits become null. Fields that do not occur in
+        old journals are omitted if they have their defaults, so that an old line is
+        written unchanged.
         """
         row = finite(self.to_dict())
         if not self.session:

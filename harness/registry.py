@@ -10,8 +10,8 @@ A plug-in file is loaded as a Python package of its own, whose path is the folde
 file. The plug-in can import the modules and packages in this folder, which are called
 its neighbours. Two plug-ins may have different neighbours of the same name: when the
 code of a plug-in is compiled, ``import helper`` is replaced by an import of the
-submodule ``helper`` of its package. Similarly, ``from harness import QP`` is replaced by
-an import from `mortarbench.harness`.
+submodule ``helper`` of its package. Similarly, ``from harness import QP`` is replaced
+by an import from `mortarbench.harness`.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class SolverSpec:
     ranks: int = 1  #: number of MPI processes
 
     def on(self, ranks: int) -> SolverSpec:
-        """Return the same solver on `ranks` MPI processes, with their number as label."""
+        """Return the same solver on `ranks` MPI processes, with the number in its label."""
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
@@ -461,7 +461,7 @@ def _no_file(plugin_file: PluginFile) -> InputError:
 
 
 def _imported(path: Path) -> ModuleType:
-    """Import a plug-in file as a package of its own; see the docstring of this module."""
+    """Import a plug-in file as a package of its own, see the docstring of the module."""
     whole = path.resolve()
     stem = re.sub(r"\W", "_", whole.stem)
     name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"
@@ -596,7 +596,10 @@ def _standing_for_harness() -> Iterator[None]:
 
 
 def _neighbour(name: str, folder: str) -> ModuleSpec | None:
-    """Return the spec of a module, or package with ``__init__``, in a folder, or None."""
+    """Return the spec of a module or package in a folder, or None if there is none.
+
+    Packages without ``__init__`` are not found.
+    """
     if name in _NEVER_BESIDE:
         return None
     spec = PathFinder.find_spec(name, [folder])
@@ -626,8 +629,8 @@ def _neighbours(path: Path) -> set[Path]:
 def _imported_names(file: Path) -> set[str]:
     """Return the top-level names in the import statements of a file.
 
-    The names in relative imports are included, since ``from .helper import f`` imports a
-    neighbour of the plug-in. If the file has a syntax error, the result is empty; the
+    The names in relative imports are included, since ``from .helper import f`` imports
+    a neighbour of the plug-in. If the file has a syntax error, the result is empty; the
     import of the file will report the error.
     """
     names: set[str] = set()
