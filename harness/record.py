@@ -128,7 +128,8 @@ class Record(Measurement):
     )
     #: part of `build_seconds` spent on the factorisation and the dual; dual forms only
     dualise_seconds: float | None = None
-    #: peak resident memory of a process that built this case only, in growing suites
+    #: peak resident memory of the new process that built the case; measured only in
+    #: series of growing sizes
     build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`

@@ -87,7 +87,7 @@ class SolverSpec:
     ranks: int = 1  #: number of MPI processes
 
     def on(self, ranks: int) -> SolverSpec:
-        """Return the same solver on `ranks` MPI processes, with the number in its label."""
+        """Return the same solver on `ranks` MPI processes; the label states `ranks`."""
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
@@ -461,7 +461,7 @@ def _no_file(plugin_file: PluginFile) -> InputError:
 
 
 def _imported(path: Path) -> ModuleType:
-    """Import a plug-in file as a package of its own, see the docstring of the module."""
+    """Import a plug-in file as a package of its own; see the module docstring."""
     whole = path.resolve()
     stem = re.sub(r"\W", "_", whole.stem)
     name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"

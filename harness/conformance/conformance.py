@@ -167,9 +167,9 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 def _solves_over_sets(shape: str, solver: Solver) -> Result:
     """Require a relative error of at most 1e-8 in the objective; report the error in x.
 
-    The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective f by
-    at least 0.05 δ². The permitted error in f therefore permits an error in x of up to
-    √(20·1e-8·|f|), which interior-point methods may attain.
+    The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective f
+    by at least 0.05 δ². The permitted error in f therefore permits an error in x of up
+    to √(20·1e-8·|f|), which interior-point methods may attain.
     """
     qp, expected = manufactured_over_sets(shape)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
@@ -305,7 +305,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Require solutions of a sequence of QPs, of which only the first share matrices."""
+    """Require correct solutions of a sequence of QPs, given by `_sequence`."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")

@@ -14,8 +14,8 @@ from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
 
 #: Arguments of each shape. m, p: numbers of equality and inequality rows; lower, upper:
-#: False without such bounds; some: bounds on half of the variables; redundant: dependent
-#: equality rows; fixed: equal bounds on some variables; rank: rank of P.
+#: False without such bounds; some: bounds on half of the variables; redundant: linearly
+#: dependent equality rows; fixed: equal bounds on some variables; rank: rank of P.
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),

@@ -92,7 +92,7 @@ def permute_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
 
 
 def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
-    """Multiply each row by a positive factor; its multiplier is divided by the factor."""
+    """Multiply each row by a positive factor, which divides the row's multiplier."""
     return _rows(qp, diags_array(equalities), diags_array(inequalities))
 
 
@@ -186,7 +186,7 @@ def _rows(qp: QP, M: Matrix, N: Matrix) -> Equivalent:
 def _selections(
     qp: QP, equalities: Order, inequalities: Order
 ) -> tuple[Matrix, Matrix]:
-    """Return the matrices that select equality and inequality rows in the given order."""
+    """Return the matrices that select the given equality and inequality rows."""
     M, N = (eye_array(v.size, format="csr") for v in (qp.b, qp.h))
     return M[equalities], N[inequalities]
 

@@ -87,7 +87,7 @@ class Pair(NamedTuple):
     a: int  #: index of the first answer
     b: int  #: index of the second answer
     distance: float  #: ‖u − u'‖ in the energy norm
-    #: ‖Bᵀ(λ − λ')‖, difference of contact forces in the dual norm; None without mechanics
+    #: ‖Bᵀ(λ − λ')‖, distance of the contact forces, dual norm; None without mechanics
     equilibrium: float | None
     energy: float  #: |J(u) − J(u')|, difference of potential energies
     allowed: float  #: sum of the errors that the two claims permit

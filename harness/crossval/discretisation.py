@@ -66,7 +66,8 @@ class Level:
     unknowns: int  #: number of unknowns
     energy: float  #: potential energy J_h, J/m in the plane, J in space
     norm: float  #: energy norm of u_h, in the square root of the unit of energy
-    bound: float  #: certified bound on the relative error of u_h as solution on the mesh
+    #: certified relative error of the reference solve on this mesh
+    bound: float
     #: energy norm of the difference from the previous level; None on the first level
     distance: float | None = None
 

@@ -1,8 +1,8 @@
 """Reference point with which the answers to one problem are compared.
 
 The reference point is computed by the reference solve. If this solve fails, the answer
-with the smallest certified error takes its place, and the report states this. Majorities
-of answers play no role.
+with the smallest certified error takes its place, and the report states this.
+Majorities of answers play no role.
 """
 
 from __future__ import annotations

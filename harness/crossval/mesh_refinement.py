@@ -59,8 +59,8 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
         places += [*centres, _between(near, *centres[:2])]
         rows += [*of_faces, csr_array((of_faces[0] + of_faces[1]) / 2)]
     if len(corners) == 4:
-        # a triangle was refined into four triangles if an edge connects the midpoints of
-        # the two sides at the double corner
+        # a triangle was refined into four triangles if an edge connects the midpoints
+        # of the two sides at the double corner
         joined = np.asarray(near[middles[1], middles[3]]).ravel() > 0
         cut = ~(joined & (corners[2] == corners[3]))
         places.append(_between(near, middles[0][cut], middles[2][cut]))

@@ -192,8 +192,8 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         for r in claims
         if r.run_id not in contradictory
     ]
-    # forms with equal mechanics belong to one problem; without mechanics, each form is a
-    # problem of its own
+    # forms with equal mechanics belong to one problem; without mechanics, each form is
+    # a problem of its own
     by_numbers: dict[str, list[StoredAnswer]] = {}
     for g in answers:
         of = g.case.mechanics
