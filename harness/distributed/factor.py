@@ -73,7 +73,7 @@ class Touched:
 
     @property
     def few_shared(self) -> bool:
-        """True if the dense factor of the shared rows has at most `MAX_FILL` entries."""
+        """True if the dense factor of the shared rows is small, see `MAX_FILL`."""
         inner = self.ranks.total(np.array([float(np.count_nonzero(~self.is_shared))]))
         s = self.shared.size
         return s**2 <= MAX_FILL * (s + float(inner[0]))
@@ -108,7 +108,7 @@ class LocalFactor:
     """
 
     at: Touched
-    changing: int  #: number of inner rows that may change, which are first in the border
+    changing: int  #: number of inner rows that may change; the border begins with them
     #: factor of A_p, with 1 added to the diagonal of shared rows; rows are ordered as
     #: unchanging, changing and shared rows
     factor: BorderedFactor
@@ -222,7 +222,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Return the consistent L⁻ᵀa (k,) for a vector a in orthonormal representation."""
+        """Return the consistent L⁻ᵀa (k,) for an orthonormal vector a."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)

@@ -1,10 +1,11 @@
 """Collective handling of failures: all ranks raise, or all processes end.
 
 If a single rank raised an exception, the other ranks would wait for its messages for
-ever. After each call of user code, all ranks therefore exchange its outcome
-(`run_collectively`), on a communicator that is used only for this purpose. A rank whose
-call failed waits in this exchange for the others. If they do not arrive in time, they
-are waiting for messages of the failed rank, which then ends all processes (`abort`).
+ever. Work that may fail is therefore called by `run_collectively`, which then exchanges
+the outcomes of all ranks, on a communicator that is used only for this purpose. A rank
+whose work failed waits in this exchange for the others. If they do not arrive in time,
+they are waiting for messages of the failed rank, which then ends all processes
+(`abort`).
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class Ranks:
     comm: Comm
     #: time that this process spent in each of the `PARTS`, without overlap, s
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
-    #: numbers of reductions, of messages to single ranks, and of bytes in these messages
+    #: numbers of reductions, of messages to single ranks, and of bytes in the messages
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
@@ -144,9 +144,11 @@ class Ranks:
         return arrived
 
     def clocked(self, part: str) -> _Clock:
-        """Return a context manager that adds the time of its block to one of the `PARTS`.
+        """Return a context manager that adds the time of its block to a category.
 
-        The time of a nested block is added to the category of this block only.
+        The time of a nested block is added to the category of the nested block only.
+
+        part : one of the `PARTS`
         """
         return _Clock(self.seconds, part)
 
@@ -191,7 +193,8 @@ class _SingleProcess:
 class _Clock:
     """Timer that adds the time of a block, without nested blocks, to a category.
 
-    This is a class since a context manager based on a generator is several times slower.
+    This is a class, since a context manager based on a generator is several times
+    slower.
     """
 
     __slots__ = ("before", "part", "seconds", "start")
@@ -414,7 +417,8 @@ Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 class Distributable(Protocol):
     """A product x ↦ Px that can be distributed over ranks.
 
-    The function that builds an operator (`harness.operators`) may return such a product.
+    The function that builds an operator (`harness.operators`) may return an object of
+    this kind.
     """
 
     @property
