@@ -16,7 +16,7 @@ from mortarbench.harness.environment.noise import NoiseFloor
 MIN_MEMORY_MIB = 2048
 MAX_QUIET_LOAD = 0.5  #: largest acceptable one-minute load average, in cores
 MAX_CLOCK_STEP_SECONDS = 1e-6
-#: Largest acceptable 95 % quantile of the relative difference of two equal measurements.
+#: Largest acceptable value of `NoiseFloor.one_pair`.
 MAX_PAIR_SCATTER = 0.10
 MAX_RATIO_BIAS = 0.01  #: largest deviation of an A/A ratio from 1 that is ignored
 ONE_THREAD = (
@@ -91,7 +91,7 @@ def load_advice(load: float) -> str:
 def _check(section: str, name: str, value: object, advice: str = "") -> Check:
     """Return a check with the level that follows from the value and the advice.
 
-    The level is WARN if there is advice, UNKNOWN if the value is None, and OK otherwise.
+    The level is WARN if there is advice, UNKNOWN if the value is None, otherwise OK.
     """
     level = Level.WARN if advice else Level.UNKNOWN if value is None else Level.OK
     text = "not reported by the system" if value is None else str(value)
@@ -169,7 +169,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the BLAS in the wheel of a package, else the BLAS of the system, or None."""
+    """Return the BLAS in a package's wheel, else the BLAS of the system, or None."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":

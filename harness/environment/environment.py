@@ -296,7 +296,7 @@ def _turbo() -> bool | None:
 
 
 def _meminfo(key: str) -> int | None:
-    """Return the value of an entry of /proc/meminfo in MiB, or None if it is missing."""
+    """Return the value of an entry of /proc/meminfo in MiB; None if it is missing."""
     entry = re.search(rf"^{key}:\s+(\d+) kB", _read(Path("/proc/meminfo")), re.M)
     return int(entry[1]) // 1024 if entry else None
 

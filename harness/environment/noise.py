@@ -17,7 +17,7 @@ from math import exp
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-_SIDE = 120  #: nodes per side of a square grid; the matrix of the kernel has 14 400 rows
+_SIDE = 120  #: nodes per side of a square grid, whose matrix has 14 400 rows
 _PRODUCTS = 10  #: number of matrix-vector products in a timed call, about 1 ms
 _BLOCKS = 20  #: number of blocks of consecutive pairs in the bootstrap
 _DRAWS = 1000  #: number of bootstrap samples
@@ -99,7 +99,7 @@ def _on_the_workers_cpu() -> Iterator[None]:
 
 
 def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:
-    """Return the smallest nonzero difference between consecutive readings of a clock."""
+    """Return the smallest nonzero difference of consecutive readings of a clock."""
     readings = np.array([clock() for _ in range(tries)])
     steps = np.diff(readings)
     return float(steps[steps > 0].min(initial=np.inf))

@@ -87,7 +87,7 @@ class _Block:
     cases: list[CaseId]
     given: list[dict[str, object]]  #: keys that the suite sets, for each case
     kind: str  #: "sequence", "growing" or, for single cases, ""
-    along: tuple[str, ...]  #: keys that vary in a sequence or series; () for single cases
+    along: tuple[str, ...]  #: keys that vary in the sequence or series, else ()
 
 
 def _blocks(
@@ -202,7 +202,7 @@ def _located(
 
 
 def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the kind of a block and the key that varies; "" and "" for single cases."""
+    """Return the kind of a block and the key that varies; "", "" for single cases."""
     kinds = [kind for kind in ("sequence", "growing") if kind in table]
     if not kinds:
         return "", ""

@@ -91,11 +91,11 @@ class Suite:
     sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: positions of cases in series of growing sizes, by name of the case
     growing: Mapping[str, Growth] = field(default_factory=dict)
-    #: values of θ, see `harness.record.Record.tighten`; each sequence is solved once for
-    #: each of them, and 0 stands for constant tolerances
+    #: values of θ, see `harness.record.Record.tighten`; each sequence is solved once
+    #: for each value, and 0 stands for constant tolerances
     tighten: tuple[float, ...] = (0.0,)
-    #: no further repeats are measured once the confidence interval of every ratio to
-    #: the fastest solver has this relative half-width; None for a fixed number `repeats`
+    #: relative half-width of confidence intervals: no further repeats are measured once
+    #: it is reached for every ratio to the fastest solver; None for `repeats` repeats
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
@@ -273,8 +273,8 @@ def _toml_value(where: str, value: Any) -> str:
             return str(value).lower()
         case int() | float():
             return repr(value)
-        # JSON strings are valid TOML strings with two exceptions, avoided here: JSON does
-        # not escape DEL, and its ASCII form splits characters beyond 16 bits into
+        # JSON strings are valid TOML strings with two exceptions, avoided here: JSON
+        # does not escape DEL, and its ASCII form splits characters beyond 16 bits into
         # surrogate pairs.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
