@@ -285,9 +285,10 @@ def _is_same_file(path: Path, fd: int) -> bool:
 
 @contextmanager
 def scratch_in(folder: Path) -> Iterator[Path]:
-    """Create a temporary folder in a locked result folder, and delete it after the block.
+    """Create a temporary folder in a locked result folder, for use within the block.
 
-    A temporary folder that a killed run left there is deleted first.
+    The temporary folder is deleted after the block. If a killed run left such a folder,
+    it is deleted first.
     """
     scratch = folder / _SCRATCH
     shutil.rmtree(scratch, ignore_errors=True)

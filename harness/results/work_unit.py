@@ -20,7 +20,7 @@ from mortarbench.harness.record import Record
 
 @dataclass(frozen=True, kw_only=True)
 class Commands:
-    """Command lines of the processes of a run, without the arguments for their pipes."""
+    """Command lines of the processes of a run, without the arguments for pipes."""
 
     #: commands that run `harness.processes.worker`, by label of the solver
     solvers: Mapping[str, list[str]]
