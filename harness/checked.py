@@ -113,7 +113,7 @@ def path(where: str, value: object) -> Path:
         os.stat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError) as e:  # ValueError: a NUL or a lone surrogate
+    except (OSError, ValueError) as e:  # ValueError for NUL and lone surrogates
         why = e.strerror if isinstance(e, OSError) else "no name of a file"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
     return Path(text)

@@ -10,7 +10,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 
 MAX_SHOWN = 200  #: number of characters of the user's input that a message repeats
-_MAX_MESSAGE = 600  #: largest number of characters of a message, without paths
+_MAX_MESSAGE = 600  #: largest number of characters of a message, not counting paths
 #: A quotation or a word. Possessive quantifiers avoid backtracking, whose time could
 #: grow without bound for malicious input.
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
@@ -49,7 +49,7 @@ def shown(value: object) -> str:
     except (
         RecursionError,
         ValueError,
-    ):  # nested too deeply; an integer of too many digits
+    ):  # nested too deeply, or an integer with too many digits
         return f"a {type(value).__name__} too long to show"
 
 

@@ -116,7 +116,7 @@ class Friction:
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, the T u from which slip is measured, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
-    cohesion: Vector  #: (k,) a force
+    cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
     mu: Vector  #: (k,) coefficient of friction
     #: `residual` at the solution of the problem with this bound; 0 if unknown
     unsettled: float = 0.0
@@ -370,9 +370,10 @@ class Exact(NamedTuple):
     def missing_work(
         self, multipliers: Extended, motion: Extended
     ) -> tuple[Extended, Extended]:
-        """Return σ(v) − λᵀv ≥ 0 of each contact row and each friction vector.
+        """Return the nonnegative terms of σ(v) − λᵀv, which vanishes at a solution.
 
-        For a friction vector, g‖v‖ − λᵀv is evaluated without cancellation as
+        The first array contains the terms of contact rows, −λᵢvᵢ, the second those of
+        friction vectors. The latter, g‖v‖ − λᵀv, are evaluated without cancellation as
 
             (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
         """

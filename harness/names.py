@@ -207,7 +207,7 @@ def is_shared(name: CaseId) -> bool:
     """
     try:
         return name.family.emission(name.form, name.params) is not None
-    except Exception:  # the family's code
+    except Exception:  # raised by code of the family
         return False
 
 

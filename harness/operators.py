@@ -24,7 +24,7 @@ from mortarbench.harness.distributed.sparse import LinearMap
 
 Arrays = Mapping[str, NDArray[Any]]
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-#: Maps plain arrays to x ↦ Px, for vectors (n,) and matrices (n, k).
+#: Function that builds x ↦ Px, for x of shape (n,) or (n, k), from plain arrays.
 Maker = Callable[[Arrays], Product]
 NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 
@@ -33,11 +33,11 @@ NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 class Preconditioned(Protocol):
     """A product x ↦ Px with a method that returns preconditioners for P.
 
-    A maker may return such a product; `preconditioned` finds it for a solver.
+    A maker may return such a product; solvers obtain it from `preconditioned`.
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply P by (n,) or (n, k)."""
+        """Return Px for x of shape (n,) or (n, k)."""
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ Mx for x of shape (n,) or (n, k), where M approximates P⁻¹.
@@ -65,7 +65,7 @@ class WithDiagonal(Protocol):
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply P by (n,) or (n, k)."""
+        """Return Px for x of shape (n,) or (n, k)."""
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return the diagonal entries Pᵢᵢ (n,)."""

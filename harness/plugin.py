@@ -288,7 +288,7 @@ class Family(ABC):
 
     """
 
-    name: str  #: first component of its case names
+    name: str  #: first component of the names of its cases
     #: default values of all keys, in the order of keys in canonical names
     defaults: Mapping[str, Value]
     forms: tuple[str, ...]  #: forms of the QPs

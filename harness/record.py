@@ -40,7 +40,7 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Judgement of a measurement, independent of the solver's claim."""
+    """Verdict on a measurement, which also takes into account what the solver claimed."""
 
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible and proven, see `harness.verify.infeasibility`
@@ -108,7 +108,7 @@ class Record(Measurement):
     family: str
     params: Mapping[str, Any]
     form: str
-    sizes: Mapping[str, int]  #: variables, equalities, inequalities, bounds of the QP
+    sizes: Mapping[str, int]  #: sizes of the QP, see `harness.qp.QP.sizes`
     solver: str  #: label in the suite
     options: Mapping[str, Any]  #: all options of the solver, including defaults
     tol: float
@@ -163,8 +163,8 @@ class Record(Measurement):
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: "residuals"; "reference": `optimum_error` decided the verdict; "certificate": a
-    #: claim of infeasibility was proven
+    #: basis of the verdict: "residuals"; "reference" for `optimum_error`; "certificate"
+    #: for a proof of infeasibility
     decided_by: str = "residuals"
     #: error relative to a proven optimum, see `harness.verify.optimum`
     optimum_error: float | None = None

@@ -331,7 +331,7 @@ def entry_point_plugins() -> Plugin:
             try:
                 with redirect_stdout(sys.stderr), _standing_for_harness():
                     entries[point.name] = point.load()
-            except Exception as e:  # somebody else's code
+            except Exception as e:  # raised by code of the package
                 raise _import_error(f"entry point {point.value}", e) from None
     return _checked("entry points", found["solvers"], found["problems"])
 
@@ -479,7 +479,7 @@ def _imported(path: Path) -> ModuleType:
     try:
         with redirect_stdout(sys.stderr):
             spec.loader.exec_module(module)
-    except (Exception, SystemExit) as e:  # somebody else's code
+    except (Exception, SystemExit) as e:  # raised by code of the plug-in
         _forget(name)
         raise _import_error(str(path), e) from None
     return module

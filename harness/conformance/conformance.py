@@ -284,7 +284,7 @@ def _many_bounds_and_no_rows(solver: Solver) -> None:
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Require that one thread computes, so that CPU time does not exceed wall time."""
+    """Require that a solve uses one thread: CPU time must not exceed wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
     # permit all CPUs: on a single CPU, the CPU time of two threads would not exceed the
@@ -322,7 +322,7 @@ def _a_sequence_is_solved(solver: Solver) -> None:
             raise
         except ImportError as e:
             raise DeclinedError(f"not installed: {e.name}") from None
-        except Exception as e:  # the solver's own code
+        except Exception as e:  # raised by code of the solver
             message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
             raise ContractError(message) from None
 

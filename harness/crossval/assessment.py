@@ -159,7 +159,7 @@ def distances(
     V = np.stack(points, axis=1)
     V = V - kernel @ (kernel.T @ V)
     gram = V.T @ np.asarray(P @ V)
-    norms = np.diag(gram)  # squared
+    norms = np.diag(gram)  # squares of the norms
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
     lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
     np.fill_diagonal(lengths, 0)  # inf − inf would be NaN

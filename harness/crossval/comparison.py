@@ -55,7 +55,7 @@ class Answer:
     form: str
     tol: float
     claimed: str
-    stored: Verdict  #: verdict of the run
+    stored: Verdict  #: verdict that the run stored
     verdict: Verdict  #: verdict on the stored point, evaluated again
     residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
     optimum_error: (

@@ -304,7 +304,7 @@ class _Halving:
         except UnsolvedError as e:
             self.why = f"{text} has no reference solution: {e}"
             return None
-        except (Exception, SystemExit) as e:  # the family's code
+        except (Exception, SystemExit) as e:  # raised by code of the family
             self.why = unbuilt(text, e)
             return None
         root = sqrt(abs(mechanics.scale))

@@ -331,7 +331,7 @@ def _true_forces(
     mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
-    point = reference_point(mechanics, solve, references)  # read from its cache
+    point = reference_point(mechanics, solve, references)  # from the cache
     return np.asarray(point.multipliers, dtype=float)
 
 

@@ -21,7 +21,7 @@ from scipy.sparse import csc_array
 
 
 cdef class LinearMap:
-    """A linear map x ↦ Ax with A (n, k), where x is a vector (k,) or a matrix (k, w)."""
+    """A linear map x ↦ Ax with A (n, k), for vectors x (k,) and matrices x (k, w)."""
 
     cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
         """y ← Ax for x (k, columns) and y (n, columns), stored by rows."""
@@ -200,7 +200,7 @@ cdef class CompressedRows(LinearMap):
         cdef const int *indptr = self.indptr
         j = indptr[0]
         for i in range(self.n):
-            y_i = z_i = 0  # two sums, since an addition has to wait for the previous one
+            y_i = z_i = 0  # two sums, since an addition waits for the previous one
             last = indptr[i + 1]
             while j + 1 < last:
                 y_i += data[j] * x[indices[j]]
@@ -438,8 +438,8 @@ def factor_above(M, double share, L_0):
 
     M is a difference of matrices of the size of L₀L₀ᵀ. If `share` is smaller than their
     relative rounding errors, the computed M may have negative eigenvalues. In exact
-    arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ. If a computed pivot is
-    smaller, the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed
+    arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ. If a computed pivot
+    is smaller, the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed
     instead. Eigenvalues below `share` are set to `share`, and L follows from
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
@@ -494,8 +494,8 @@ cdef class BorderedFactor(LinearMap):
     L_bbL_bbᵀ. As a linear map, the object is x ↦ A⁻¹x.
 
     order : (n,) permutation of the rows, with the border last
-    columns : first n − b columns of L (n, n − b) in CSC format, where the diagonal entry
-        is the first of each column
+    columns : first n − b columns of L (n, n − b) in CSC format, each with its diagonal
+        entry first
     L_bb : (b, b) lower triangular; the upper triangle is not used
     """
 
@@ -651,7 +651,7 @@ cdef class BorderedFactor(LinearMap):
                 u[self.indices[l]] -= self.data[l] * u_j
 
     cdef void extend(self, double *u, double *y) noexcept:
-        """y ← solution of L_aaᵀy_a + L_baᵀy_b = u_a with y_b = u_b; u is overwritten."""
+        """y ← solution of L_aaᵀy_a + L_baᵀy_b = u_a with y_b = u_b; overwrites u."""
         cdef Py_ssize_t i, j
         cdef int l
         cdef double u_j

@@ -96,7 +96,7 @@ def capture(
             "kernel": platform.release(),
             "libc": " ".join(platform.libc_ver()).strip() or None,
             "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-            "governor": ", ".join(sorted(governors)) or None,  # that of each CPU
+            "governor": ", ".join(sorted(governors)) or None,  # of all CPUs
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
         },

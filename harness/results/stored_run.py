@@ -197,7 +197,7 @@ def rebuild(
     name = assemble(families[r.family], r.params, r.form)
     try:
         case = name.build(reference)
-    except (Exception, SystemExit) as e:  # the family's code
+    except (Exception, SystemExit) as e:  # raised by code of the family
         raise InputError(unbuilt(r.case, e)) from None
     if r.qp is None or r.qp.startswith(DISTRIBUTED_DIGEST):
         return case

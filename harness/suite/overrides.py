@@ -1,4 +1,4 @@
-"""Overrides of a suite by options of the command line."""
+"""Changes of a suite by options of the command line."""
 
 from __future__ import annotations
 
