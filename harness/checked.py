@@ -114,7 +114,7 @@ def path(where: str, value: object) -> Path:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError) as e:  # ValueError for NUL and lone surrogates
-        why = e.strerror if isinstance(e, OSError) else "no name of a file"
+        why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
     return Path(text)
 

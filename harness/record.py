@@ -40,7 +40,7 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Verdict on a measurement, which also takes into account what the solver claimed."""
+    """Verdict on a measurement: the claim of the solver, and whether it is true."""
 
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible and proven, see `harness.verify.infeasibility`

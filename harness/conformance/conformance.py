@@ -242,7 +242,7 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     # compare values as well, since a solver can make read-only arrays writable
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
-            raise ContractError("changed the QP that it was given")
+            raise ContractError("modified the QP")
     if s.status is not Status.SOLVED:
         raise ContractError(f"ended as {s.status}: {s.message}")
 
@@ -340,7 +340,7 @@ def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
     before, after = same_answer(form, change, solver)
     if before is None or after is None:
         return Result(Grade.PASS)
-    message = f"{after} iterations, {before} as it is"
+    message = f"{after} iterations, {before} without the change"
     return Result(Grade.PASS, message, after / max(before, 1))
 
 
@@ -351,7 +351,7 @@ def _near(
     error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
     if not error <= tol:
         raise ContractError(
-            f"{name} differs from the known one by {error:.1e}; expected at most "
+            f"{name} differs from the known value by {error:.1e}; expected at most "
             f"{tol:.1e}"
         )
 

@@ -81,7 +81,7 @@ def same_answer(
     old = old or answer(solver, qp)
     before = _fault(qp, old)
     if before and change != UNCHANGED:
-        raise DeclinedError(f"not solved as it is: {before}")
+        raise DeclinedError(f"not solved without the change: {before}")
     new = CHANGES[change](qp, form)
     s = old if change == UNCHANGED else answer(solver, new.qp)
     if after := _fault(new.qp, s):

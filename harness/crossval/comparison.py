@@ -195,7 +195,7 @@ def _answer(
         remarks=g.remarks,
     )
     refuted = tuple(_refutations(answer))
-    twin = (f"the very point that it gave for {g.twin}",) if g.twin and refuted else ()
+    twin = (f"equals its answer to {g.twin}",) if g.twin and refuted else ()
     return replace(
         answer,
         refuted=refuted,
@@ -245,7 +245,7 @@ def _refutations(a: Answer) -> Iterable[str]:
         most = brief(a.energy_allowed)
         yield f"{', '.join(off)} in the energy norm, allowed {most}"
     if a.assessment.pulls:
-        yield f"multipliers pull at rows {some(map(str, a.assessment.pulls))}"
+        yield f"inadmissible multipliers at rows {some(map(str, a.assessment.pulls))}"
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:

@@ -188,7 +188,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         if infeasibility_margin(qp, claim) is not None:
             contradictory.add(r.run_id)
     lost += [
-        _listed(r, "no certificate of infeasibility was found again")
+        _listed(r, "the proof of infeasibility could not be repeated")
         for r in claims
         if r.run_id not in contradictory
     ]
@@ -229,7 +229,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
 def _pointless(records: Sequence[Record]) -> str:
     """Return the reason why a folder has no answers that could be assessed."""
     if any(r.vectors for r in records):
-        return "its stored points are gone; expected vectors/*.npz, which a run writes"
+        return "its stored points are missing; expected the vectors/*.npz of the run"
     statuses = Counter(r.verdict.words for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
     return f"no solver returned a point ({ends}); expected one that solves a case"

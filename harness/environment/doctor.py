@@ -106,14 +106,14 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
         "processor",
         f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
         f"{usable} usable{virtual})",
-        "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch",
+        "" if usable > 1 else "Provide 2 cores: for measurements and for supervision",
     )
     limit = machine["cpu_limit"]
     throttled = limit is not None and limit < 2
     yield check(
         "cpu limit",
         "none" if limit is None else f"{limit:g} cores",
-        "The container is throttled: give it 2 cores or more (docker run --cpus=2)"
+        "The container is throttled: allow at least 2 cores (docker run --cpus=2)"
         * throttled,
     )
     yield check(
@@ -125,7 +125,7 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "turbo",
         _SWITCH[machine["turbo"]],
-        "Frequencies above the nominal one depend on temperature and on neighbours: "
+        "Frequencies above nominal depend on temperature and on other cores: "
         "echo 0 | sudo tee /sys/devices/system/cpu/cpufreq/boost "
         "(Intel: echo 1 | sudo tee /sys/devices/system/cpu/intel_pstate/no_turbo)"
         * bool(machine["turbo"]),
@@ -162,7 +162,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
         advice = (
             "The reference BLAS is several times slower: "
             "sudo apt-get install libopenblas0-pthread "
-            f"(if it is there already: sudo update-alternatives --auto {link})"
+            f"(if it is installed: sudo update-alternatives --auto {link})"
         )
     linked = blas and f"{blas}, linked by CHOLMOD {version or '?'}"
     yield _check("BLAS", "of CHOLMOD", linked, advice)
@@ -201,7 +201,7 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
         "A/A ratio",
         f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
         f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
-        "A kernel seems to differ from itself: repeat when the machine is idle"
+        "Equal measurements seem to differ: repeat when the machine is idle"
         if biased
         else "",
     )

@@ -37,7 +37,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_DUPLICATES_NOTE = "are there already, and count once"
+_DUPLICATES_NOTE = "measurements are already present, and count once"
 JOURNAL = "merged"  #: name of the only journal of a merged folder
 
 

@@ -172,7 +172,7 @@ def plugins_needed(environment: Mapping[str, Any]) -> str:
     plugins = environment.get("plugins")
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
-    return f"; it was measured with plug-ins, give {options}" if options else ""
+    return f"; it was measured with plug-ins: add {options}" if options else ""
 
 
 def rebuild(
