@@ -45,7 +45,8 @@ class Inverse(Protocol):
     """A symmetric generalised inverse K⁺ of the stiffness K (n, n).
 
     K⁺ is zero on prescribed components, and the inverse of K on the others. If the
-    supports allow rigid motions, the columns of R,  K K⁺ b = b  holds for Rᵀb = 0.
+    supports allow rigid motions, which form the columns of R, then K K⁺ b = b for all b
+    with Rᵀb = 0.
     """
 
     @property
@@ -66,7 +67,8 @@ class Substructures(Protocol):
     interface occurs in v once for each adjacent subdomain, in the axes of that
     subdomain. The columns of R_s are the rigid motions of subdomain s. K_s stands for
     P_s K_s P_s with P_s = I − R_sR_sᵀ: this projection removes the rounding errors in
-    K_s R_s, so that the kernel of K_s is exactly the span of R_s.
+    K_s R_s, so that the kernel of K_s is exactly the span of R_s. Below, D denotes the
+    block diagonal matrix diag(K_1 … K_S) before this projection.
     """
 
     @property
@@ -85,13 +87,13 @@ class Substructures(Protocol):
         """Return the diagonal entries (k,) of K at the global components `at` (k,)."""
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,) in the precision of v, where P = I − RRᵀ."""
+        """Apply PDP to v (N,) in the precision of v, where P = I − RRᵀ."""
 
     def squared_product(self, v: Vector) -> Vector:
-        """Apply K∘K, the squares of the entries of K, to v (N,)."""
+        """Apply D∘D, the matrix of the squared entries of D, to v (N,)."""
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P to forces (N,), where P = I − RRᵀ."""
+        """Apply PD⁺P to forces (N,), where P = I − RRᵀ."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -204,18 +206,18 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 
 
 def with_friction(primal: QP, friction: Friction) -> QP:
-    """Return the problem with friction as a QP, in which auxiliary variables occur.
+    """Return the problem with friction as a QP with auxiliary variables.
 
-    Only friction rows with g > 0 enter. In the plane, each row has a variable t ≥ |Tu −
-    s|:
+    Friction rows with g = 0 are omitted. In the plane, a variable t ≥ |Tu − s| is added
+    for each row:
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    In space, each tangential vector has the slip w = Tu − s, of two components, and a
-    variable t ≥ ‖w‖; together they lie in a second-order cone:
+    In space, two variables, the slip w = Tu − s, and a variable t ≥ ‖w‖ are added for
+    each tangential vector, where (t, w) lies in a second-order cone:
 
     ::
 

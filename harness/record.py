@@ -45,7 +45,7 @@ class Verdict(StrEnum):
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible and proven, see `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    INACCURATE = "inaccurate"  #: claimed solved; at least half of the digits are right
+    INACCURATE = "inaccurate"  #: claimed solved, but only half of the digits are right
     WRONG = "wrong"  #: claimed solved, but refuted
     INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, but not proven
     ITERATION_LIMIT = "iteration_limit"

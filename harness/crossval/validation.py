@@ -255,9 +255,9 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read each distinct stored point of claims of success once.
+    """Read the stored points of claims of success, equal points of a solver once.
 
-    Points that cannot be read are listed with the reason.
+    Points that cannot be read are returned as a list with the reasons.
     """
     answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
     lost: list[Listed] = []
@@ -298,7 +298,9 @@ def _is_proven(r: Record) -> bool:
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
-    """Return the reason why a claim without a point is false, or "" if it is not.
+    """Return the reason why the claim of a record is false, or "".
+
+    Only claims without a point are considered.
 
     solved : the problem if it has a reference point, else None
     """

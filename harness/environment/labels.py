@@ -35,7 +35,7 @@ _NAMES = {
     "plugins": "plug-ins",
     "threads.pools": "libraries with threads",
     "cholmod.version": "version of CHOLMOD",
-    "cholmod.blas": "BLAS behind CHOLMOD",
+    "cholmod.blas": "BLAS used by CHOLMOD",
 }
 _GROUPS = {
     "versions.": "version of {}",
