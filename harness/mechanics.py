@@ -488,7 +488,7 @@ def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
 
 
 def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
-    """Return the facets (k, m) of all cells, their keys (k, dim) and cells (k,).
+    """Return the facets (k, m) of all cells, their keys (k, dim), cell numbers (k,).
 
     The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
     cells have the same key for their common facet. Degenerate facets between repeated

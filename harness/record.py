@@ -45,7 +45,8 @@ class Verdict(StrEnum):
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible and proven, see `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    INACCURATE = "inaccurate"  #: claimed solved, but only half of the digits are right
+    #: claimed solved; not verified, but at least half of the requested digits are right
+    INACCURATE = "inaccurate"
     WRONG = "wrong"  #: claimed solved, but refuted
     INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, but not proven
     ITERATION_LIMIT = "iteration_limit"

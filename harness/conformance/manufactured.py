@@ -319,7 +319,7 @@ def infeasible() -> QP:
 
 
 def unbounded() -> QP:
-    """Return a QP whose objective decreases linearly in x₀, without upper bound."""
+    """Return a QP that decreases linearly in x₀, a variable without upper bound."""
     return QP(
         P=csr_array(np.diag([0.0] + [1.0] * 19)),
         q=-np.ones(20),

@@ -12,8 +12,8 @@ so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at 
 latter equals the error of the contact forces in the dual norm, ‖Bᵀ(λ − λ*)‖. The
 multipliers themselves need not be unique.
 
-A contact row i with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. An error of this
-size changes λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
+A contact row i with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors within this
+bound change λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
 contradict each other on a row only if max(λᵢDᵢ, gapᵢ) > sᵢ for both.
 """
 

@@ -222,7 +222,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Return the consistent L⁻ᵀa (k,) for an orthonormal vector a."""
+        """Return the consistent L⁻ᵀa (k,) for a in orthonormal representation."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)

@@ -97,7 +97,7 @@ class Ranks:
         return float(pick(self.gather_all(np.array([value], dtype=float))))
 
     def gather_all(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the arrays of all ranks, which have equal shapes, as (size, …)."""
+        """Return the stacked arrays (size, …) of all ranks, which have equal shapes."""
         parts = np.empty((self.size, *part.shape))
         self.counts["reductions"] += 1
         with self.clocked("waiting"):
@@ -234,7 +234,7 @@ class DistributedVector(np.ndarray):
             self.ranks = obj.ranks
 
     def dot(self, other: Any) -> Any:  # type: ignore[override]  # no `out`
-        """Return the dot product over all ranks."""
+        """Return the dot product, summed over all ranks."""
         return self @ other
 
     def _refused(self, *args: Any, **kwargs: Any) -> Any:

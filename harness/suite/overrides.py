@@ -90,7 +90,7 @@ def with_overrides(
 def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
 ) -> dict[str, Any]:
-    """Return the cases that match a pattern, and the sequences that contain any."""
+    """Return the cases that match a pattern, and the sequences with such a case."""
     names = [case.name for case in suite.names]
     selected: set[str] = set()
     for pattern in patterns:
