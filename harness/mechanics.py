@@ -61,14 +61,14 @@ class Inverse(Protocol):
 
 
 class Substructures(Protocol):
-    """The stiffness as a sum over floating subdomains:  K = Tᵀ diag(K_1 … K_S) T.
+    """The stiffness as a sum over floating subdomains:  K = Tᵀ PDP T.
 
+    D is the block diagonal matrix (N, N) of the stiffness matrices of the subdomains.
     The vector v (N,) contains the displacements of all subdomains. A component on an
     interface occurs in v once for each adjacent subdomain, in the axes of that
-    subdomain. The columns of R_s are the rigid motions of subdomain s. K_s stands for
-    P_s K_s P_s with P_s = I − R_sR_sᵀ: this projection removes the rounding errors in
-    K_s R_s, so that the kernel of K_s is exactly the span of R_s. Below, D denotes the
-    block diagonal matrix diag(K_1 … K_S) before this projection.
+    subdomain. The columns of R are the rigid motions of the subdomains. In exact
+    arithmetic, DR = 0. The projection P = I − RRᵀ removes the rounding errors in DR, so
+    that the kernel of PDP is exactly the span of R.
     """
 
     @property
@@ -87,13 +87,13 @@ class Substructures(Protocol):
         """Return the diagonal entries (k,) of K at the global components `at` (k,)."""
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PDP to v (N,) in the precision of v, where P = I − RRᵀ."""
+        """Return PDPv for a vector v (N,), in the precision of v."""
 
     def squared_product(self, v: Vector) -> Vector:
-        """Apply D∘D, the matrix of the squared entries of D, to v (N,)."""
+        """Return the product of v (N,) with D∘D, the squares of the entries of D."""
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PD⁺P to forces (N,), where P = I − RRᵀ."""
+        """Return PD⁺Pb for forces b (N,), where D⁺ is a generalised inverse of D."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -692,8 +692,8 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
 
     K and R are split into leading parts and remainders. The leading part of K has 26
     bits relative to the largest entry of the row; that of R has 24 bits relative to the
-    largest entry of the column. In extended precision (64 bits), products of leading
-    parts are exact, and so is the sum of these products over a row of K.
+    largest entry of R. In extended precision (64 bits), products of leading parts are
+    exact, and so is the sum of these products over a row of K.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))
