@@ -80,7 +80,7 @@ class Grade(StrEnum):
 
     PASS = "pass"
     DECLINE = "decline"  #: the solver declines the QP
-    WEAK = "weak"  #: a weakness; the solver conforms nevertheless
+    WEAK = "weak"  #: a weakness, which does not violate the contract
     FAIL = "fail"
 
 

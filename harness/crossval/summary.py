@@ -27,7 +27,7 @@ class Row:
     tol: float
     answers: int  #: number of answers with a stored point
     refuted: int  #: number of refuted claims
-    unanswered: int  #: number of measurements without claim and point
+    unanswered: int  #: number of measurements without a claim of success
     error_median: float | None  #: median bound on the relative error, energy norm
     error_worst: float | None  #: largest bound on the relative error, energy norm
     worst_case: str  #: case with the error `error_worst`
