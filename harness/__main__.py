@@ -1,4 +1,4 @@
-"""Alias: `python -m harness` runs `python -m mortarbench`."""
+"""Run the command line of mortarbench for `python -m harness` in a checkout."""
 
 from mortarbench.__main__ import main
 

@@ -1,6 +1,7 @@
-"""Checks of plain data from users: entries of files, and arguments in Python.
+"""Checks of plain data from users: entries of files, and arguments of functions.
 
-All functions raise `InputError`; `where` is the user's name for the value.
+A check that fails raises `InputError`. In all functions, `where` is the name of the
+value in the message, such as the key of a file.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown, unknown
 
-MAX_COUNT = 1_000_000  #: default limit of an integer
+MAX_COUNT = 1_000_000  #: default upper limit of an integer
 
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Prefix the messages of errors in the block with a place in the input."""
+    """Prefix the message of an `InputError` from the block with `where`."""
     try:
         yield
     except InputError as e:
@@ -27,14 +28,14 @@ def located(where: str) -> Iterator[None]:
 
 
 def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Raise if a key of `table` is not in `known`."""
+    """Raise `InputError` if a key of `table` is not in `known`."""
     for key in table:
         if key not in known:
             raise unknown("key", key, known)
 
 
 def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
-    """Return a positive integer up to `most`; 2.0 and True are refused."""
+    """Check that `value` is an integer from 1 to `most`, not 2.0 or True; return it."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
     if value > most:
@@ -45,19 +46,19 @@ def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
 
 
 def positive(where: str, value: Any) -> float:
-    """Return a positive finite number as a float."""
+    """Check that `value` is a positive finite number, and return it as a float."""
     if not is_number(value) or not 0 < value <= sys.float_info.max:
         raise InputError(f"{where} = {shown(value)}; expected a positive number")
     return float(value)
 
 
 def is_number(value: object) -> bool:
-    """Return True for an int or a float, False for a bool."""
+    """Return True if `value` is an int or a float; a bool does not count."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def text(where: str, value: object) -> str:
-    """Return a nonempty string without control characters."""
+    """Check that `value` is a nonempty string without control characters; return it."""
     if not isinstance(value, str) or not value:
         raise InputError(f"{where} = {shown(value)}; expected a nonempty string")
     if has_control(value):
@@ -68,19 +69,19 @@ def text(where: str, value: object) -> str:
 
 
 def has_control(text: str) -> bool:
-    """Return True if a text contains a control character."""
+    """Return True if `text` contains an ASCII control character."""
     return any(c < " " or c == "\x7f" for c in text)
 
 
 def any_list(where: str, value: object) -> list[Any]:
-    """Return a list, empty or not."""
+    """Check that `value` is a list, which may be empty, and return it."""
     if not isinstance(value, list):
         raise InputError(f"{where} = {shown(value)}; expected a list")
     return value
 
 
 def filled_list(where: str, value: object) -> list[Any]:
-    """Return a nonempty list."""
+    """Check that `value` is a nonempty list, and return it."""
     entries = any_list(where, value)
     if not entries:
         raise InputError(f"{where} is empty; expected at least one entry")
@@ -88,9 +89,9 @@ def filled_list(where: str, value: object) -> list[Any]:
 
 
 def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
-    """Return a table; raise for other values.
+    """Check that `value` is a table (dict), and return it.
 
-    instead : description of the expected value for the error message
+    instead : description of the expected value in the error message
     """
     if not isinstance(value, dict):
         raise InputError(f"{where} = {shown(value)}; expected {instead}")
@@ -98,7 +99,10 @@ def table(where: str, value: object, *, instead: str = "a table") -> dict[str, A
 
 
 def path(where: str, value: object) -> Path:
-    """Return a str or PathLike as a Path, which need not exist; refuse invalid ones."""
+    """Check that `value` is a str or PathLike, and return it as a Path.
+
+    The file need not exist, but the operating system must accept the path.
+    """
     if not isinstance(value, str | os.PathLike) or not isinstance(
         text := os.fspath(value), str
     ):
@@ -109,14 +113,17 @@ def path(where: str, value: object) -> Path:
         os.stat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError) as e:  # ValueError: a NUL or a lone surrogate
-        why = e.strerror if isinstance(e, OSError) else "no name of a file"
+    except (OSError, ValueError) as e:  # ValueError for NUL and lone surrogates
+        why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
     return Path(text)
 
 
 def texts(where: str, value: object) -> tuple[str, ...]:
-    """Return a tuple of strings; refuse a single string, which is also a sequence."""
+    """Check that `value` is an iterable of strings, and return it as a tuple.
+
+    A single string is refused, although it is an iterable of its characters.
+    """
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         entries = tuple(value)
         if all(isinstance(each, str) for each in entries):
@@ -125,13 +132,13 @@ def texts(where: str, value: object) -> tuple[str, ...]:
 
 
 def flag(where: str, value: object) -> bool:
-    """Return True or False; 0 and 1 are accepted."""
+    """Check that `value` is True, False, 0 or 1, and return it as a bool."""
     if not isinstance(value, int) or value not in (0, 1):
         raise InputError(f"{where} = {shown(value)}; expected True or False")
     return bool(value)
 
 
 def function(where: str, value: object) -> None:
-    """Raise unless `value` is callable."""
+    """Raise `InputError` unless `value` is callable."""
     if not callable(value):
         raise InputError(f"{where} = {shown(value)}; expected a function")

@@ -9,15 +9,15 @@ from typing import IO, TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from hashlib import _Hash
 
-Digest: TypeAlias = "_Hash"  #: a SHA-256 in progress; ``update`` adds another part
+Digest: TypeAlias = "_Hash"  #: an unfinished SHA-256; ``update`` appends bytes
 
 _PIECE_BYTES = 2**20  #: number of bytes that are read at a time
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
-    """Return the first hexadecimal digits of the SHA-256 of concatenated parts.
+    """Return the SHA-256 of the concatenated `parts`, cut to its first digits.
 
-    digits : number of digits, at most 64, of 4 bits each
+    digits : number of hexadecimal digits, at most 64
 
     >>> from mortarbench.harness.digest import hex_digest
     >>> hex_digest([b"a", b"b"]) == hex_digest([b"ab"])
@@ -27,7 +27,7 @@ def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
 
 
 def running_digest(parts: Iterable[bytes]) -> Digest:
-    """Return the SHA-256 of concatenated parts, to which ``update`` adds more."""
+    """Return the unfinished SHA-256 of the concatenated `parts`."""
     content = sha256()
     for part in parts:
         content.update(part)
@@ -35,6 +35,6 @@ def running_digest(parts: Iterable[bytes]) -> Digest:
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:
-    """Yield the rest of a file in pieces."""
+    """Yield the unread rest of an open file in pieces of at most 1 MiB."""
     while piece := file.read(_PIECE_BYTES):
         yield piece

@@ -1,4 +1,4 @@
-"""Exceptions and messages for users: input errors, faults, remarks on stderr."""
+"""Exceptions for invalid input and for faults, and texts of messages for users."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from contextlib import suppress
 from difflib import get_close_matches
 
 MAX_SHOWN = 200  #: number of characters of the user's input that a message repeats
-_MAX_MESSAGE = 600  #: largest number of characters of a message, without paths
-#: Quotations and words. Possessive quantifiers bound the time for adversarial input.
+_MAX_MESSAGE = 600  #: largest number of characters of a message, not counting paths
+#: A quotation or a word. Possessive quantifiers avoid backtracking, whose time could
+#: grow without bound for malicious input.
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 
 
 class InputError(Exception):
-    """Invalid input: one line that states what is wrong, where, and what is expected.
+    """Error for invalid input.
 
-    The command line prints it without a traceback and exits with code 2.
+    The message is one line: the place of the error, the value, and what is expected.
+    The command line prints this line without a traceback and exits with code 2.
     """
 
     def __str__(self) -> str:
@@ -28,31 +30,31 @@ class InputError(Exception):
 class PastEndError(InputError):
     """Error for a step beyond the end of a sequence, such as a converged fixed point.
 
-    A sequence with more steps is truncated at the last existing step.
+    If a suite asks for more steps than exist, its sequence ends at the last step.
     """
 
 
 class FaultError(Exception):
-    """A fault of the harness or the machine, such as a full disk; never of a solver.
+    """Error of the harness or the machine, such as a full disk, but not of a solver.
 
-    The message is one line. A fault yields no verdict: the measurement is retried once,
-    and counts as not measured if it fails again.
+    The message is one line. A fault yields no verdict: the measurement is repeated
+    once, and counts as not measured if the repetition fails as well.
     """
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for a message; abridge it in the middle if long."""
+    """Return the repr of a value for a message, with the middle of a long one cut."""
     try:
         return shortened(repr(value))
     except (
         RecursionError,
         ValueError,
-    ):  # nested too deeply; an integer of too many digits
+    ):  # nested too deeply, or an integer with too many digits
         return f"a {type(value).__name__} too long to show"
 
 
 def shortened(text: str, most: int = MAX_SHOWN) -> str:
-    """Replace the middle of a long text by …, since names differ at their ends.
+    """Replace the middle of a long text by …, since names tend to differ at the ends.
 
     >>> from mortarbench.harness.errors import shortened
     >>> shortened("beam-ring/Nr=30/Nh=15/dual", 16)
@@ -63,10 +65,10 @@ def shortened(text: str, most: int = MAX_SHOWN) -> str:
 
 
 def one_line(message: str) -> str:
-    """Return a message as one line that repeats little of a long input.
+    """Return a message as a single line of limited length.
 
-    Long words and quotations are shortened, then the whole line. Paths that exist are
-    not shortened, since users copy them.
+    First, long words and quotations are shortened, then the whole line if it is still
+    too long. Paths that exist are not shortened, since users copy them.
     """
     line = " ".join(message.splitlines())
     if len(line) <= MAX_SHOWN:
@@ -84,15 +86,19 @@ def one_line(message: str) -> str:
     return shortened(line, _MAX_MESSAGE + sum(map(len, paths)))
 
 
-PLUGINS = "; others come with --plugin FILE.py"  #: follows a list of known names
+#: Hint after the list of known solvers or families in an error message.
+PLUGINS = "; others come with --plugin FILE.py"
 
 
 def unknown(
     what: str, got: str, known: Iterable[str], where: str = "", more: str = ""
 ) -> InputError:
-    """Return the error for an unknown name, with the known names and the nearest.
+    """Return the error for an unknown name; the message lists the known names.
 
-    more : text after the known names
+    A similar known name is suggested, if there is one.
+
+    what : kind of the name, such as "solver"
+    more : text appended to the list of known names
 
     >>> from mortarbench.harness.errors import unknown
     >>> print(unknown("form", "duel", ["primal", "dual"], where="beam-ring"))
@@ -109,7 +115,7 @@ def unknown(
 
 
 def some(names: Iterable[str], most: int = 3) -> str:
-    """Return the first few names, and the number of the others.
+    """Return the first `most` names as text, followed by the number of the others.
 
     >>> from mortarbench.harness.errors import some
     >>> some(["a", "b", "c", "d", "e"])
@@ -120,6 +126,6 @@ def some(names: Iterable[str], most: int = 3) -> str:
 
 
 def say(text: str) -> None:
-    """Print a remark on stderr; results go to stdout."""
+    """Print a remark on stderr, so that stdout carries results only."""
     with suppress(BrokenPipeError):  # a closed stderr must not end the program
         print(f"mortarbench: {text}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Limits of threads and memory for solvers and for building cases."""
+"""Limits on threads, and on memory for solvers and for building cases."""
 
 from __future__ import annotations
 
@@ -6,28 +6,31 @@ import os
 
 from mortarbench.harness.errors import InputError, shown
 
-#: Environment variables that limit libraries to one thread; read when these load.
+#: Environment variables that limit numerical libraries to one thread. A library reads
+#: its variable when it is loaded.
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1"
     for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
 }
-CASE_VARIABLE = "MORTARBENCH_CASE_MIB"  #: limit for building a case, MiB
-VARIABLE = "MORTARBENCH_MEMORY_MIB"  #: limit of the suite, MiB, set for its workers
+#: Environment variable with the memory limit for building a case, in MiB.
+CASE_VARIABLE = "MORTARBENCH_CASE_MIB"
+#: Environment variable with the memory limit of a suite, in MiB, set for its workers.
+VARIABLE = "MORTARBENCH_MEMORY_MIB"
 
 
 def memory_limit_mib() -> float:
-    """Return the memory limit of this process in MiB, at most the machine's memory."""
+    """Return the memory limit of this process in MiB, at most the physical memory."""
     machine = _machine_mib()
     return min(float(os.environ.get(VARIABLE, machine)), machine)
 
 
 def case_limit_mib() -> float:
-    """Return the memory limit for building a case in MiB; default: the machine's.
+    """Return the memory limit for building a case in MiB; default: physical memory.
 
     Raises
     ------
     InputError
-        When the environment variable is not a positive number.
+        If the environment variable is set, but is not a positive number.
 
     """
     text = os.environ.get(CASE_VARIABLE)
@@ -49,8 +52,9 @@ def _machine_mib() -> float:
 
 
 def too_large(n: int, copies: float = 1.0) -> str | None:
-    """Return the reason to decline if dense (n, n) matrices exceed the limit, or None.
+    """Return the reason to decline if dense matrices exceed the memory limit, or None.
 
+    n : number of rows and columns of each matrix
     copies : number of such matrices that the solver stores at the same time
     """
     needed, limit = copies * 8 * n**2 / 2**20, memory_limit_mib()

@@ -1,7 +1,8 @@
-"""The elastic contact problem behind a QP, for certificates of errors.
+"""The elastic contact problem from which a QP is derived, for error certificates.
 
-If a family attaches it to its case (`harness.plugin.Case`), the error of every answer
-is bounded in the energy norm, in any form of the QP; see `harness.verify.certificate`.
+If a family attaches its `Mechanics` to a case (`harness.plugin.Case`), the error of
+every answer is bounded in the energy norm, whichever form the QP has; see
+`harness.verify.certificate`.
 """
 
 from __future__ import annotations
@@ -30,24 +31,27 @@ from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution
 
-#: Extended precision if the machine has it (x86: 64-bit mantissa), so that residuals of
-#: the size of double rounding have some correct digits.
+#: Extended precision if the machine has it (x86: 64-bit mantissa), so that a residual
+#: as small as the rounding errors of double precision still has correct digits.
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
-#: Change of the gaps by a rigid motion, or load along it, that counts as rounding (of
-#: coordinates, normals and tractions), relative to the sum of its absolute terms.
+#: Largest change of the gaps by a rigid motion, and largest work of the loads on it,
+#: that count as rounding (of coordinates, normals and tractions). Both are relative to
+#: the sum of the absolute values of their terms.
 MOTION_ROUNDING = 1e-10
 
 
 class Inverse(Protocol):
-    """A symmetric K⁺, zero on prescribed components and the inverse of K on the others.
+    """A symmetric generalised inverse K⁺ of the stiffness K (n, n).
 
-    If the supports allow rigid motions R,  K K⁺ b = b  holds for Rᵀb = 0.
+    K⁺ is zero on prescribed components, and the inverse of K on the others. If the
+    supports allow rigid motions, which form the columns of R, then K K⁺ b = b for all b
+    with Rᵀb = 0.
     """
 
     @property
     def kernel(self) -> NDArray[np.float64]:
-        """Orthonormal basis R (n, r) of the remaining rigid motions; often r = 0."""
+        """Orthonormal basis R (n, r) of the rigid motions that the supports allow."""
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ to a vector (n,)."""
@@ -57,12 +61,14 @@ class Inverse(Protocol):
 
 
 class Substructures(Protocol):
-    """The stiffness as a sum over floating subdomains:  K = Tᵀ diag(K_1 … K_S) T.
+    """The stiffness as a sum over floating subdomains:  K = Tᵀ PDP T.
 
-    The unknowns v (N,) of subdomains contain a copy of each component for every
-    subdomain around it, in the axes of that subdomain. K_s stands for P_s K_s P_s with
-    P_s = I − R_sR_sᵀ, so that its kernel is exactly the rigid motions R_s: the rounding
-    in K_s R_s is not part of the problem.
+    D is the block diagonal matrix (N, N) of the stiffness matrices of the subdomains.
+    The vector v (N,) contains the displacements of all subdomains. A component on an
+    interface occurs in v once for each adjacent subdomain, in the axes of that
+    subdomain. The columns of R are the rigid motions of the subdomains. In exact
+    arithmetic, DR = 0. The projection P = I − RRᵀ removes the rounding errors in DR, so
+    that the kernel of PDP is exactly the span of R.
     """
 
     @property
@@ -71,38 +77,38 @@ class Substructures(Protocol):
 
     @property
     def kernel(self) -> csr_array:
-        """Orthonormal rigid motions R (N, r), each of a single subdomain."""
+        """Orthonormal rigid motions R (N, r); each column moves a single subdomain."""
 
     @property
     def weight(self) -> Vector:
-        """Relative stiffness (N,) of the copies, equal for all components of a node."""
+        """Relative stiffness (N,) of each copy, equal for all components of a node."""
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
-        """Return the diagonal of K at global components `at` (k,)."""
+        """Return the diagonal entries (k,) of K at the global components `at` (k,)."""
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,), in the precision of v."""
+        """Return PDPv for a vector v (N,), in the precision of v."""
 
     def squared_product(self, v: Vector) -> Vector:
-        """Apply K∘K, the squares of the entries of K, to v (N,)."""
+        """Return the product of v (N,) with D∘D, the squares of the entries of D."""
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P to forces (N,)."""
+        """Return PD⁺Pb for forces b (N,), where D⁺ is a generalised inverse of D."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Friction:
-    """Friction with a given bound (Tresca); zero rows without friction.
+    """Friction with a given bound g on the tangential force, as in Tresca's law.
 
     ::
 
-        Σ gᵢ‖Tᵢu − sᵢ‖  is added to the energy;  its multipliers satisfy  ‖λᵢ‖ ≤ gᵢ
+        energy of friction:  Σ gᵢ‖Tᵢu − sᵢ‖,   multipliers:  ‖λᵢ‖ ≤ gᵢ
 
-    T u is the tangential motion of the slave relative to the master, and s its initial
-    value: zero for a single static load, and T u of the previous step for slip
-    increments. A contact row i with friction has d consecutive rows Tᵢ of equal bound,
-    one for each tangential direction. In the plane d = 1, and ‖·‖ is |·|; in space d =
-    2.
+    T u is the tangential displacement of the slave side relative to the master side.
+    The slip is measured from s: s = 0 for a single static load, and T u of the previous
+    load step for slip increments. A contact row i with friction has d consecutive rows
+    Tᵢ of equal bound, one for each tangential direction: d = 1 in the plane, d = 2 in
+    space. A problem without friction has zero rows.
 
     The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
     the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
@@ -110,58 +116,67 @@ class Friction:
 
     T: csr_array  #: (k, n) tangential rows, d consecutive ones per contact row
     bound: Vector  #: (k,) g ≥ 0, a force
-    start: Vector  #: (k,) s, a length
+    start: Vector  #: (k,) s, the T u from which slip is measured, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
-    cohesion: Vector  #: (k,) a force
+    cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
     mu: Vector  #: (k,) coefficient of friction
-    unsettled: float = 0.0  #: `residual` at the solution with this bound; 0 if unknown
+    #: `residual` at the solution of the problem with this bound; 0 if unknown
+    unsettled: float = 0.0
 
     @property
     def tangents(self) -> int:
-        """Number d of tangential directions, or friction rows per contact row."""
+        """Number d of tangential directions, i.e. of friction rows per contact row."""
         return int(np.bincount(self.row).max(initial=1))
 
     @property
     def vectors(self) -> NDArray[np.int64]:
-        """The friction rows (k/d, d) of each tangential vector."""
+        """Numbers (k/d, d) of the friction rows that form each tangential vector."""
         return np.arange(self.row.size).reshape(-1, self.tangents)
 
     def discs(self, first: int) -> Discs:
-        """Return the sets of the multipliers λ_t, which begin at variable `first`."""
+        """Return the discs of the multipliers λ_t, which begin at variable `first`."""
         return friction_discs(self.bound, self.tangents, first)
 
     def slip(self, u: NDArray[Any]) -> NDArray[Any]:
-        """Return Tᵢu − sᵢ (k/d, d) for u (n,)."""
+        """Return the slip Tᵢu − sᵢ (k/d, d) for a displacement u (n,)."""
         return np.asarray((self.T @ u - self.start)[self.vectors])
 
     def work(self, u: NDArray[Any]) -> float:
-        """Return Σ gᵢ‖Tᵢu − sᵢ‖ for u (n,)."""
+        """Return the energy of friction Σ gᵢ‖Tᵢu − sᵢ‖ for a displacement u (n,)."""
         radius = self.bound[self.vectors[:, 0]]
         return float(radius @ norms(self.slip(u)))
 
     def demanded(self, normal: Vector) -> Vector:
-        """Return cohesion + mu·max(λ_n, 0) (k,) for normal forces (m,)."""
+        """Return the bound cohesion + mu·max(λ_n, 0) (k,) that the law requires.
+
+        normal : (m,) multipliers λ_n of the contact rows
+        """
         return np.asarray(self.cohesion + self.mu * np.maximum(normal[self.row], 0.0))
 
     def residual(self, normal: Vector) -> float:
-        """Return ‖g − demanded‖/‖g‖ for normal forces (m,); absolute if g = 0."""
+        """Return the relative distance of the bound g from the one the law requires.
+
+        The distance is ‖g − demanded‖₂/‖g‖₂, or without the divisor if g = 0.
+
+        normal : (m,) multipliers λ_n of the contact rows
+        """
         off = float(np.linalg.norm(self.bound - self.demanded(normal)))
         return off / (float(np.linalg.norm(self.bound)) or 1.0)
 
     def __getitem__(self, selected: NDArray[Any]) -> Friction:
-        """Return the selected rows (an index array or a mask)."""
+        """Return the friction of the selected rows, given by indices or a mask."""
         rows = {k: v[selected] for k, v in vars(self).items() if k != "unsettled"}
         return replace(self, **rows)
 
 
 def friction_discs(bound: Vector, tangents: int, first: int) -> Discs:
-    """Return the sets ‖λᵢ‖ ≤ gᵢ of multipliers of friction rows.
+    """Return the discs ‖λᵢ‖ ≤ gᵢ of the multipliers of friction rows.
 
     Parameters
     ----------
-    bound : (k,) g of each row, equal for the d rows of a vector
-    tangents : d
-    first : number of the first of these multipliers
+    bound : (k,) bound g of each row, equal for the d rows of a tangential vector
+    tangents : number d of tangential directions
+    first : number of the variable that is the first of these multipliers
 
     """
     index = first + np.arange(bound.size).reshape(-1, tangents)
@@ -180,7 +195,10 @@ NO_FRICTION = Friction(
 
 
 def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
-    """Return the rows of contact, then of friction:  B (m + k, n)  and  c (m + k,)."""
+    """Return matrix B (m + k, n) and right-hand side c (m + k,) of all rows.
+
+    The m contact rows precede the k friction rows.
+    """
     B = csr_array(primal.G)
     if not friction.bound.size:
         return B, primal.h
@@ -188,24 +206,26 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 
 
 def with_friction(primal: QP, friction: Friction) -> QP:
-    """Return the problem with friction as a QP, with further variables.
+    """Return the problem with friction as a QP with auxiliary variables.
 
-    For the friction rows with g > 0, in the plane one t per |·|,
+    Friction rows with g = 0 are omitted. In the plane, a variable t ≥ |Tu − s| is added
+    for each row:
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    and in space the slip w = Tu − s and one t per ‖·‖, over second-order cones,
+    In space, two variables, the slip w = Tu − s, and a variable t ≥ ‖w‖ are added for
+    each tangential vector, where (t, w) lies in a second-order cone:
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
 
-    The unknown is (u, t) or (u, t, w). Without friction rows, `primal` itself is
-    returned. See `friction_multipliers` for those of the friction rows.
+    The unknown is (u, t) or (u, t, w). If no row has g > 0, `primal` itself is
+    returned. `friction_multipliers` returns the multipliers of the friction rows.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
@@ -246,10 +266,13 @@ def with_friction(primal: QP, friction: Friction) -> QP:
 def friction_multipliers(
     s: Solution, primal: QP, friction: Friction
 ) -> tuple[Vector, Vector, Vector]:
-    """Split a solution of `with_friction`: y of supports, z of contact, λ_t.
+    """Return the multipliers of supports, contact and friction rows from a solution.
 
-    λ_t (k,) is in the plane the difference of the multipliers of the two rows of each
-    |·|, and in space the multiplier of Tu − w = s; zero where g = 0.
+    s : solution of the QP returned by `with_friction`
+
+    The multipliers λ_t (k,) of friction rows are zero where g = 0. In the plane, the
+    other entries are differences of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s; in
+    space, they are the multipliers of Tu − w = s.
     """
     e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
     tangential = np.zeros(acts.size)
@@ -263,9 +286,9 @@ def friction_multipliers(
 
 @dataclass(frozen=True, eq=False)
 class AdmissibleForces:
-    """Set Λ of admissible multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction."""
+    """Set Λ of admissible multipliers: λᵢ ≥ 0 for contact, ‖λᵢ‖ ≤ gᵢ for friction."""
 
-    rows: int  #: m
+    rows: int  #: number m of rows of contact and friction
     discs: Discs  #: discs of the friction rows, which are the last rows
 
     @cached_property
@@ -275,7 +298,7 @@ class AdmissibleForces:
 
     @property
     def sets(self) -> tuple[ConvexSet, ...]:
-        """The same set for variables of a QP."""
+        """The set Λ as a box and discs, the form in which a QP takes it."""
         upper = np.full(self.rows, np.inf)
         return Box(np.where(self.contact, 0.0, -upper), upper), self.discs
 
@@ -285,10 +308,11 @@ class AdmissibleForces:
         return np.where(self.contact, np.maximum(nearest, 0), nearest)
 
     def room(self, multipliers: Extended) -> Extended:
-        """Return g − ‖λ‖ of each friction vector; rounding is set to zero.
+        """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
-        Projected multipliers are on their circle up to rounding in extended precision,
-        about 1e-19. In the work, √1e-19 would dominate certificates.
+        The norm of a projected multiplier equals g only up to rounding in extended
+        precision, about 1e-19. As work, this error would dominate certificates, which
+        contain its square root.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -296,13 +320,16 @@ class AdmissibleForces:
         return np.where(np.abs(room) > rounding, room, 0)
 
     def interior(self, multipliers: Extended) -> Extended:
-        """Return the distance (m,) from the boundary: λ of contact, g − ‖λ‖."""
+        """Return the distance (m,) from the boundary of Λ.
+
+        The distance is λᵢ for contact rows, and g − ‖λ‖ for friction rows.
+        """
         distance = multipliers.copy()
         distance[self.discs.index] = self.room(multipliers)[:, None]
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return the bounds (m,) of each λᵢ, with the other components fixed."""
+        """Return lower and upper bounds (m,) of each λᵢ, with all others held fixed."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -315,17 +342,18 @@ class AdmissibleForces:
 class Exact(NamedTuple):
     """The data of the contact problem except K, in extended precision.
 
-    The rows are those of contact, then those of friction. At a solution, v = Bu − c is
-    normal to Λ at λ: λ ∈ Λ and λᵀv = σ(v). The support function σ of Λ is Σ gᵢ‖vᵢ‖,
-    summed over friction vectors, if v ≤ 0 on all contact rows, and infinite otherwise.
+    Contact rows precede friction rows. Λ is the set of admissible multipliers. At a
+    solution, v = Bu − c is normal to Λ at λ: λ ∈ Λ and λᵀv = σ(v). Here, σ is the
+    support function of Λ: σ(v) is Σ gᵢ‖vᵢ‖, summed over friction vectors, if v ≤ 0 on
+    all contact rows, and infinite otherwise.
     """
 
-    f: Extended  #: (n,)
-    B: Any  #: (m, n) sparse, contact and friction
-    c: Extended  #: (m,)
-    forces: AdmissibleForces  #: Λ
-    fixed: NDArray[np.int64]  #: prescribed components
-    compliance: Extended  #: (m,) estimate for each row, B_i diag(K)⁻¹B_iᵀ
+    f: Extended  #: (n,) load
+    B: Any  #: (m, n) sparse rows of contact and friction
+    c: Extended  #: (m,) right-hand side: initial gaps, then the `start` of friction
+    forces: AdmissibleForces  #: set Λ of admissible multipliers
+    fixed: NDArray[np.int64]  #: numbers of the prescribed components
+    compliance: Extended  #: (m,) estimate B_i diag(K)⁻¹ B_iᵀ for each row B_i
 
     @property
     def contact(self) -> NDArray[np.bool_]:
@@ -333,20 +361,21 @@ class Exact(NamedTuple):
         return self.forces.contact
 
     def motion(self, u: Extended) -> Extended:
-        """Return v = Bu − c (m,), the penetration or the slip of each row."""
+        """Return v = Bu − c (m,), the penetration or the slip in each row."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
-        """Return gᵢ‖vᵢ‖ of each friction vector."""
+        """Return the energy of friction gᵢ‖vᵢ‖ of each friction vector."""
         discs = self.forces.discs
         return np.asarray(discs.radius * norms(self.motion(u)[discs.index]))
 
     def missing_work(
         self, multipliers: Extended, motion: Extended
     ) -> tuple[Extended, Extended]:
-        """Return σ(v) − λᵀv ≥ 0 of each contact row and each friction vector.
+        """Return the nonnegative terms of σ(v) − λᵀv, which vanishes at a solution.
 
-        For a friction vector, g‖v‖ − λᵀv is evaluated without cancellation as
+        The first array contains the terms of contact rows, −λᵢvᵢ, the second those of
+        friction vectors. The latter, g‖v‖ − λᵀv, are evaluated without cancellation as
 
             (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
         """
@@ -365,21 +394,21 @@ class Exact(NamedTuple):
 class RigidMotions(NamedTuple):
     """Rigid motions that the supports allow, split into constrained and free ones.
 
-    Constrained motions change contact gaps. Columns are orthonormal in extended
-    precision. K·constrained is zero up to rounding, which matters if bodies move far;
-    see `harness.verify.certificate`.
+    Constrained motions change contact gaps or slip; free ones do not. Columns are
+    orthonormal in extended precision. K·constrained is zero except for rounding errors,
+    which matter if bodies move far; see `harness.verify.certificate`.
     """
 
-    constrained: Any  #: (n, p) sparse; motions that open or close contact rows
-    free: Any  #: (n, q) sparse; gaps change by rounding only
+    constrained: Any  #: (n, p) sparse; motions that change gaps or slip
+    free: Any  #: (n, q) sparse; motions that change gaps and slip by rounding only
     G: Extended  #: (m, p)  B·constrained
     largest: (
-        Any  #: (n, p) each column's largest |entry|, in the pattern of `constrained`
+        Any  #: (n, p) `constrained` with each nonzero replaced by its column's largest
     )
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
-#: Meshio's names of first-order cells, by dimension and number of corners.
+#: Names of first-order cells in meshio, by dimension and number of corners.
 KINDS = {
     (0, 1): "vertex",
     (1, 2): "line",
@@ -391,9 +420,9 @@ KINDS = {
 }
 
 
-#: Corners of the facets of each kind. In the plane the cell is on the left of an edge;
-#: in space the corners are anticlockwise from outside, and triangles repeat the last
-#: one.
+#: Corners of each facet, for each kind of cell. In the plane, the cell is on the left
+#: of the edge. In space, the corners are in anticlockwise order when seen from outside,
+#: and a triangle repeats its last corner.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),
@@ -408,19 +437,19 @@ FACETS = {
 
 
 class CellBlock(NamedTuple):
-    """Cells of one kind."""
+    """The cells of one kind in a table of cells."""
 
     kind: str  #: name of the kind in meshio
-    nodes: NDArray[np.int64]  #: (k, corners)
-    cells: NDArray[np.int64]  #: (k,) their rows in the table
+    nodes: NDArray[np.int64]  #: (k, corners) node numbers
+    cells: NDArray[np.int64]  #: (k,) rows of these cells in the table
 
 
 def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
-    """Split a table of cells (E, c) by kind, those with the fewest corners first.
+    """Split a table of cells (E, c) by kind; kinds with few corners come first.
 
-    In a mixed table, cells with fewer than c corners repeat some of them: a triangle
-    among quadrilaterals is (a, b, c, c), a wedge among hexahedra (a, b, c, c, d, e, f,
-    f) and a tetrahedron (a, b, c, c, d, d, d, d).
+    In a mixed table, a cell with fewer than c corners repeats some of its corners: a
+    triangle among quadrilaterals is (a, b, c, c), a wedge among hexahedra is (a, b, c,
+    c, d, e, f, f), and a tetrahedron is (a, b, c, c, d, d, d, d).
 
     dim : dimension of the cells
 
@@ -445,9 +474,10 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 
 
 def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
-    """Return the facets (k, m) that belong to one cell only, which is on their left.
+    """Return the node numbers (k, m) of the facets that belong to a single cell.
 
-    In the plane facets are edges, sorted by their lower node, then by the other one.
+    Facets are oriented as in `FACETS`. In the plane, they are edges, sorted by the
+    lower, then by the higher node number.
     """
     facets, names, _ = cell_facets(cells, dim)
     key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
@@ -458,17 +488,17 @@ def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
 
 
 def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
-    """Return the facets of all cells (k, m), their names (k, dim) and cells (k,).
+    """Return the facets (k, m) of all cells, their keys (k, dim), cell numbers (k,).
 
-    The dim lowest nodes of a facet are its name, which neighbouring cells share.
-    Degenerate facets between repeated corners are left out; triangles in space repeat
-    their last corner.
+    The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
+    cells have the same key for their common facet. Degenerate facets between repeated
+    corners are left out. In space, a triangle repeats its last corner.
     """
     facet = np.array(FACETS[KINDS[dim, cells.shape[1]]])
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # distinct nodes come first
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # sorted to the end
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
@@ -481,62 +511,63 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
 
 
 class Grid(NamedTuple):
-    """The mesh of the unknowns, which are numbered node by node."""
+    """The mesh on which u is defined; components of the same node are consecutive."""
 
-    points: NDArray[np.float64]  #: (N, d)
-    #: (E, 2) segments, or (E, 4) corners in order, of which a triangle repeats the
-    #: last one; in space (E, 8) hexahedra
+    points: NDArray[np.float64]  #: (N, d) positions of the nodes
+    #: node numbers: (E, 2) for segments; (E, 4) for quadrilaterals, with corners in
+    #: cyclic order, where a triangle repeats its last node; (E, 8) for hexahedra
     cells: NDArray[np.int64]
     bodies: NDArray[np.int64]  #: (E,) body number of each cell
-    lift: Vector  #: (n,) physical unknown − u, from nonzero boundary values
+    lift: Vector  #: (n,) added to u to satisfy nonzero boundary values
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanics:
-    """Non-dimensional elastic contact problem, and the map of solutions to it.
+    """Non-dimensional elastic contact problem, and the map to its displacement u.
 
     ::
 
         min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
 
-    `Friction` adds its terms to the energy.
+    With `friction`, its energy is added to the objective.
     """
 
-    #: P = K, q = −f, A has one unit entry per prescribed component, b = 0, G = B, h = c
+    #: P = K, q = −f, G = B, h = c, b = 0; each row of A has a single entry 1, at a
+    #: prescribed component
     primal: QP
-    #: maps a solution of the emitted QP to x = u, y of the supports, and z of the
-    #: contact and friction rows
+    #: maps a solution of the emitted QP to x = u, the multipliers y of the supports,
+    #: and the multipliers z of the contact and friction rows
     to_primal: Callable[[Solution], Solution]
-    factorise: Callable[[], Inverse]  #: returns K⁺; called at most once
+    factorise: Callable[[], Inverse]  #: factorises K, returns K⁺; called at most once
     #: cell size of the contact side, in the unit of length of `primal`
     mesh_size: float
-    #: (n, r) rigid motions of each body, regardless of supports, to measure the balance
-    #: of forces
+    #: (n, r) rigid motions of each body, regardless of supports, for checks of
+    #: equilibrium
     rigid: NDArray[np.float64]
     names: tuple[
         str, ...
     ] = ()  #: names of the bodies, in the order of the columns of `rigid`
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
-    #: needed to compare meshes, see `harness.crossval.discretisation`
+    #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`
     grid: Grid | None = None
     friction: Friction = NO_FRICTION
-    #: returns the `Certificate` of a displacement (n,) with multipliers (m,) of `rows`,
-    #: computed by subdomains without a factor of the assembled K
+    #: returns the `Certificate` of a displacement (n,) and the multipliers (m,) of
+    #: `rows`, computed for each subdomain, without factorising the assembled K
     certify_by_subdomains: Callable[[Vector, Vector], Any] | None = None
 
     @cached_property
     def rows(self) -> csr_array:
-        """All rows B (m, n): of contact, then of friction."""
+        """Rows B (m, n) of contact, followed by those of friction with g > 0."""
         return contact_rows(self.primal, self._active_friction)[0]
 
     @cached_property
     def program(self) -> QP:
-        """The problem as a QP, see `with_friction`; `primal` without friction."""
+        """The problem as a QP, see `with_friction`; `primal` if it is frictionless."""
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:
-        """Return λ (m,) of `rows` from a solution returned by `to_primal`."""
+        """Return the multipliers λ (m,) of `rows` from a result of `to_primal`."""
         contact = self.primal.h.size
         return np.append(s.z[:contact], s.z[contact:][self.friction.bound > 0])
 
@@ -547,12 +578,12 @@ class Mechanics:
 
     @cached_property
     def inverse(self) -> Inverse:
-        """K⁺, factorised at the first access."""
+        """Generalised inverse K⁺; K is factorised at the first access."""
         return self.factorise()
 
     @cached_property
     def exact(self) -> Exact:
-        """The data in extended precision."""
+        """The data of the problem except K, in extended precision."""
         diagonal, B = self.primal.P.diagonal(), self.rows
         c = contact_rows(self.primal, self._active_friction)[1]
         fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
@@ -571,12 +602,12 @@ class Mechanics:
 
     @cached_property
     def stiffness(self) -> Any:
-        """K (n, n), sparse, in extended precision."""
+        """Sparse stiffness K (n, n) in extended precision."""
         return csr_array(self.primal.P).astype(Real)
 
     @cached_property
     def whole(self) -> Mechanics:
-        """The same problem without subdomains, for K⁺ or a u_λ without jumps."""
+        """The same problem, certified with the assembled K instead of by subdomains."""
         return (
             self
             if self.certify_by_subdomains is None
@@ -584,9 +615,9 @@ class Mechanics:
         )
 
     def energy(self, u: Extended) -> float:
-        """Return the potential energy of `u` (n,) with the work of friction, SI.
+        """Return the potential energy of `u` (n,), including friction, in SI units.
 
-        The energy is summed in extended precision.
+        The terms are summed in extended precision.
         """
         objective = 0.5 * (u @ (self.stiffness @ u)) - self.exact.f @ u
         objective = objective + self.exact.friction_work(u).sum()
@@ -599,7 +630,7 @@ class Mechanics:
 
     @cached_property
     def motions(self) -> RigidMotions:
-        """The same motions, split into constrained and free ones."""
+        """Rigid motions that the supports allow, as constrained and free motions."""
         exact, B, R = self.exact, self.rows, self.inverse.kernel
         turn, p = constrained_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
@@ -617,37 +648,38 @@ class Mechanics:
         )
 
     def without_rigid_motion(self, v: Extended) -> Extended:
-        """Return v − R Rᵀv (n,), without rigid motion."""
+        """Return v − RRᵀv (n,), where R is `kernel`."""
         if not self.kernel.shape[1]:  # products with empty sparse matrices are slow
             return v
         return np.asarray(v - self.kernel @ (self.kernel.T @ v))
 
     def apply_inverse(self, force: Extended) -> Extended:
-        """Apply  P K⁺P,  P = I − RRᵀ,  to a force (n,)."""
+        """Apply PK⁺P to a force (n,), where P = I − RRᵀ and R is `kernel`."""
         u = self.inverse(self.without_rigid_motion(force).astype(np.float64))
         return self.without_rigid_motion(u.astype(Real))
 
     def norm(self, v: Extended) -> float:
         """Return the energy norm ‖v‖_K, a seminorm if bodies can move rigidly.
 
-        The rigid motion is subtracted first: KR = 0 holds up to rounding only, which
-        would dominate the result for a motion much larger than the deformation.
+        The rigid part of v is subtracted first. KR = 0 holds only up to rounding
+        errors, which would dominate if the rigid part is much larger than the
+        deformation.
         """
         v = self.without_rigid_motion(v)
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 
 def _orthonormal(R: NDArray[np.float64]) -> Any:
-    """Orthonormalise columns (n, r) that are orthonormal to double precision; sparse.
+    """Orthonormalise the columns of R (n, r) in extended precision, as a sparse matrix.
 
-    One step of R + R(I − RᵀR)/2 squares their error.
+    R is orthonormal to double precision; the step R + R(I − RᵀR)/2 squares this error.
     """
     Q = csr_array(R.astype(Real))
     return csr_array(Q + Q @ (0.5 * (eye_array(R.shape[1]) - Q.T @ Q)))
 
 
 def _largest(R: Any) -> Any:
-    """Replace the entries of each column by the largest absolute value in it."""
+    """Replace the nonzeros of each column by the column's largest absolute value."""
     columns = csc_array(abs(R))
     empty = np.zeros(R.shape[1])
     sizes = columns.max(axis=0).toarray().ravel() if columns.nnz else empty
@@ -656,12 +688,12 @@ def _largest(R: Any) -> Any:
 
 
 def cancelling(K: csr_array, R: Extended) -> Extended:
-    """Return KR (n, r) to about twice the digits of doubles, in spite of cancellation.
+    """Return KR (n, r) with about twice the digits of doubles, despite cancellation.
 
-    K and R are split into remainders and leading parts, which have 26 and 24 bits
-    relative to the largest entry of a row of K and of R. In extended precision (64
-    bits) the products of the leading parts are exact, and so are their sums over a row
-    of K.
+    K and R are split into leading parts and remainders. The leading part of K has 26
+    bits relative to the largest entry of the row; that of R has 24 bits relative to the
+    largest entry of R. In extended precision (64 bits), products of leading parts are
+    exact, and so is the sum of these products over a row of K.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))
@@ -673,7 +705,7 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
 
 
 def _leading(v: Any, size: Any, bits: int) -> Any:
-    """Round to multiples of 2^−bits·`size`, with size rounded up to a power of two."""
+    """Round v to multiples of 2^−bits·`size`, with size rounded up to a power of 2."""
     unit = np.exp2(np.ceil(np.log2(np.where(size > 0, size, 1))) - bits)
     return np.round(v / unit) * unit
 
@@ -681,7 +713,13 @@ def _leading(v: Any, size: Any, bits: int) -> Any:
 def constrained_first(
     B: Matrix, R: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], int]:
-    """Return a rotation V (r, r) and p, the number of nonzero columns of BRV."""
+    """Return an orthogonal V (r, r) and the number p of nonzero columns of BRV.
+
+    The nonzero columns come first. Values up to `MOTION_ROUNDING` count as zero.
+
+    B : (m, n) rows of contact and friction
+    R : (n, r) rigid motions
+    """
     r = R.shape[1]
     length = np.sqrt(np.asarray(B.multiply(B).sum(axis=1)).ravel())
     per = 1 / np.where(length > 0, length, np.inf)

@@ -1,12 +1,13 @@
 """Case names ``FAMILY/key=value/…/FORM``: strict parsing, and canonical names.
 
-Missing keys are filled in by the family's ``complete``, which may derive a default from
-other keys (a number of layers from another one).
+The family's method ``complete`` adds missing keys. The default of a key may depend on
+other keys: a default number of layers may depend on the number of cells.
 
-A family that reads problems from files has the key ``path``, and ``path_suffix`` is the
-ending of its paths. Its names are ``FAMILY:PATH/key=value/…/FORM``, where PATH ends at
-the first part with that suffix; or ``FAMILY:PATH`` if the suffix is empty and there is
-one form.
+A family that reads problems from files has the key ``path``, and its attribute
+``path_suffix`` is the suffix of these files. A case is named
+``FAMILY:PATH/key=value/…/FORM``. Since PATH may contain slashes, it ends at the first
+component with the suffix. If ``path_suffix`` is empty, PATH is the rest of the name,
+``FAMILY:PATH``, and the family has a single form.
 """
 
 from __future__ import annotations
@@ -37,25 +38,25 @@ _TYPE_NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class CaseId:
-    """A checked case of a family; its str is the canonical name."""
+    """A valid choice of family, keys and form; `str` returns the canonical name."""
 
     family: Family = field(compare=False, repr=False)
-    name: str  #: canonical: without keys that the others imply
-    params: Mapping[str, Value]  #: all keys, in the order of the family
+    name: str  #: canonical name, without keys whose value follows from the other keys
+    params: Mapping[str, Value]  #: values of all keys, in the order of the family
     form: str
 
     def __str__(self) -> str:
         return self.name
 
     def build(self, reference: Reference) -> Case:
-        """Build the case; output of the family is redirected to stderr.
+        """Build the case, with anything that the family prints redirected to stderr.
 
         Exceptions of the family are not caught.
 
         Raises
         ------
         TypeError
-            When the family does not return a `Case`.
+            If the family does not return a `Case`.
 
         """
         with redirect_stdout(sys.stderr):
@@ -71,12 +72,13 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     Raises
     ------
     InputError
-        When a family, key or form is unknown, a key is set twice, a part is not
-        key=value, a value has the wrong type, or ``family.check`` refuses a value.
+        If a family, key or form is unknown, a key is set twice, a component is not
+        of the form key=value, a value has the wrong type, or ``family.check`` refuses
+        the values.
 
     Examples
     --------
-    Keys with the default of the family are not part of the canonical name:
+    Keys with their default values are not part of the canonical name:
 
     >>> from mortarbench.harness.names import parse
     >>> from mortarbench.problems import PROBLEMS
@@ -141,14 +143,16 @@ def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
 def assemble(
     family: Family, given: Mapping[str, object], form: str, *, texts: bool = False
 ) -> CaseId:
-    """Return the checked case with the keys `given`.
+    """Return the case of a family with the keys `given` and a form, after checks.
 
-    texts : convert texts to numbers, as in a name
+    texts : True to convert the text of a value to a number if the default of its key
+        is a number
 
     Raises
     ------
     InputError
-        For the same reasons as `parse`.
+        If the form or a key is unknown, a value has the wrong type, or
+        ``family.check`` refuses the values.
 
     """
     if form not in family.forms:
@@ -168,7 +172,7 @@ def assemble(
 
 
 def _canonical(family: Family, params: Mapping[str, Value], form: str) -> str:
-    """Return the name without the keys that the other keys imply."""
+    """Return the case name without keys whose value follows from the other keys."""
     needed, head = dict(params), family.name
     if (path := needed.pop(_path_key(family), None)) is not None:
         head = f"{head}:{path}"
@@ -184,7 +188,7 @@ def _canonical(family: Family, params: Mapping[str, Value], form: str) -> str:
 
 
 def unbuilt(name: object, e: BaseException) -> str:
-    """Return a message of one line for a case that could not be built."""
+    """Return a one-line message for a case that could not be built because of `e`."""
     match e:
         case InputError():
             why = str(e)
@@ -196,18 +200,19 @@ def unbuilt(name: object, e: BaseException) -> str:
 
 
 def is_shared(name: CaseId) -> bool:
-    """Return True if ranks can assemble the QP of a case, see `Family.emission`.
+    """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
 
-    An exception of the family counts as False: the same one will occur in `build`.
+    The result is False if the family raises an exception. `build` will raise the same
+    exception, and is the place to report it.
     """
     try:
         return name.family.emission(name.form, name.params) is not None
-    except Exception:  # the family's code
+    except Exception:  # raised by code of the family
         return False
 
 
 def match(pattern: str, names: Iterable[str]) -> list[str]:
-    """Return the canonical names that match a shell glob.
+    """Return those of the canonical `names` that match a shell glob.
 
     >>> from mortarbench.harness.names import match
     >>> match("*/dual", ["beam-ring/dual", "beam-ring/primal"])
@@ -217,20 +222,20 @@ def match(pattern: str, names: Iterable[str]) -> list[str]:
 
 
 def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
-    """Return all keys in the order of the family, with defaults filled in."""
+    """Return the values of all keys in the order of the family, including defaults."""
     params = family.complete(given)
     return {key: params[key] for key in family.defaults}
 
 
 def _path_key(family: Family) -> str:
-    """Return the key of the path, or "" if the family reads no file."""
+    """Return "path" if the family reads files, which makes it a key, else ""."""
     return "" if family.path_suffix is None else "path"
 
 
 def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]:
-    """Split the text after ``FAMILY:`` into the path and the other parts.
+    """Split the text after ``FAMILY:`` into the path and the other components.
 
-    The form of a family with a single form may be missing, and is added.
+    The form may be missing if the family has a single form; it is then added.
     """
     head = family.name
     path = text[len(head) + 1 :]
@@ -253,7 +258,7 @@ def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]
 def _number(text: str, kind: type) -> object:
     """Convert a text to a finite number; return any other text unchanged."""
     if not (_INTEGER if kind is int else _REAL).fullmatch(text):
-        return text  # Python alone accepts 1_0 and digits of other scripts
+        return text  # int and float would accept 1_0 and digits of other scripts
     try:
         number = kind(text)
         return number if math.isfinite(number) else text
@@ -262,9 +267,10 @@ def _number(text: str, kind: type) -> object:
 
 
 def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
-    """Return a value with the type of the key's default.
+    """Check the type of a value, and return it; an integer may become a float.
 
-    free : allow the characters / and =, which separate the parts of a name
+    kind : type of the default of the key
+    free : True to allow the characters / and =, which separate components of a name
     """
     match value:
         case str() if kind is str and value and (free or not set("/=") & set(value)):

@@ -1,12 +1,13 @@
-"""Serialisable operators P: plain arrays, and the name of a function that builds P.
+"""Serialisable operators: plain arrays and the name of a function that builds P.
 
-A matrix-free P cannot be written to a file, but the arrays that it is built from can.
-Workers receive these arrays and build the operator on the clock: work before the first
-product, such as a factorisation, counts as preparation of the solver.
+P is the matrix of a QP. A matrix-free P cannot be written to a file, but the arrays
+from which it is built can. Workers receive these arrays and build the operator while
+the clock runs: work before the first product, such as a factorisation, counts as
+preparation of the solver.
 
-The function is looked up by name in a table of *makers*: the ``OPERATORS`` of a
-plug-in, or that of a package. A file contains the name only. It cannot specify a module
-to import.
+The function that builds P, its *maker*, is looked up by name in a table: the
+``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
+and therefore cannot cause the import of a module.
 """
 
 from __future__ import annotations
@@ -23,70 +24,74 @@ from mortarbench.harness.distributed.sparse import LinearMap
 
 Arrays = Mapping[str, NDArray[Any]]
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-#: Maps plain arrays to x ↦ Px, for vectors (n,) and matrices (n, k).
+#: Function that builds x ↦ Px, for x of shape (n,) or (n, k), from plain arrays.
 Maker = Callable[[Arrays], Product]
 NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 
 
 @runtime_checkable
 class Preconditioned(Protocol):
-    """A product x ↦ Px that also offers approximate inverses of P.
+    """A product x ↦ Px with a method that returns preconditioners for P.
 
-    A maker may return one; solvers get it from `SerialisableOperator.build`.
+    A maker may return such a product; solvers obtain it from `preconditioned`.
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply P by (n,) or (n, k)."""
+        """Return Px for x of shape (n,) or (n, k)."""
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Return x ↦ Mx, symmetric positive semidefinite, for (n,) and (n, k).
+        """Return x ↦ Mx for x of shape (n,) or (n, k), where M approximates P⁻¹.
 
-        kind, scaling : names that the operator defines
+        M is symmetric positive semidefinite.
+
+        kind, scaling : names of a preconditioner and of its scaling; each operator
+            defines its own names
 
         Raises
         ------
         ValueError
-            If a name is unknown; the message lists the valid names.
+            If `kind` or `scaling` is unknown; the message lists the valid names.
 
         """
 
 
 @runtime_checkable
 class WithDiagonal(Protocol):
-    """A product x ↦ Px that also offers the diagonal of P; a maker may return one.
+    """A product x ↦ Px with a method that returns the diagonal of P.
 
-    Pᵢᵢ scales the residual of component i. Without it, an operator is judged more
-    strictly than a matrix (`harness.verify.kkt`).
+    A maker may return such a product. Pᵢᵢ scales the residual of component i; without
+    the diagonal, the scale is smaller, and the verdict stricter than for a matrix
+    (`harness.verify.kkt`).
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply P by (n,) or (n, k)."""
+        """Return Px for x of shape (n,) or (n, k)."""
 
     def diagonal(self) -> NDArray[np.float64]:
-        """Return Pᵢᵢ (n,)."""
+        """Return the diagonal entries Pᵢᵢ (n,)."""
 
 
 @runtime_checkable
 class Compiled(Protocol):
-    """A product x ↦ Px whose map compiled solvers apply without calling Python."""
+    """A product x ↦ Px that compiled solvers can apply without calling Python."""
 
     @property
     def linear_map(self) -> LinearMap:
-        """The same product."""
+        """The map x ↦ Px as an object of compiled code."""
 
 
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
-    maker : name of a function in `makers`
-    arrays : plain arrays by name, the argument of that function
-    makers : functions by name; workers have the same table, with the ``OPERATORS`` of
-        the same plug-ins
+    maker : name of the function in `makers` that builds the product
+    arrays : plain arrays by name, the argument of the maker
+    makers : functions by name; a worker loads the same plug-ins, and so has the same
+        table
 
     Raises
     ------
     ValueError
-        When `maker` is not in `makers`.
+        If `maker` is not a name in `makers`.
 
     Examples
     --------
@@ -117,27 +122,27 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         self._product: Product | None = None
 
     def build(self) -> Product:
-        """Return the product, built at the first call."""
+        """Return the product x ↦ Px, which the first call builds."""
         if self._product is None:
             self._product = self._make(self.arrays)
         return self._product
 
     def diagonal(self) -> NDArray[np.float64] | None:
-        """Return Pᵢᵢ (n,), or None if the product is not a `WithDiagonal`."""
+        """Return the diagonal of P (n,), or None if the product has no `diagonal`."""
         product = self.build()
         return product.diagonal() if hasattr(product, "diagonal") else None
 
     @property
     def least_eigenvalue(self) -> float | None:
-        """Proven lower bound of the eigenvalues of P that the product offers, or None.
+        """Proven lower bound on the eigenvalues of P, or None if the product has none.
 
-        With a positive one, errors of answers over convex sets are bounded
+        A positive bound yields an error bound for any answer over convex sets
         (`harness.verify.certificate.certify_by_eigenvalue`).
         """
         return getattr(self.build(), "least_eigenvalue", None)
 
     def forget(self) -> None:
-        """Drop the product, so that the next solver is charged for building it."""
+        """Discard the product, so that the next solver has to build it on the clock."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -150,25 +155,28 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return self
 
 
-# The next functions look for an attribute: `isinstance` with a protocol takes longer
-# than several products with a small operator.
+# The next functions test for an attribute, since `isinstance` with a protocol takes
+# longer than several products with a small operator.
 
 
 def preconditioned(P: Any) -> Preconditioned | None:
-    """Return an operator P, or its product, if it is `Preconditioned`; else None."""
+    """Return the product of P, or P itself, if it is `Preconditioned`; else None."""
     product: Any = P.build() if isinstance(P, SerialisableOperator) else P
     return product if hasattr(product, "preconditioner") else None
 
 
 def linear_map(P: Any) -> LinearMap | None:
-    """Return the map of an operator P that is `Compiled`; else None."""
+    """Return x ↦ Px as a compiled map if P or its product is `Compiled`; else None."""
     product = P.build() if isinstance(P, SerialisableOperator) else P
     return getattr(product, "linear_map", None)
 
 
 def assembled(P: LinearOperator) -> NDArray[np.float64]:
-    """Return an operator as a matrix (n, n), the symmetric part of P·I."""
+    """Assemble the matrix (n, n) of an operator by a product with the identity.
+
+    The symmetric part of the product is returned.
+    """
     M = np.asarray(P @ np.eye(P.shape[0]))
-    M += M.T.copy()  # rounding of products makes P·I slightly asymmetric
+    M += M.T.copy()  # rounding errors of products make P·I slightly asymmetric
     M /= 2
     return M

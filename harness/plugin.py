@@ -1,4 +1,4 @@
-"""Protocols for plug-ins: solvers, and families of problems that build cases."""
+"""Interfaces for plug-ins: solvers, families of problems, and the cases they build."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 Value = int | float | str  #: value of a key in a case name
-#: The injected high-accuracy solve.
+#: Function that solves a QP accurately; families receive it and import no solver.
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
 class ReferenceOverRanks(Protocol):
-    """The injected high-accuracy solve of a distributed QP; called by all ranks."""
+    """Function that solves a distributed QP accurately; all ranks must call it."""
 
     def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
-        """Solve a QP.
+        """Solve a QP to high accuracy.
 
-        start : a solution of a QP that differs only in its bounds
+        start : a solution of a QP that differs from `qp` only in its bounds, from which
+            the iteration may start
         """
 
 
@@ -37,8 +38,9 @@ class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options.
 
     The class attribute ``accepts``, a tuple of classes of `harness.sets`, declares the
-    convex sets that the solver supports. Without it a solver accepts bounds only
-    (``(Box,)``). QPs with other sets are declined before `declines` is called.
+    convex sets that the solver supports. A solver without this attribute accepts bounds
+    only, as with ``(Box,)``. QPs with other sets are declined without a call of
+    `declines`.
 
     Examples
     --------
@@ -73,37 +75,40 @@ class Solver(Protocol):
     """
 
     def declines(self, qp: QP) -> str | None:
-        """Return the reason why this solver does not accept `qp`, or None."""
+        """Return the reason why this solver does not accept `qp`; None if it does."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert and factorise; return a function that solves. Both are timed.
+        """Convert and factorise the data of `qp`, and return a function that solves it.
 
-        `tol` is the requested relative accuracy of the KKT residuals; the adapter
-        translates it to the stopping test of the solver. The returned function is
-        called once: every repeat starts with `prepare`.
+        The call of `prepare` and the call of the returned function are timed. The
+        returned function is called once, since every repeat starts with `prepare`.
+
+        tol : requested tolerance of the relative KKT residuals, which the adapter
+            translates into the stopping criterion of the solver
         """
 
 
 class Chained(Solver, Protocol):
-    """A solver that can reuse work from one QP to the next, such as load steps."""
+    """A solver that can reuse work within a sequence of QPs, such as load steps."""
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Begin a sequence; return the `prepare` for its QPs, called in their order.
+        """Begin a sequence, and return a `prepare` function for its QPs.
 
-        Each call may reuse results of earlier ones (points, multipliers, factors,
-        norms). The solver must check that they still apply: the QPs of a sequence may
-        differ in every coefficient. Sequences are independent of each other.
+        The returned function is called for each QP in the order of the sequence. A call
+        may reuse results of earlier calls (points, multipliers, factors, norms). The
+        solver must check that these results still apply, since the QPs of a sequence
+        may differ in every coefficient. Nothing may be shared between two sequences.
         """
 
 
 class Tightening(Chained, Protocol):
-    """A solver that can reuse work if each QP has its own tolerance."""
+    """A solver that can reuse work in a sequence whose QPs differ in tolerance."""
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        """Begin a sequence: return the `prepare` for its QPs and their tolerances.
+        """Begin a sequence, and return a `prepare` function for its QPs.
 
-        The early QPs of a fixed point iteration need not be solved as accurately as the
-        last one, so that `prepare` also takes a tolerance.
+        The returned function takes a QP and its tolerance, since early QPs of a
+        fixed-point iteration need not be solved as accurately as the last one.
         """
 
 
@@ -111,65 +116,69 @@ class Tightening(Chained, Protocol):
 class About:
     """Description of a solver, for lists and reports.
 
-    A solver may have one as its attribute ``about``. Texts are Markdown, a sentence or
-    two each. The translation of the tolerance belongs in the docstring of the class.
+    A solver may have an `About` as its attribute ``about``. Each text is Markdown, of
+    one or two sentences. The docstring of the solver's class, rather than this
+    description, explains how the tolerance is translated.
     """
 
     title: str
     method: str  #: class of methods, e.g. "interior point"
     licence: str
-    linear_solver: str  #: solver of its linear systems
-    phases: str  #: work timed as preparing, and work timed as solving
+    linear_solver: str  #: solver used for its linear systems
+    phases: str  #: which work is timed as preparation, and which as solution
     package: str = (
         ""  #: package to install; its module has the same name unless `module` is set
     )
-    module: str = ""  #: name of the module to import, if it differs
-    sequence: str = ""  #: work reused from one QP to the next; empty for none
+    module: str = ""  #: name of the module, if it differs from that of the package
+    sequence: str = ""  #: work reused from one QP to the next; empty if none is reused
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
     @property
     def missing(self) -> str | None:
-        """The package to install, or None if the library can be imported."""
+        """Message with the package to install, or None if the library is installed."""
         module = self.module or self.package
         if not module or find_spec(module) is not None:
             return None
         return f"not installed: {module} (pip install {self.package})"
 
 
-#: State of a node without pressure that transmits shear up to the bound of Tresca's
-#: law.
+#: State of a node without contact pressure whose shear is at the bound of Tresca's law,
+#: which does not depend on the pressure.
 SLIDING = "sliding without contact"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSide:
-    """Results of a contact along its slave side, node by node; SI units."""
+    """Results of one contact at the s nodes of its slave side, in SI units."""
 
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
-    length: Vector  #: (s,) share of the undeformed side of each node, m
-    force: NDArray[Any]  #: (s, dim) force of this contact on each node, N/m; N in space
-    pressure: Vector  #: (s,) Pa, positive in compression
-    gap: Vector  #: (s,) m, positive if open; NaN without an opposite side
+    length: Vector  #: (s,) length of the undeformed side attributed to each node, m
+    #: (s, dim) force of this contact on each slave node: N/m in the plane, N in space
+    force: NDArray[Any]
+    pressure: Vector  #: (s,) contact pressure, Pa, positive in compression
+    gap: Vector  #: (s,) m, positive if open; NaN at nodes without an opposite side
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    #: (s,) tangential traction on the side, Pa; in space its size
+    #: (s,) tangential traction on the side, Pa; in space its magnitude
     shear: Vector | None = None
-    #: (s,) "open", "stick", "slip" or `SLIDING`, "" for nodes without a contact row;
-    #: old files have "open" for the last two
+    #: (s,) "open", "stick", "slip" or `SLIDING`; "" at nodes without a contact row. Old
+    #: files have "open" instead of `SLIDING` and ""
     friction: NDArray[Any] | None = None
-    friction_force: NDArray[Any] | None = None  #: (s, dim) part of `force`, tangential
-    #: (k, 3) exact solution, if known: distance along the side from its middle, m,
-    #: pressure and shear, Pa
+    friction_force: NDArray[Any] | None = None  #: (s, dim) tangential part of `force`
+    #: (k, 3) analytical solution, if known. Columns: distance along the side from its
+    #: middle, m; pressure, Pa; shear, Pa
     exact: NDArray[Any] | None = None
 
     def pressed(self, least: float) -> NDArray[Any]:
         """Return the mask (s,) of the nodes in contact.
 
-        With friction, these nodes stick or slip; under Tresca's law, forces also act
-        without contact. Without friction, their `push` exceeds `least` (N/m), or their
-        force if `push` is unknown. Forces alone are misleading: a mortar row of a
-        curved side also has tangential forces at the neighbours of its node.
+        With friction, a node is in contact if it sticks or slips; a force is not a
+        sufficient criterion, since under Tresca's law forces also act without contact.
+        Without friction, a node is in contact if its `push`, or the norm of its force
+        if `push` is None, exceeds `least` (N/m). The norm of the force is the worse
+        criterion: on a curved side, a mortar row also causes tangential forces at nodes
+        adjacent to its own.
         """
         mask: NDArray[Any]
         if self.friction is not None:
@@ -183,13 +192,13 @@ class ContactSide:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fields:
-    """A deformed state of bodies, for pictures and files; SI units."""
+    """A deformed state of all bodies, for plots and VTK files, in SI units."""
 
     points: NDArray[Any]  #: (N, dim) reference positions, m
     #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
-    displacement: NDArray[Any]  #: (N, dim) m
+    displacement: NDArray[Any]  #: (N, dim) displacement of each node, m
     nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     #: (c, dim) force on each slave node: N/m in the plane, N in space
@@ -200,12 +209,12 @@ class Fields:
 
     @property
     def dim(self) -> int:
-        """Dimension of space."""
+        """Dimension of space, 2 or 3."""
         return int(self.points.shape[1])
 
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
-        """Cells by kind, with the names of meshio."""
+        """Cells grouped by kind, under the names that meshio uses."""
         from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
 
         return cell_blocks(self.cells, self.dim)
@@ -215,44 +224,46 @@ class Fields:
 class Case:
     """A QP, and the maps from its solution to physical results.
 
-    `scale` and `constant` convert the objective of the QP to the potential energy of
-    the physical problem:  energy = scale·objective + constant.
+    The potential energy of the physical problem is scale·objective + constant, where
+    `objective` is that of the QP.
     """
 
     qp: QP
     recover: Callable[
         [Solution], Vector
-    ]  #: solution of the QP ↦ physical unknown u, SI
+    ]  #: maps a solution of the QP to the physical unknown u, SI
     quantities: Callable[
         [Solution], Mapping[str, Any]
-    ]  #: solution of the QP ↦ physical results, SI
-    fields: Callable[[Solution], Fields] | None = None  #: deformed state, for pictures
+    ]  #: maps a solution of the QP to physical results, SI
+    #: maps a solution of the QP to the deformed state, for plots
+    fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0
     constant: float = 0.0
     matrices: Mapping[str, Any] = field(default_factory=dict)  #: exported with the QP
-    #: time of forming a dual, with the factorisation; None for other forms
+    #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
-    mechanics: Mechanics | None = None  #: needed to certify errors
-    remarks: tuple[str, ...] = ()  #: warnings about the input, a line each
-    #: relative distance of the QP from the fixed point of its iteration, such as that
-    #: of Coulomb's law; no solution of this QP can reduce it. 0 without an iteration
+    mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
+    remarks: tuple[str, ...] = ()  #: warnings about the input, one line each
+    #: relative residual of the fixed-point iteration to which the QP belongs, such as
+    #: that of Coulomb's law. An accurate solution of this QP does not reduce it. 0 if
+    #: there is no iteration
     unsettled: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFile:
-    """A file that a case is read from, identified by its content."""
+    """A file from which a case is read, identified by its content."""
 
-    path: str  #: path in the name of the case
-    sha256: str  #: first 12 hexadecimal digits
-    #: suffix of the format, for the name of a copy; not taken from the path
+    path: str  #: path as given in the name of the case
+    sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
+    #: suffix for the name of a copy, which depends on the file format, not on `path`
     suffix: str
 
 
 class Family(ABC):
     """A parametrised family of problems; in practice a frozen dataclass.
 
-    All methods raise `InputError` for values outside the family's range.
+    A method raises `InputError` if a value is outside the range of the family.
 
     Examples
     --------
@@ -277,8 +288,9 @@ class Family(ABC):
 
     """
 
-    name: str  #: first component of its case names
-    defaults: Mapping[str, Value]  #: all keys, in the order of canonical names
+    name: str  #: first component of the names of its cases
+    #: default values of all keys, in the order of keys in canonical names
+    defaults: Mapping[str, Value]
     forms: tuple[str, ...]  #: forms of the QPs
     path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
     #: reason why the energy diverges under refinement; empty if it converges
@@ -288,53 +300,60 @@ class Family(ABC):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Build one case from complete params."""
+        """Build the case with the values `params` of all keys in the given form.
+
+        reference : function that solves a QP accurately, e.g. for previous load steps
+        """
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return params with the missing keys; a default may depend on another key."""
+        """Return the values of all keys; a default may depend on the keys `given`."""
         return {**self.defaults, **given}
 
     def check(self, params: Mapping[str, Value]) -> None:  # noqa: B027  # may be none
-        """Raise InputError for complete params out of range; called before a run."""
+        """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the params of the case with every cell halved, or None.
+        """Return the params for halved cell size, or None if there is no such mesh.
 
-        The mechanics of both cases need a grid, see `harness.crossval.discretisation`.
+        Estimates of the discretisation error need these params, and `Mechanics.grid` of
+        both cases; see `harness.crossval.discretisation`.
         """
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the part of the geometry that `refined` does not refine, or "".
+        """Describe the geometry that `refined` leaves unrefined; "" if there is none.
 
-        The text is printed after an error of the mesh, such as "of the bodies as they
-        are meshed".
+        The text follows an estimate of the discretisation error, for instance "of the
+        bodies as they are meshed".
         """
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file from which a case is read; results contain a copy of it."""
+        """Return the file from which a case is read, or None if it is not from a file.
+
+        The file is copied to the result folder.
+        """
         return None
 
     def with_copies(self, folder: Path) -> Family:
-        """Return the family with the copied files of a result folder.
+        """Return a family that also reads the copies of files in a result folder.
 
-        The copies replace files that are missing here or have different content.
+        A copy is read if the original file is missing or has different content.
         """
         return self
 
     def copied_paths(self) -> list[str]:
-        """List the paths of the copied files, see `with_copies`."""
+        """Return the paths of the copied files, see `with_copies`."""
         return []
 
     def emission(
         self, form: str, params: Mapping[str, Value]
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return a function that assembles the QP of `build` on ranks, or None.
+        """Return a function that assembles the QP of `build` on MPI ranks, or None.
 
-        All ranks call the returned function, with a reference solver for distributed
-        QPs. None means that one process builds the QP. The method itself builds nothing
-        and does not need MPI.
+        All ranks must call the returned function, which takes a reference solve for
+        distributed QPs. None means that a single process builds the QP. The method
+        itself builds nothing and does not need MPI.
 
         params : values of all keys
         """
@@ -342,10 +361,10 @@ class Family(ABC):
 
 
 def as_family(offered: Any) -> Family:
-    """Return an object as a `Family`, wrapped if its class does not inherit from that.
+    """Return an object as a `Family`; wrap it unless its class inherits from `Family`.
 
-    offered : has `name`, `defaults`, `forms` and `build`, and optionally the other
-        members of `Family`
+    offered : object with `name`, `defaults`, `forms` and `build`; the other members of
+        `Family` are optional
     """
     if isinstance(offered, Family):
         return offered

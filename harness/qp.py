@@ -1,4 +1,4 @@
-"""The convex quadratic program that all solvers take."""
+"""The convex quadratic program, which is the input of all solvers."""
 
 from __future__ import annotations
 
@@ -20,22 +20,23 @@ from mortarbench.harness.sets.discs import Discs
 
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
-#: Largest entry of P − Pᵀ, relative to that of P, that counts as rounding.
+#: Largest absolute entry of P − Pᵀ that counts as rounding, relative to that of P.
 SYMMETRY_TOLERANCE = 1e-12
-#: Rows of the largest P that is checked by a Cholesky factor, which takes 0.25 s.
+#: Number of rows up to which convexity of P is checked by a Cholesky factorisation,
+#: which then takes 0.25 s.
 _MAX_FACTORED_ROWS = 2000
-#: Least eigenvalue of the scaled P. Text formats may store only six digits, and this
-#: rounding can make eigenvalues negative.
+#: Least permitted eigenvalue of the scaled P. It is negative, since entries rounded to
+#: six digits, as in some text formats, may perturb zero eigenvalues.
 _MIN_CURVATURE = -1e-6
-#: Least diagonal entry used for scaling, relative to the largest entry of P, since
-#: smaller entries may be mostly rounding.
+#: Least diagonal entry used for scaling, relative to the largest entry of P. Smaller
+#: entries may consist mostly of rounding errors.
 _MIN_DIAGONAL = 1e-4
-_STRIP_ROWS = 256  #: rows of a dense matrix that are compared at a time, to save memory
+_STRIP_ROWS = 256  #: rows of P that are compared with Pᵀ at a time, to save memory
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """Factors of the matrix P = B K⁺ Bᵀ of a dual, in the units of the dual."""
+    """The matrices K and B in P = B K⁺ Bᵀ, the matrix of a dual QP, in its units."""
 
     K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
     B: Matrix  #: (n, N) sparse constraint rows
@@ -54,23 +55,24 @@ class QP:
                     lb ≤ x ≤ ub      multiplier z_box, ≤ 0 at lb and ≥ 0 at ub
 
     so that at a solution  P x + q + Aᵀy + Gᵀz + z_box = 0  (qpsolvers' convention).
-    Blocks of variables may have further convex sets, to which z_box is normal.
+    Blocks of variables may also be restricted to convex sets; z_box is then an element
+    of the normal cone of the set at x.
 
-    Absent constraints have zero rows, absent bounds are ±inf; nothing is None. All
-    arrays become read-only, so that a solver that scales its input in place raises an
-    exception. `from_arrays` accepts more kinds of input, and copies them.
+    Absent constraints have zero rows, and absent bounds are ±inf, never None. All
+    arrays become read-only, so that an exception occurs if a solver scales its input in
+    place. `from_arrays` accepts more kinds of input, and copies the arrays.
 
     Parameters
     ----------
     P, q, A, b, G, h, structure : see the attributes
-    lb, ub : (n,) bounds, -inf and inf for absent ones; None for no bounds
-    sets : sets of further blocks; the first may be a `Box` in place of lb and ub.
-        Discs of one variable become bounds
+    lb, ub : (n,) bounds, -inf and inf where absent; None if no variable has a bound
+    sets : convex sets of blocks of variables; the first may be a `Box` instead of lb
+        and ub. Discs of a single variable are converted to bounds
 
     Raises
     ------
     ValueError
-        When shapes disagree, bounds cross, a vector holds NaN (or inf, except in
+        If shapes disagree, bounds cross, a vector contains NaN (or inf, except in
         bounds), or two sets share a variable.
 
     Examples
@@ -95,7 +97,7 @@ class QP:
     b: Vector  #: (m,)
     G: Matrix  #: (p, n)
     h: Vector  #: (p,)
-    sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then sets of other blocks
+    sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, followed by the other sets
     #: data that a solver may use but must not require
     structure: Structure | None = None
 
@@ -168,25 +170,26 @@ class QP:
     ) -> QP:
         """Create a QP from copies of arrays, after checking them.
 
-        Matrices are dense or sparse; sparse ones are stored by columns. These
-        abbreviations are accepted: a matrix with one row or column for a vector, a
-        vector with a scalar right-hand side for a single row of G or A, and a scalar
-        for equal bounds. None stands for an absent part.
+        Matrices may be dense or sparse; sparse ones are stored by columns. A vector may
+        be given as a matrix with one row or column, a single row of G or A as a vector
+        with a scalar right-hand side, and equal bounds as a scalar. Absent constraints
+        and bounds are None.
 
         Parameters
         ----------
-        P : (n, n) symmetric, both triangles
+        P : (n, n) symmetric positive semidefinite, with both triangles
         q : (n,)
         G, h : (p, n) and (p,), the rows G x ≤ h
         A, b : (m, n) and (m,), the rows A x = b
-        lb, ub : (n,) bounds, -inf and inf for absent ones
-        sets : convex sets of further blocks of variables
+        lb, ub : (n,) bounds, -inf and inf where absent
+        sets : convex sets of blocks of variables without bounds
 
         Raises
         ------
         InputError
-            When a part is missing, is not numeric, has the wrong shape or holds NaN,
-            bounds cross, or P is not symmetric or not convex (see `check_convex`).
+            If an argument is missing, is not numeric, has the wrong shape or contains
+            NaN, if bounds cross, or if P is not symmetric or not positive semidefinite
+            (see `check_convex`).
 
         Examples
         --------
@@ -240,7 +243,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return Pᵢᵢ (n,), or None if P is an operator without a diagonal."""
+        """Return the diagonal of P (n,), or None if P is an operator without one."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -252,7 +255,7 @@ class QP:
     def sizes(self) -> dict[str, int]:
         """Numbers of variables, equality rows, inequality rows and finite bounds.
 
-        Numbers of discs and cones follow if there are any.
+        If the QP has discs or cones, their numbers follow.
         """
         bounds = np.isfinite(self.lb).sum() + np.isfinite(self.ub).sum()
         sizes = {
@@ -272,10 +275,10 @@ class QP:
         return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
 
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
-        """Return the same QP with its sparse matrices converted.
+        """Return the same QP with its sparse matrices in another storage format.
 
-        convert : maps a sparse matrix to an equal one of another type; dense matrices
-            and operators are not converted
+        convert : maps a sparse matrix to an equal one in that format; it is not applied
+            to dense matrices and operators
         """
         matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
         sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}
@@ -287,9 +290,15 @@ class QP:
 
 
 def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
-    """Check sets, and return them with discs of one variable as bounds of the box.
+    """Check the sets, and return them with discs of one variable turned into bounds.
 
-    Sets without variables are left out. Raises ValueError as `_check_sets` does.
+    Empty sets are left out.
+
+    Raises
+    ------
+    ValueError
+        If a set does not fit n variables, or two sets share a variable.
+
     """
     _check_sets(sets, n)
     box, others = sets[0], list[ConvexSet]()
@@ -302,7 +311,7 @@ def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ..
 
 
 def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
-    """Raise ValueError if a set does not fit n variables, or two sets share one."""
+    """Raise ValueError if a set does not fit n variables, or if two sets overlap."""
     taken = np.zeros(n, dtype=bool)
     for one in sets:
         one.check(n)
@@ -318,16 +327,16 @@ def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
 
 
 def no_rows(n: int) -> Matrix:
-    """Return the (0, n) matrix of an absent constraint block."""
+    """Return a sparse (0, n) matrix, which stands for absent constraints."""
     return csr_array((0, n))
 
 
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    A solver that reads entries of P calls this function in `declines`. If a solver
-    declines for this reason, a run assembles a small P, on the clock, and calls
-    `declines` again.
+    A solver that reads entries of P should call this function in `declines`. If a
+    solver declines for this reason and P is small, the matrix is assembled on the
+    clock, and `declines` is called again.
 
     Examples
     --------
@@ -342,15 +351,16 @@ def needs_matrices(qp: QP) -> str | None:
 
 
 def check_symmetric(P: Matrix) -> None:
-    """Raise unless P is symmetric up to rounding.
+    """Check that P is symmetric up to rounding.
 
-    For an asymmetric P, solvers that read one triangle would solve different problems.
+    If P were asymmetric, solvers that read only the upper or only the lower triangle
+    would solve different problems.
 
     Raises
     ------
     ValueError
-        If P is asymmetric; the message names the two entries that differ most, and
-        contains a hint if P is a triangle.
+        If P is not symmetric. The message names the two entries that differ most, with
+        a hint if P is triangular.
 
     """
     where, worst = _asymmetry(P)
@@ -364,16 +374,18 @@ def check_symmetric(P: Matrix) -> None:
 
 
 def check_convex(P: Matrix) -> None:
-    """Raise if P has negative curvature, since a KKT point may then be a maximum.
+    """Check that P is positive semidefinite up to rounding.
 
-    With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to exceed −1e-6:
-    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues between −1e-6 and 0
-    may be due to rounding. For more than 2000 rows, only the diagonal is checked.
+    If P had a direction of negative curvature, a KKT point could be a saddle point or a
+    maximum. Let D be the diagonal matrix of dᵢ = max(Pᵢᵢ, 1e-4 max|P|). The eigenvalues
+    of D⁻½PD⁻½ must exceed −1e-6, i.e. D⁻½PD⁻½ + 1e-6·I must have a Cholesky factor.
+    Eigenvalues between −1e-6 and 0 may be due to rounding. If P has more than 2000
+    rows, only its diagonal is checked.
 
     Raises
     ------
     InputError
-        When curvature is negative.
+        If P has a diagonal entry or an eigenvalue below these limits.
 
     """
     largest = float(abs(P).max()) if P.shape[0] else 0.0
@@ -400,7 +412,7 @@ def check_convex(P: Matrix) -> None:
 
 
 def _triangle(P: Matrix) -> str:
-    """Return a hint if one strict triangle of an asymmetric P is zero, else ""."""
+    """Return a hint for the message if an asymmetric P is triangular, else ""."""
     lower, upper = (tril, triu) if issparse(P) else (np.tril, np.triu)
     for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
         if not abs(other).max():
@@ -412,7 +424,7 @@ def _triangle(P: Matrix) -> str:
 
 
 def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
-    """Return place and size of the largest entry of |P − Pᵀ|."""
+    """Return the indices (i, j) and the value of the largest entry of |P − Pᵀ|."""
     if issparse(P):
         difference = coo_array(abs(P - P.T))
         if not difference.nnz:
@@ -433,7 +445,7 @@ def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
 def canonical(M: Matrix) -> Matrix:
     """Return a sparse matrix with sorted indices and without duplicate entries.
 
-    The caller sorts before the arrays become read-only, since SciPy sorts in place.
+    Indices must be sorted before arrays become read-only, since SciPy sorts in place.
     """
     if M.has_canonical_format:
         return M
@@ -443,7 +455,14 @@ def canonical(M: Matrix) -> Matrix:
 
 
 def _numbers(name: str, value: Any) -> NDArray[np.float64]:
-    """Return a dense copy of an array of numbers; inf and NaN are not checked."""
+    """Return a dense copy of an array of real numbers, which may contain inf and NaN.
+
+    Raises
+    ------
+    InputError
+        If `value` is None, ragged or not numeric.
+
+    """
     expected = "expected an array of numbers"
     if value is None:
         raise InputError(f"{name} is missing; {expected}")
@@ -454,20 +473,20 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
     if array.dtype.kind not in "biuf":
         kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
         raise InputError(f"{name} is of type {kind}; {expected}")
-    with np.errstate(over="ignore"):  # inf beyond double precision, which callers check
+    with np.errstate(over="ignore"):  # overflow yields inf, for which callers check
         return np.array(array, dtype=float)
 
 
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
-    """Return a copy of a vector, also from a matrix with one row or column.
+    """Return a copy of a vector, which may be given as a matrix with one row or column.
 
     name : name of the vector in messages
-    n : expected number of entries; None for any
+    n : expected number of entries; None for any number
 
     Raises
     ------
     InputError
-        When `value` is not numeric or has another shape; NaN and inf are not checked.
+        If `value` is not numeric or has the wrong shape; NaN and inf are accepted.
 
     """
     array = _numbers(name, value)
@@ -479,7 +498,10 @@ def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
 
 
 def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
-    """Return a bound (n,), the same for all variables from a scalar."""
+    """Return a vector of bounds (n,); a scalar applies to all variables.
+
+    absent : value of all entries if `value` is None
+    """
     value = absent if value is None else value
     if np.ndim(value) == 0 and not issparse(value):
         return np.full(n, _numbers(name, value))
@@ -487,9 +509,9 @@ def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
 
 
 def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
-    """Return a copy of a matrix with n columns.
+    """Check that `value` is a finite matrix with n columns, and return a copy.
 
-    rows : expected number of rows; None for any
+    rows : expected number of rows; None for any number
     """
     if issparse(value):
         if value.dtype.kind not in "biuf":
@@ -518,7 +540,11 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
 def _rows(
     name: str, M: Any, side: str, rhs: ArrayLike | None, n: int
 ) -> dict[str, Matrix]:
-    """Return constraint rows and right-hand side by name; zero rows if M is None."""
+    """Return the matrix and the right-hand side of constraints as keyword arguments.
+
+    name, side : their names, such as "G" and "h"
+    M : matrix with n columns; None for zero rows
+    """
     if M is None:
         return {name: no_rows(n), side: np.zeros(0)}
     matrix = _matrix(name, M, None, n)

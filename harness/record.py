@@ -1,4 +1,4 @@
-"""The record of a measurement: plain data, one line of the journal."""
+"""The record of a measurement, which is stored as a line of the journal."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ if TYPE_CHECKING:
     from msgspec.json import Decoder
 
 #: Version of a journal line, increased whenever a field changes its meaning.
-#: 2: the four residuals have other scales (docs/verdicts.md).
+#: In version 2, the four residuals are scaled differently (docs/verdicts.md).
 SCHEMA = 2
-VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
+#: Largest residual of a verified answer, relative to the tolerance.
+VERIFIED_FACTOR = 10.0
 READABLE = (1, 2)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
-LARGEST_INTEGER = 2**63 - 1  #: largest integer of 64-bit readers such as Parquet
-SECONDS = (1e-12, 1e10)  #: limits of measured times other than 0
-MAX_LEVELS = 20  #: largest depth of nesting in a field
+LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
+SECONDS = (1e-12, 1e10)  #: least and largest measured time in s, except 0
+MAX_LEVELS = 20  #: largest depth of nested lists and tables in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
-#: fields whose values many lines have in common
+#: fields whose values are equal in many lines, and therefore stored once
 _TEXTS = (
     "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
     "session",
@@ -39,29 +40,30 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Judgement of a measurement, independent of the solver's claim."""
+    """Verdict on a measurement: the claim of the solver, and whether it is true."""
 
-    VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` if known
+    VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible and proven, see `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    INACCURATE = "inaccurate"  #: claimed solved; at least half of the digits are right
-    WRONG = "wrong"  #: claimed solved and refuted
-    INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, not proven
+    #: claimed solved; not verified, but at least half of the requested digits are right
+    INACCURATE = "inaccurate"
+    WRONG = "wrong"  #: claimed solved, but refuted
+    INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, but not proven
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     MEMORY_LIMIT = "memory_limit"
-    CRASHED = "crashed"  #: the process died
-    FAILED = "failed"  #: the solver raised or gave up
+    CRASHED = "crashed"  #: the process ended without an answer
+    FAILED = "failed"  #: the solver raised an exception or stopped without a solution
     DECLINED = "declined"  #: the solver does not accept the QP
 
     @property
     def words(self) -> str:
-        """The verdict as text with spaces."""
+        """The verdict as text, with spaces instead of underscores."""
         return self.value.replace("_", " ")
 
     @property
     def is_verified(self) -> bool:
-        """True for a verified solution or a proof of infeasibility.
+        """True if a solution was verified or infeasibility was proven.
 
         >>> from mortarbench import Verdict
         >>> [v.value for v in Verdict if v.is_verified]
@@ -72,11 +74,11 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Measurement:
-    """Costs of preparing and solving; None if not measured.
+    """Time and memory needed to prepare and to solve; None if not measured.
 
-    Every field is also a field of the journal. A new field that
-    `harness.verify.measure` sets is transferred from the worker to the record without
-    further code. Values must not be negative.
+    Every field is also a field of the journal, with a value of at least 0. A field
+    added here needs no further code: `harness.verify.measure` sets it in the worker,
+    from which all fields are transferred to the record.
     """
 
     prepare_seconds: float | None = None
@@ -85,7 +87,8 @@ class Measurement:
     peak_mib: float | None = None  #: peak resident memory of the worker
     prepare_peak_mib: float | None = None
     solve_peak_mib: float | None = None
-    inner_loops: int = 1  #: repetitions within a sample; seconds are means over these
+    #: number of solves timed together, if one is too short; seconds are their means
+    inner_loops: int = 1
 
 
 MEASURED = tuple(f.name for f in fields(Measurement))
@@ -95,25 +98,27 @@ MEASURED = tuple(f.name for f in fields(Measurement))
 class Record(Measurement):
     """A single run of one solver on one case at one tolerance; one JSON line.
 
-    A record contains measurement, task, claims of the solver and verdict.
-    Values that were not, or cannot be, measured are None, since JSON has no NaN.
+    A record contains the task, the measured costs, the claim of the solver and the
+    verdict. Values that were not, or cannot be, measured are None, since JSON has no
+    NaN.
     """
 
     schema: int = SCHEMA
-    run_id: str  #: digest of the task: the same in every run of the same suite
+    run_id: str  #: digest of the task; equal in every run of the same suite
     case: str  #: canonical name
     family: str
     params: Mapping[str, Any]
     form: str
-    sizes: Mapping[str, int]  #: variables, equalities, inequalities, bounds of the QP
+    sizes: Mapping[str, int]  #: sizes of the QP, see `harness.qp.QP.sizes`
     solver: str  #: label in the suite
     options: Mapping[str, Any]  #: all options of the solver, including defaults
     tol: float
-    repeat: int  #: 0, 1, …
-    block: int  #: number of the unit of work; its measurements ran consecutively
+    repeat: int  #: number of the repeat, from 0
+    block: int  #: number of the work unit, whose measurements ran consecutively
     verdict: Verdict
-    claimed: str | None = None  #: the solver's own status
-    message: str = ""  #: message of the solver, reason to decline, or cause of death
+    claimed: str | None = None  #: status claimed by the solver; None if it has none
+    #: message of the solver, reason to decline, or the way in which the worker ended
+    message: str = ""
     iterations: int | None = None
     counts: Mapping[str, Any] = field(default_factory=dict)
     reported: Mapping[str, Any] = field(
@@ -122,87 +127,91 @@ class Record(Measurement):
     build_seconds: float | None = (
         None  #: time to build the case, in the process that built it
     )
-    #: the part of `build_seconds` for factor and dual; dual forms only
+    #: part of `build_seconds` spent on the factorisation and the dual; dual forms only
     dualise_seconds: float | None = None
-    #: peak resident memory of the process that built the case anew; see `growing`
+    #: peak resident memory of the new process that built the case; measured only in
+    #: series of growing sizes
     build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
     canary_seconds: float | None = (
         None  #: time of a fixed computation just before, which reveals drift
     )
-    threads: int | None = None  #: largest number of any library in the worker
-    cpu: int | None = None  #: CPU that the worker was bound to
+    threads: int | None = None  #: largest thread count of any library in the worker
+    cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
-    #: parts of a solve on ranks, s: [mean, largest] over ranks of products, exchange,
-    #: coarse, waiting; see `harness.distributed.vectors.Ranks`
+    #: [mean, largest] over ranks of the seconds spent on products, exchange, coarse and
+    #: waiting; see `harness.distributed.vectors.PARTS`
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: [mean, largest] of reductions, messages to neighbours, and their bytes
+    #: [mean, largest] over ranks of the numbers of reductions, messages and bytes
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: [mean, largest] of reduction_seconds, message_seconds, seconds_per_byte; see
-    #: `harness.distributed.network`
+    #: [mean, largest] over ranks of reduction_seconds, message_seconds and
+    #: seconds_per_byte; see `harness.distributed.network`
     rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: "cold"; "sequence": earlier steps may be reused; "sequence, tighten=θ": the same
-    #: with tightening tolerances, see `Record.tighten`
+    #: "cold"; "sequence": results of earlier steps may be reused; "sequence,
+    #: tighten=θ": a sequence with tightening tolerances, see `Record.tighten`
     mode: str = "cold"
-    #: tolerance of an early step of a tightening sequence, where looser than `tol`
+    #: tolerance of an early step of a tightening sequence; None if it is `tol`
     step_tol: float | None = None
-    accuracy: float | None = None  #: tolerance of the verdict in a sweep, if not `tol`
+    #: tolerance of the verdict if it differs from `tol`, as in accuracy sweeps
+    accuracy: float | None = None
     #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
     #: which measures the noise; "copies": `ranks` independent solves at the same time
     role: str = ""
     primal: float | None = (
-        None  #: this and the next three: residuals of harness.verify.kkt
+        None  #: this and the next three are the residuals of `harness.verify.kkt`
     )
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: "residuals"; "reference": `optimum_error` decided the verdict; "certificate": a
-    #: claim of infeasibility was proven
+    #: basis of the verdict: "residuals"; "reference" for `optimum_error`; "certificate"
+    #: for a proof of infeasibility
     decided_by: str = "residuals"
-    #: error against a proven optimum, see `harness.verify.optimum`
+    #: error relative to a proven optimum, see `harness.verify.optimum`
     optimum_error: float | None = None
     energy_bound: float | None = (
-        None  #: certified bound of the relative error, energy norm
+        None  #: certified bound on the relative error in the energy norm
     )
-    #: relative components of that bound; see `harness.verify.verdicts.certified`
+    #: terms of `energy_bound`, relative; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
-    quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
+    #: physical results by name, in SI units
+    quantities: Mapping[str, Any] = field(default_factory=dict)
     qp: str | None = None  #: digest of the emitted QP; None in old journals
     environment: str = ""  #: digest of environment.json, or of a file in environments/
-    node: str = ""  #: host name, if a cluster measured
+    node: str = ""  #: host name of the cluster node; empty without a cluster
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
-    started: str = ""  #: UTC, ISO 8601
-    session: str = ""  #: id of the command; empty in old journals
+    started: str = ""  #: start of the measurement, UTC, ISO 8601
+    session: str = ""  #: id of the run command; empty in old journals
 
     @property
     def tighten(self) -> float:
-        """θ of a sequence with tolerances that tighten towards `tol`, else 0.
+        """Factor θ of a tightening sequence; 0 for other modes.
 
-        Its steps are solved to max(tol, θ·`harness.plugin.Case.unsettled`).
+        Each step of a tightening sequence is solved to the tolerance
+        max(tol, θ·`unsettled`), see `harness.plugin.Case`.
         """
         _, _, number = self.mode.partition(TIGHTENING)
         return float(number or 0)
 
     @property
     def asked_tol(self) -> float:
-        """Tolerance passed to the solver."""
+        """Tolerance that was passed to the solver."""
         return self.tol if self.step_tol is None else self.step_tol
 
     @property
     def judged_at(self) -> float:
-        """Tolerance of the verdict."""
+        """Tolerance on which the verdict is based."""
         return self.asked_tol if self.accuracy is None else self.accuracy
 
     @property
     def claims_answer(self) -> bool:
-        """True if the solver claims a solution, or a proven infeasibility."""
+        """True if the solver claims a solution, or has proven infeasibility."""
         return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed."""
+        """Return a copy with the fields in `changes` replaced."""
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -212,8 +221,9 @@ class Record(Measurement):
     def to_json(self) -> str:
         """Return one line of strict JSON.
 
-        NaN, inf and integers beyond 64 bits become null. Fields that old journals lack
-        are omitted at their defaults, so that an old line is written as it was read.
+        NaN, inf and integers beyond 64 bits become null. Fields that do not occur in
+        old journals are omitted if they have their defaults, so that an old line is
+        written unchanged.
         """
         row = finite(self.to_dict())
         if not self.session:
@@ -231,18 +241,19 @@ class Record(Measurement):
 
     @staticmethod
     def from_json(line: str | bytes, shared: dict[Any, Any] | None = None) -> Record:
-        """Parse a line written by `to_json`; unknown fields are ignored.
+        """Parse a journal line as written by `to_json`; unknown fields are ignored.
 
-        Lone surrogates, which no file can contain, are escaped. The last of several
-        equal keys counts.
+        Lone surrogates are escaped, since they cannot be encoded in UTF-8. If a key
+        occurs several times, its last value counts.
 
-        shared : texts and tables of earlier lines; equal ones are stored once
+        shared : texts and tables of earlier lines, to which those of this line are
+            added; equal ones are stored once
 
         Raises
         ------
         ValueError
-            When the line is not a JSON object, lacks a field, has another schema, or a
-            field with a wrong type or value.
+            If the line is not a JSON object, lacks a field, has an unknown schema, or
+            if a field has a wrong type or an invalid value.
 
         """
         import msgspec  # measuring processes do not need it
@@ -265,21 +276,21 @@ class Record(Measurement):
             raise ValueError(f"nested deeper than {MAX_LEVELS} levels") from None
 
 
-#: journal names of the fields that have another name in the code
+#: journal names of those attributes whose names differ from them
 _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 
 
 def in_space(quantities: Mapping[str, Any]) -> bool:
-    """Return True for quantities of three-dimensional bodies.
+    """Return True if quantities are those of three-dimensional bodies.
 
-    Their forces are in N and energies in J, in the plane in N/m and J/m.
+    Forces are then in N and energies in J, instead of N/m and J/m in the plane.
     """
     nodes, dofs = quantities.get("nodes"), quantities.get("dofs")
     return isinstance(nodes, int) and nodes > 0 and dofs == 3 * nodes
 
 
 def journal_name(name: str) -> str:
-    """Return the journal name of a field."""
+    """Return the journal name of a field, given the name of its attribute."""
     return _JOURNAL_NAMES.get(name, name)
 
 
@@ -335,7 +346,7 @@ def _decoder() -> Decoder[Struct]:
 
 @cache
 def _line() -> type[Struct]:
-    """Return the msgspec type of a journal line: the fields by their journal names."""
+    """Return the msgspec type of a journal line, with the journal names of fields."""
     import msgspec
 
     types = get_type_hints(Record)
@@ -350,7 +361,10 @@ def _line() -> type[Struct]:
 
 
 def _explained(e: Exception, row: object) -> str:
-    """Return the message for a journal line with a field of the wrong type."""
+    """Return the error message for a journal line with a missing or mistyped field.
+
+    e : error of msgspec, which contains the path of the field
+    """
     if not isinstance(row, dict) or row.get("schema") not in READABLE:
         return _WRONG_SCHEMA
     place = re.search(r"at `\$\.(\w+)", str(e))
@@ -364,12 +378,12 @@ def _explained(e: Exception, row: object) -> str:
 
 
 def _check(r: Record) -> None:
-    """Check the ranges of all values.
+    """Check that all values are in their ranges.
 
     Raises
     ------
     ValueError
-        If a value is out of range; the message names the field, value and range.
+        If a value is out of range; the message states field, value and range.
 
     """
     if r.schema not in READABLE:
@@ -422,7 +436,7 @@ def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:
 
 
 def _share(record: Record, shared: dict[Any, Any]) -> Record:
-    """Replace texts and tables by equal ones of earlier lines; check new ones."""
+    """Replace texts and tables by equal objects of earlier lines; check new tables."""
     for name, text in zip(_TEXTS, _texts(record), strict=True):
         object.__setattr__(record, name, shared.setdefault(text, text))
     for name, table in zip(_TABLES, _tables(record), strict=True):
@@ -437,7 +451,7 @@ def _share(record: Record, shared: dict[Any, Any]) -> Record:
 
 
 def _check_values(params: Mapping[str, Any]) -> None:
-    """Raise ValueError for values that a case name cannot contain."""
+    """Raise ValueError if a value is a list or a table, which no case name contains."""
     for key, value in params.items():
         if isinstance(value, dict | list):
             raise ValueError(
@@ -446,7 +460,7 @@ def _check_values(params: Mapping[str, Any]) -> None:
 
 
 def _check_nested(where: str, data: Any, levels: int) -> None:
-    """Raise ValueError for data nested too deeply, and for integers beyond 64 bits."""
+    """Raise ValueError if data are nested too deeply, or integers exceed 64 bits."""
     match data:
         case dict() | list() if not levels:
             raise ValueError(f"{where} is nested deeper than {MAX_LEVELS} levels")

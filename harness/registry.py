@@ -1,14 +1,17 @@
 """Registries of solvers and families, and plug-ins from files and packages.
 
-A registry maps names to solvers. An entry ``"PREFIX:*"`` stands for all backends of a
-generic adapter: the text after the last colon is the value of the adapter's field
-``backend``. If the adapter has a method ``backends()``, it lists the installed ones.
+A registry maps names to solvers or families. In a registry of solvers, the entry
+``"PREFIX:*"`` stands for all backends of a generic adapter. In the name
+``PREFIX:BACKEND``, the text after the last colon is the value of the adapter's field
+``backend``. A method ``backends()`` of the adapter, if it exists, returns the installed
+backends.
 
-A plug-in file is loaded as a separate Python package, whose path is the folder of the
-file. It can import the modules and packages in that folder, its neighbours. Two
-plug-ins may have different neighbours of the same name: when the code is compiled,
-``import helper`` is replaced by an import of the submodule ``helper`` of the package.
-Similarly, ``from harness import QP`` refers to `mortarbench.harness`.
+A plug-in file is loaded as a Python package of its own, whose path is the folder of the
+file. The plug-in can import the modules and packages in this folder, which are called
+its neighbours. Two plug-ins may have different neighbours of the same name: when the
+code of a plug-in is compiled, ``import helper`` is replaced by an import of the
+submodule ``helper`` of its package. Similarly, ``from harness import QP`` is replaced
+by an import from `mortarbench.harness`.
 """
 
 from __future__ import annotations
@@ -55,41 +58,42 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-COPIES = "copies"  #: role of the specs from `SolverSpec.copies`
+COPIES = "copies"  #: role of a spec that `SolverSpec.copies` returns
 
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
-#: Modules that a plug-in never imports from its own folder.
+#: Modules that a plug-in does not import from its folder, even if they exist there.
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
-#: Subpackages that old plug-ins import without the prefix ``mortarbench``.
+#: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
-_BESIDE = "beside a plug-in: "  #: prefix of a folder in the path of its package
+#: Prefix of the folder in the ``__path__`` of a plug-in's package, for `path_hooks`.
+_BESIDE = "beside a plug-in: "
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSpec:
-    """A solver in a suite: its name, label and options."""
+    """A solver in a suite: name, label, options, role and number of ranks."""
 
-    name: str  #: name in the registry, e.g. "NAME" or "PREFIX:BACKEND"
+    name: str  #: name in the registry, "NAME" or "PREFIX:BACKEND"
     label: str  #: label in records and reports
     options: Mapping[str, Any] = field(
         default_factory=dict
-    )  #: that differ from defaults
+    )  #: options that the suite sets, by name
     #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
     #: which measures the noise; "copies": `ranks` independent solves at the same time,
-    #: an upper bound for the speed of ranks
+    #: which bound the speed-up of a solve on that number of ranks
     role: str = ""
-    ranks: int = 1  #: number of MPI processes of a solve
+    ranks: int = 1  #: number of MPI processes
 
     def on(self, ranks: int) -> SolverSpec:
-        """Return the same solver on a number of ranks, which the label states."""
+        """Return the same solver on `ranks` MPI processes; the label states `ranks`."""
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
 
     def copies(self, count: int) -> SolverSpec:
-        """Return `count` independent copies of the solver, each on its own rank."""
+        """Return a spec of `count` independent copies of the solver, one per rank."""
         label = f"{self.label} copies={count}"
         return replace(self, ranks=count, role=COPIES, label=label)
 
@@ -98,8 +102,8 @@ class SolverSpec:
 class PluginFile:
     """A plug-in file, written ``FILE.py`` or ``LABEL=FILE.py``.
 
-    A label prefixes the names of its solvers, ``LABEL:NAME``, so that two versions of a
-    plug-in can be measured in one run. Families keep their names.
+    With a label, the solvers of the file are named ``LABEL:NAME``, so that two versions
+    of a plug-in can be measured in one run. The names of families do not change.
 
     >>> from mortarbench.harness.registry import PluginFile
     >>> PluginFile.of("new=mine.py")
@@ -111,7 +115,7 @@ class PluginFile:
 
     @classmethod
     def of(cls, text: str | Path | PluginFile) -> PluginFile:
-        """Parse ``[LABEL=]FILE.py``; a path with ``=`` needs a ``/`` before that."""
+        """Parse ``[LABEL=]FILE.py``; a path with ``=`` must have a ``/`` before it."""
         if isinstance(text, PluginFile):
             return text
         if isinstance(text, str) and (match := _LABELLED.fullmatch(text)):
@@ -123,23 +127,23 @@ class PluginFile:
 
     @property
     def name(self) -> str:
-        """The label and the file name without its folder."""
+        """The label, if any, and the name of the file without its folder."""
         return str(replace(self, path=Path(self.path.name)))
 
     def resolved(self) -> PluginFile:
-        """Return the same with an absolute path."""
+        """Return the same plug-in file with an absolute path."""
         return replace(self, path=self.path.resolve())
 
     def content(self) -> Iterator[bytes]:
-        """Yield the code: the file, then its neighbours, sorted by path.
+        """Yield the bytes of the file, then those of its neighbours, sorted by path.
 
-        The neighbours are the modules in the same folder that import statements in the
-        file name (also those inside functions), directly or through other neighbours.
+        Neighbours are the modules in the same folder that the file imports, directly or
+        through other neighbours. Import statements inside functions count.
 
         Raises
         ------
         InputError
-            When the file does not exist.
+            If the file does not exist.
 
         """
         path = self.path.resolve()
@@ -154,32 +158,32 @@ class PluginFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin:
-    """Entries that a plug-in adds to the registries."""
+    """Solvers, families and operators that a plug-in adds to the registries."""
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
     operators: Mapping[str, Maker] = field(
         default_factory=dict
-    )  #: makers, see `harness.operators`
-    origin: str = ""  #: path of its file, or "entry points"
+    )  #: functions that build operators, see `harness.operators`
+    origin: str = ""  #: path of the plug-in file, or "entry points"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An object of a registry that is imported when needed."""
+    """Reference to an object of a registry, which `load` imports."""
 
     module: str
-    attribute: str  #: a class, or an instance
+    attribute: str  #: name of a class or an instance in the module
     options: Mapping[str, Any] = field(default_factory=dict)  #: arguments of the class
 
     def load(self) -> Any:
-        """Import the module, and return the instance."""
+        """Import the module, and return the object; a class is instantiated."""
         thing = getattr(import_module(self.module), self.attribute)
         return thing(**self.options) if isinstance(thing, type) else thing
 
 
 def entry(module: str, attribute: str, **options: Any) -> Entry:
-    """Return one line of a registry.
+    """Return the entry of a registry that refers to an attribute of a module.
 
     >>> from mortarbench.harness.registry import Registry, entry
     >>> registry = Registry({"half": entry("fractions", "Fraction", numerator="1/2")})
@@ -192,10 +196,10 @@ def entry(module: str, attribute: str, **options: Any) -> Entry:
 
 
 class Registry(Mapping[str, T]):
-    """Objects by name, each imported at its first access."""
+    """Mapping of names to objects, each imported at its first access."""
 
     def __init__(self, entries: Mapping[str, Entry | T]) -> None:
-        self.entries = dict(entries)  #: objects, or where to import them from
+        self.entries = dict(entries)  #: objects, or references to them
         self._loaded: dict[str, T] = {}
 
     def __getitem__(self, name: str) -> T:
@@ -215,13 +219,13 @@ class Registry(Mapping[str, T]):
 
 
 def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
-    """Return the configured solver of `spec`.
+    """Return the solver that `spec` names, with the backend and options of `spec`.
 
     Raises
     ------
     InputError
-        If the solver, backend or an option is unknown, or the value of an option has
-        the wrong type or is refused by the solver.
+        If the solver, the backend or an option is unknown, or if the value of an option
+        has the wrong type or is refused by the solver.
 
     """
     prefix, colon, backend = spec.name.rpartition(":")
@@ -234,12 +238,12 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
 
 
 def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
-    """Raise unless `name` is the name of a solver, without importing any solver.
+    """Check that `name` is the name of a solver, without importing any solver.
 
     Raises
     ------
     InputError
-        If the solver is unknown. Backends of adapters are not checked.
+        If no solver has this name. Backends of adapters are not checked.
 
     """
     prefix, colon, _ = name.rpartition(":")
@@ -248,21 +252,22 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return all options of a solver with their values; {} if it is not a dataclass."""
+    """Return the values of a solver's options by name; {} if it is not a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
 
 
 def option_types(solver: Solver) -> dict[str, Any]:
-    """Return the annotated types of a solver's options.
+    """Return the annotated types of a solver's options by name.
 
-    Options annotated as Any or object are omitted, and so are all options if Python
-    cannot evaluate the annotations. The type of the default decides for these.
+    Options annotated as Any or object are omitted. If Python cannot evaluate the
+    annotations, all options are omitted. The type of an omitted option is that of its
+    default.
     """
     try:
         hints = get_type_hints(type(solver))
-    except (NameError, TypeError, AttributeError, SyntaxError):  # of a plug-in
+    except (NameError, TypeError, AttributeError, SyntaxError):  # code of a plug-in
         return {}
     return {
         name: hints[name]
@@ -272,15 +277,16 @@ def option_types(solver: Solver) -> dict[str, Any]:
 
 
 def load_plugin(file: str | Path | PluginFile) -> Plugin:
-    """Import a file that defines ``SOLVERS`` and/or ``PROBLEMS``.
+    """Import a file that defines ``SOLVERS`` or ``PROBLEMS`` or both.
 
-    ``OPERATORS`` contains the makers of operators of its families, if there are any.
+    If the QPs of its families contain operators, ``OPERATORS`` maps names to the
+    functions that build them, see `harness.operators`.
 
     Raises
     ------
     InputError
-        When the file is missing, fails to import, defines neither, or defines objects
-        of a wrong type.
+        If the file is missing, fails to import, defines neither ``SOLVERS`` nor
+        ``PROBLEMS``, or if an object in these has the wrong type.
 
     """
     plugin_file = PluginFile.of(file)
@@ -312,7 +318,7 @@ def entry_point_plugins() -> Plugin:
     Raises
     ------
     InputError
-        When an entry point fails to import, or is neither a solver nor a family.
+        If an entry point fails to import, or is not a solver or a family.
 
     """
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
@@ -325,7 +331,7 @@ def entry_point_plugins() -> Plugin:
             try:
                 with redirect_stdout(sys.stderr), _standing_for_harness():
                     entries[point.name] = point.load()
-            except Exception as e:  # somebody else's code
+            except Exception as e:  # raised by code of the package
                 raise _import_error(f"entry point {point.value}", e) from None
     return _checked("entry points", found["solvers"], found["problems"])
 
@@ -333,8 +339,9 @@ def entry_point_plugins() -> Plugin:
 def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
-    The function searches the folders of `sys.path`, which is faster than importing
-    importlib.metadata. An archive on the path counts as a package that may.
+    The function reads the folders of `sys.path`, which is faster than importing
+    importlib.metadata. It does not open archives: if one is on the path, the result is
+    True.
     """
     for place in sys.path:
         if os.path.isfile(place):
@@ -351,10 +358,12 @@ def _some_package_offers() -> bool:
 def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[str, T]:
     """Return the union of two registries.
 
+    what : kind of their objects, for the message
+
     Raises
     ------
     InputError
-        When both have the same name, since results could not be attributed.
+        If both contain the same name, since its results would be ambiguous.
 
     """
     if both := sorted(known.keys() & new.keys()):
@@ -396,13 +405,16 @@ def _with_options(
         return solver  # type: ignore[no-any-return]  # without options, it need not be a dataclass
     try:
         configured: Solver = replace(solver, **changes)
-    except (TypeError, ValueError) as e:  # the solver's own check of its options
+    except (TypeError, ValueError) as e:  # raised by the solver's check of its options
         raise InputError(f"{spec.name}: {_one_line(e)}") from None
     return configured
 
 
 def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
-    """Check the type of an option by its annotation, or else by its default."""
+    """Check the type of an option, and return its value; an int may become a float.
+
+    current : default of the option, whose type counts if there is no annotation
+    """
     kinds = _classes(annotation)
     if kinds is None:
         kinds = None if current is None else (type(current),)
@@ -449,7 +461,7 @@ def _no_file(plugin_file: PluginFile) -> InputError:
 
 
 def _imported(path: Path) -> ModuleType:
-    """Import a plug-in as a package of its own; see the docstring of this module."""
+    """Import a plug-in file as a package of its own; see the module docstring."""
     whole = path.resolve()
     stem = re.sub(r"\W", "_", whole.stem)
     name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"
@@ -463,28 +475,28 @@ def _imported(path: Path) -> ModuleType:
         raise InputError(f"{path}: not a Python file; its name must end in .py")
     _forget(name)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look there
+    sys.modules[name] = module  # dataclasses look up their module there
     try:
         with redirect_stdout(sys.stderr):
             spec.loader.exec_module(module)
-    except (Exception, SystemExit) as e:  # somebody else's code
+    except (Exception, SystemExit) as e:  # raised by code of the plug-in
         _forget(name)
         raise _import_error(str(path), e) from None
     return module
 
 
 def _forget(package: str) -> None:
-    """Remove a package from `sys.modules`, since its files may have changed."""
+    """Remove a package and its submodules from `sys.modules`, to import them again."""
     for name in [n for n in sys.modules if f"{n}.".startswith(f"{package}.")]:
         del sys.modules[name]
     importlib.invalidate_caches()
 
 
 class _PluginLoader(SourceFileLoader):
-    """Loader of the modules of a plug-in, whose imports prefer its neighbours."""
+    """Loader of the modules of a plug-in, which redirects imports to its neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
-        # not from __pycache__: rewritten imports depend on the files in the folder
+        # bypass __pycache__, since rewritten imports depend on the files in the folder
         package = fullname.partition(".")[0]
         (entry,) = sys.modules[package].__path__
         imports = _Imports(package, entry.removeprefix(_BESIDE))
@@ -494,7 +506,7 @@ class _PluginLoader(SourceFileLoader):
 
 
 class _Imports(ast.NodeTransformer):
-    """Transformer of the imports of a plug-in to the full names of their modules."""
+    """Replacement of module names in import statements of a plug-in by full names."""
 
     def __init__(self, package: str, folder: str) -> None:
         self._package = package
@@ -513,7 +525,7 @@ class _Imports(ast.NodeTransformer):
             if full != alias.name:
                 first = alias.name.partition(".")[0]
                 names = [ast.alias(full, bound or first)]
-                if bound is None and first != alias.name:  # it binds the first part
+                if bound is None and first != alias.name:  # `import a.b` binds a
                     names += [ast.alias(self._full(first), first)]
             statements += [ast.Import([name]) for name in names]
         return [
@@ -529,7 +541,7 @@ class _Imports(ast.NodeTransformer):
 
 
 class _NeighbourFinder(FileFinder):
-    """Finder of the neighbours of a plug-in as submodules of its package."""
+    """Finder that offers the neighbours of a plug-in as submodules of its package."""
 
     def __init__(self, folder: str) -> None:
         super().__init__(
@@ -549,7 +561,7 @@ class _NeighbourFinder(FileFinder):
 
 
 def _neighbour_finder(entry: str) -> _NeighbourFinder:
-    """Return the finder for an entry of the path of a plug-in's package."""
+    """Return the finder for an entry of the ``__path__`` of a plug-in's package."""
     if not entry.startswith(_BESIDE):
         raise ImportError  # not an entry of a plug-in
     return _NeighbourFinder(entry.removeprefix(_BESIDE))
@@ -559,10 +571,10 @@ sys.path_hooks.append(_neighbour_finder)
 
 
 def stand_for_harness() -> None:
-    """Install a module `harness` with the exported names, which old plug-ins import.
+    """Install a module `harness` with the exported names, for plug-ins that import it.
 
-    Only worker processes call it: in the process of a user, the name is the user's, see
-    `_standing_for_harness`.
+    Only worker processes call this function. In the process of a user, a module of this
+    name may belong to the user, see `_standing_for_harness`.
     """
     exports = ModuleType("harness")  # without a path: it has no submodules
     exports.__dict__["__getattr__"] = partial(getattr, import_module(__package__))
@@ -572,7 +584,7 @@ def stand_for_harness() -> None:
 
 @contextmanager
 def _standing_for_harness() -> Iterator[None]:
-    """Install the module `harness` temporarily, while a package is imported."""
+    """Install the module `harness` within the block, and restore a previous module."""
     before = sys.modules.get("harness")
     stand_for_harness()
     try:
@@ -584,7 +596,10 @@ def _standing_for_harness() -> Iterator[None]:
 
 
 def _neighbour(name: str, folder: str) -> ModuleSpec | None:
-    """Find a module, or a package with ``__init__``, in the folder of a plug-in."""
+    """Return the spec of a module or package in a folder, or None if there is none.
+
+    Packages without ``__init__`` are not found.
+    """
     if name in _NEVER_BESIDE:
         return None
     spec = PathFinder.find_spec(name, [folder])
@@ -592,7 +607,7 @@ def _neighbour(name: str, folder: str) -> ModuleSpec | None:
 
 
 def _neighbours(path: Path) -> set[Path]:
-    """Return the files that a plug-in would import from its folder."""
+    """Return the files in its folder that a plug-in imports, directly or indirectly."""
     found: set[Path] = set()
     unread = [path]
     while unread:
@@ -614,8 +629,9 @@ def _neighbours(path: Path) -> set[Path]:
 def _imported_names(file: Path) -> set[str]:
     """Return the top-level names in the import statements of a file.
 
-    Relative imports count: ``from .helper import f`` finds a neighbour of a plug-in.
-    The result is empty for a file with a syntax error, which its import will report.
+    The names in relative imports are included, since ``from .helper import f`` imports
+    a neighbour of the plug-in. If the file has a syntax error, the result is empty; the
+    import of the file will report the error.
     """
     names: set[str] = set()
     try:
@@ -632,7 +648,10 @@ def _imported_names(file: Path) -> set[str]:
 
 
 def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
-    """Check the objects of a plug-in, and return them as a `Plugin`."""
+    """Check the types and names of a plug-in's objects, and return a `Plugin`.
+
+    where : file or "entry points", for messages
+    """
     for name, offered, kind, parts in (
         ("SOLVERS", solvers, "solver", _SOLVER_PARTS),
         ("PROBLEMS", problems, "family", _FAMILY_PARTS),
@@ -662,17 +681,17 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
 
 
 def is_solver(thing: object) -> bool:
-    """Return True for a solver or the class of a solver, False for a name."""
+    """Return True if `thing` has the methods of a solver, also as a class."""
     return _has(_SOLVER_PARTS, thing)
 
 
 def check_solver(thing: object) -> None:
-    """Raise unless `thing` is a solver or the name of one.
+    """Check that `thing` is a solver or a string, which may name a solver.
 
     Raises
     ------
     InputError
-        Otherwise; the message names the methods that a solver needs.
+        If `thing` is the class of a solver, or neither a solver nor a string.
 
     """
     methods = " and ".join(_SOLVER_PARTS)
@@ -693,7 +712,14 @@ def _has(parts: Sequence[str], thing: object) -> bool:
 
 
 def _check_names(where: str, family: Any) -> None:
-    """Raise InputError unless the keys and forms of a family can be part of names."""
+    """Check that the keys, defaults and forms of a family can occur in case names.
+
+    Raises
+    ------
+    InputError
+        If `defaults` or `forms` has the wrong type.
+
+    """
     defaults, forms = family.defaults, family.forms
     if not isinstance(defaults, Mapping) or not all(
         isinstance(key, str) and type(value) in (int, float, str)

@@ -1,19 +1,22 @@
 """The result of a solver: a claim, a primal-dual point, and a history of iterations.
 
-A history has columns of equal length, with any names. Reports use these:
+A history consists of columns of equal length, which may have any names. Reports use the
+following columns:
 
 * ``step``: kind of the step, one letter: c CG, e expansion, f fallback,
   p proportioning, n Newton
-* ``outer``: number of the outer iteration; ``products``: products with P so far
-* ``free_gradient``, ``chopped_gradient``: ‖φ‖ and ‖β‖, so that the projected gradient
-  has the norm √(‖φ‖² + ‖β‖²)
-* ``infeasibility``: ‖Ax − b‖, relative; ``active``: number of active bounds
-* ``two_sided``: number of active bounds of components with two finite bounds: in a dual
-  with friction, the rows that slip
-* ``cost``: value of the objective or the Lagrangian; ``seconds``: since the start of
-  `prepare`
+* ``outer``: number of the outer iteration
+* ``products``: number of products with P so far
+* ``free_gradient``, ``chopped_gradient``: norms ‖φ‖ and ‖β‖ of the free and the chopped
+  gradient; the norm of the projected gradient is √(‖φ‖² + ‖β‖²)
+* ``infeasibility``: relative norm of Ax − b
+* ``active``: number of active bounds
+* ``two_sided``: number of components at one of two finite bounds; in a dual with
+  friction, these are the rows that slip
+* ``cost``: value of the objective or the Lagrangian
+* ``seconds``: time since the start of `prepare`
 
-These are statements of the solver; no verdict depends on them.
+The solver reports these values; no verdict depends on them.
 """
 
 from __future__ import annotations
@@ -30,29 +33,30 @@ from mortarbench.harness.qp import QP, Vector
 
 History = Mapping[str, NDArray[Any]]
 
-_MAX_TEXT = 16  #: largest number of characters of an entry
-#: largest size, which keeps a result folder from filling the disk
+_MAX_TEXT = 16  #: largest number of characters of a text in a history
+#: Largest size of a history, so that a result folder does not fill the disk.
 MAX_HISTORY_BYTES = 2**28
 _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
 class Status(StrEnum):
-    """Claim of a solver about the outcome of its run."""
+    """Outcome of a solve as claimed by the solver."""
 
-    SOLVED = "solved"  #: claims that its tolerance is met
+    SOLVED = "solved"  #: the solver claims that the point meets its tolerance
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
-    INFEASIBLE = "infeasible"  #: claims that no feasible (or no bounded) point exists
-    FAILED = "failed"  #: stopped without a solution, or raised
-    DECLINED = "declined"  #: not started; the message has the reason
+    INFEASIBLE = "infeasible"  #: claimed: no feasible point, or objective unbounded
+    FAILED = "failed"  #: the solver stopped without a solution, or raised an exception
+    DECLINED = "declined"  #: the solver was not started; `message` states the reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A primal-dual point in the sign convention of `QP`; NaN without a point.
+    """A primal-dual point in the sign convention of `QP`, and the claim of the solver.
 
-    At a solution  P x + q + Aᵀy + Gᵀz + z_box = 0.  With a claim of infeasibility, y, z
-    and z_box may be a certificate: see `without_point`.
+    At a solution  P x + q + Aᵀy + Gᵀz + z_box = 0.  If the solver returns no point, the
+    vectors are NaN. If the solver claims infeasibility, y, z and z_box may instead be a
+    certificate of infeasibility, see `without_point`.
 
     Examples
     --------
@@ -76,7 +80,7 @@ class Solution:
     z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
     #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
     z_box: Vector
-    iterations: int | None = None  #: None if the solver does not report it
+    iterations: int | None = None  #: None if the solver does not report the number
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record
     reported: Mapping[str, float | str] = field(
@@ -99,9 +103,9 @@ class Solution:
     ) -> Solution:
         """Return a solution without a point: NaN vectors of the right shapes.
 
-        y, z, z_box : a certificate of infeasibility, if the solver has one: Aᵀy + Gᵀz +
-            z_box = 0, z ≥ 0, and the sum of bᵀy, hᵀz and of z_box times its bounds is
-            negative
+        y, z, z_box : a certificate of infeasibility (Farkas), if the solver has one:
+            Aᵀy + Gᵀz + z_box = 0, z ≥ 0, and  bᵀy + hᵀz + ubᵀ(z_box)₊ − lbᵀ(−z_box)₊ <
+            0, where (·)₊ is the positive part
 
         Examples
         --------
@@ -122,7 +126,7 @@ class Solution:
         )
 
     def mismatch(self, qp: QP) -> str | None:
-        """Return a message if a vector has the wrong shape for `qp`, else None."""
+        """Return a message if a vector does not have the shape required by `qp`."""
         expected = {"x": qp.q, "y": qp.b, "z": qp.h, "z_box": qp.q}
         for name, like in expected.items():
             got = np.shape(getattr(self, name))
@@ -132,25 +136,25 @@ class Solution:
 
 
 def usable_history(history: object) -> tuple[History, str]:
-    """Return a history as plain arrays and "", or an empty one and the defect.
+    """Return the history as plain arrays and "", or {} and a description of its defect.
 
-    The function never raises, so that a malformed history does not invalidate its
-    answer.
+    The function does not raise, so that a malformed history does not invalidate the
+    answer that comes with it.
     """
     try:
         return checked_history(history), ""
-    except Exception as e:  # the solver's own object; it may do anything when read
+    except Exception as e:  # reading a solver's own object may raise anything
         return {}, f"history dropped: {e}"
 
 
 def checked_history(history: object) -> History:
-    """Return a history as arrays of int64, float64 or short texts.
+    """Check a history, and return its columns as arrays of int64, float64 or texts.
 
     Raises
     ------
     ValueError
-        When `history` is not a mapping from identifiers to columns of equal length, or
-        is larger than MAX_HISTORY_BYTES.
+        If `history` is not a mapping from identifiers to columns of equal length, if a
+        column has another type, or if the size exceeds MAX_HISTORY_BYTES.
 
     """
     if not isinstance(history, Mapping):

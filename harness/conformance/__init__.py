@@ -1,1 +1,1 @@
-"""Conformance checks and weaknesses of solvers, with manufactured QPs to test them."""
+"""Checks that a solver conforms to its contract, and the manufactured QPs they use."""

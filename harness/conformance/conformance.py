@@ -1,9 +1,9 @@
 """Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
-The name of each check is a statement about the solver. A check passes, or fails with a
-description of the violation. If the solver declines the QP, the check is declined with
-the same reason. An answer that changes under an equivalent formulation is reported as a
-weakness, which most solvers have.
+The name of each check is a statement about the solver. A check passes, or it fails with
+a description of the violation. If the solver declines the QP, so is the check, for the
+reason that the solver states. If the answer changes under an equivalent formulation of
+the QP, the check reports a weakness, since many otherwise correct solvers would fail.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ from mortarbench.harness.verify.measure import (
 SOLUTION_PREFIX = "finds the planted solution"
 #: beginning of the names of checks of QPs over discs and cones
 SETS_PREFIX = "solves over"
-#: name of the check that reports errors in x at the degenerate cone
+#: name of the check that solves `degenerate_cone`
 DEGENERATE = f"{SETS_PREFIX} the degenerate cone"
-#: tolerances of that check
+#: tolerances of the check `DEGENERATE`
 DEGENERATE_TOLERANCES = (1e-6, 1e-8)
 #: beginning of the names of checks that compare equivalent formulations
 INVARIANCE_PREFIX = "keeps its answer"
@@ -67,10 +67,11 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-#: Rounding of a gradient relative to its largest term, as in dual residuals.
+#: Size of a gradient, relative to its largest term, that counts as rounding, as in dual
+#: residuals.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
-#: Difference between repeats that is ignored. The order of sums, and hence rounding,
-#: depends on the alignment of arrays in memory.
+#: Largest permitted difference in x between repeats. The order of summation, and hence
+#: rounding, may depend on the alignment of arrays in memory.
 REPEAT_ROUNDING = 1e-12
 
 
@@ -79,28 +80,30 @@ class Grade(StrEnum):
 
     PASS = "pass"
     DECLINE = "decline"  #: the solver declines the QP
-    WEAK = "weak"  #: a weakness; the solver conforms nevertheless
+    WEAK = "weak"  #: a weakness, which does not violate the contract
     FAIL = "fail"
 
 
 class Result(NamedTuple):
-    """Result of a check: its grade, and a reason or remark."""
+    """Result of a check: its grade, and the reason for it or a remark."""
 
     grade: Grade
     message: str = ""
-    work: float | None = None  #: iterations relative to the unchanged formulation
+    #: number of iterations relative to that of the unchanged formulation, if compared
+    work: float | None = None
 
 
 class ContractError(Exception):
     """Violation of the contract by a solver."""
 
 
-#: Raises ContractError, DeclinedError or WeaknessError; may return a result or None.
+#: Function that checks a solver. If it passes, it returns a result, or None if there is
+#: no remark; otherwise it raises ContractError, DeclinedError or WeaknessError.
 Check = Callable[[Solver], Result | None]
 
 
 def run_check(name: str, solver: Solver) -> Result:
-    """Run one of `CHECKS`."""
+    """Run the check with this name in `CHECKS`, and return its result."""
     try:
         return CHECKS[name](solver) or Result(Grade.PASS)
     except ContractError as e:
@@ -112,7 +115,7 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by `measure`; require a finite point, verified or not."""
+    """Solve as in a measurement, and require a point unless the solver declines."""
     s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
@@ -120,7 +123,14 @@ def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
 
 
 def _end(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by `measure`, which converts exceptions of the solver to a status."""
+    """Solve as in a measurement, in which an exception of the solver becomes a status.
+
+    Raises
+    ------
+    DeclinedError
+        If the solver declines the QP.
+
+    """
     s = measure(solver, qp, tol).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -155,11 +165,11 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 
 
 def _solves_over_sets(shape: str, solver: Solver) -> Result:
-    """Require a relative accuracy of 1e-8 of the objective; report the error in x.
+    """Require a relative error of at most 1e-8 in the objective; report the error in x.
 
-    The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective by
-    at least 0.05 δ². Points of interior-point methods may therefore have errors of up
-    to √(20·1e-8·|f|).
+    The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective f
+    by at least 0.05 δ². The permitted error in f therefore permits an error in x of up
+    to √(20·1e-8·|f|), which interior-point methods may attain.
     """
     qp, expected = manufactured_over_sets(shape)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
@@ -171,7 +181,7 @@ def _solves_over_sets(shape: str, solver: Solver) -> Result:
 
 
 def _solves_the_degenerate_cone(solver: Solver) -> Result:
-    """Require verified answers; report their errors in x, which are of order √tol."""
+    """Require verified answers, and report their errors in x, which are about √tol."""
     qp, x = degenerate_cone()
     errors = [
         float(np.abs(_solved(solver, qp, tol, VERIFIED_FACTOR).x - x).max())
@@ -198,8 +208,8 @@ def _multipliers_have_our_signs(solver: Solver) -> None:
 def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
     """Require zero multipliers on absent bounds, up to rounding.
 
-    Multipliers of at most 8·2⁻⁵² times the largest term of the gradient pass with a
-    remark: the dual residual neglects as much.
+    If the multipliers are at most 8·2⁻⁵² times the largest term of the gradient, the
+    check passes with a remark, since the dual residual neglects values of this size.
     """
     qp, _ = manufactured("some bounds")
     s = _solve(solver, qp, 1e-3)
@@ -229,10 +239,10 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
-    # solvers can make the read-only arrays writable, so their values are compared too
+    # compare values as well, since a solver can make read-only arrays writable
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
-            raise ContractError("changed the QP that it was given")
+            raise ContractError("modified the QP")
     if s.status is not Status.SOLVED:
         raise ContractError(f"ended as {s.status}: {s.message}")
 
@@ -274,11 +284,11 @@ def _many_bounds_and_no_rows(solver: Solver) -> None:
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Require that one thread computes, so that CPU time does not exceed wall time."""
+    """Require that a solve uses one thread: CPU time must not exceed wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
-    # on all CPUs: on a single CPU, the CPU time of two threads would not exceed wall
-    # time
+    # permit all CPUs: on a single CPU, the CPU time of two threads would not exceed the
+    # wall time
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()
@@ -295,7 +305,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Require solutions of two QPs with equal matrices, then of two other QPs."""
+    """Require correct solutions of a sequence of QPs, given by `_sequence`."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
@@ -312,7 +322,7 @@ def _a_sequence_is_solved(solver: Solver) -> None:
             raise
         except ImportError as e:
             raise DeclinedError(f"not installed: {e.name}") from None
-        except Exception as e:  # the solver's own code
+        except Exception as e:  # raised by code of the solver
             message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
             raise ContractError(message) from None
 
@@ -330,18 +340,18 @@ def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
     before, after = same_answer(form, change, solver)
     if before is None or after is None:
         return Result(Grade.PASS)
-    message = f"{after} iterations, {before} as it is"
+    message = f"{after} iterations, {before} without the change"
     return Result(Grade.PASS, message, after / max(before, 1))
 
 
 def _near(
     name: str, value: Vector | float, expected: Vector | float, tol: float
 ) -> None:
-    """Require ‖value − expected‖∞ ≤ tol; NaN fails."""
+    """Require ‖value − expected‖∞ ≤ tol; a value of NaN does not pass."""
     error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
     if not error <= tol:
         raise ContractError(
-            f"{name} differs from the known one by {error:.1e}; expected at most "
+            f"{name} differs from the known value by {error:.1e}; expected at most "
             f"{tol:.1e}"
         )
 

@@ -1,9 +1,10 @@
 """Invariance of a solver's answer under equivalent formulations of a contact problem.
 
-Two strings in contact (`harness.conformance.manufactured.strings`) are solved in each
-form, unchanged and after every change of `CHANGES`. Verdict and answer must not change.
-For two verified points x and x₀ of one QP, the residuals bound the difference of the
-objectives and the energy ½‖x − x₀‖²_P of the difference, both relative to the energies.
+The problem of two strings in contact (`harness.conformance.manufactured.strings`) is
+solved in each form, unchanged and after each of the `CHANGES`, which yield equivalent
+QPs. Verdict and answer must be equal. Answers are compared as points x and x₀ of the
+unchanged QP: if both are verified, their residuals bound the difference of their
+objectives, and the energy ½‖x − x₀‖²_P of their difference, relative to their energies.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8  #: tolerance of all solves of the strings
-#: Largest difference relative to the energies. The factor of 10 allows for residuals
-#: that add up over rows.
+#: Largest permitted difference, relative to the energies. The factor of 10 accounts for
+#: the sum of residuals over rows.
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
-#: Load (10⁸ N/m) and length (2 m) of beam-ring in each system of units, as powers of
-#: two. Forces are per unit thickness, so that the stiffness is in Pa, MPa and GPa.
+#: Load (10⁸ N/m) and length (2 m) of beam-ring in each system of units, rounded to
+#: powers of two. Forces are per unit thickness, so that the stiffness is in Pa, MPa or
+#: GPa.
 UNITS: Mapping[str, tuple[float, float]] = {
     "N, m": (2.0**27, 2.0**1),
     "N, mm": (2.0**17, 2.0**11),
@@ -47,20 +49,20 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Change of the verdict or the answer under an equivalent formulation."""
+    """Error if verdict or answer change under an equivalent formulation."""
 
 
 class DeclinedError(Exception):
-    """Refusal of a QP by a solver, with its reason."""
+    """Error if a solver declines a QP; the message is its reason."""
 
 
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
-    """Solve the unchanged and the changed string problem; compare the answers.
+    """Solve the unchanged and the changed string problem, and compare the answers.
 
     change : a key of `CHANGES`
-    old : the answer to the unchanged QP, if it is available
+    old : the answer to the unchanged QP; None to solve it
 
     Returns
     -------
@@ -69,16 +71,17 @@ def same_answer(
     Raises
     ------
     DeclinedError
-        If the solver declines either QP, or fails on the unchanged one.
+        If the solver declines one of the QPs, or, for a change other than `UNCHANGED`,
+        if its answer to the unchanged QP is not verified.
     WeaknessError
-        If verdict or answer differ; without a change, if the solver fails.
+        If the answer to the changed QP is not verified, or differs from the other.
 
     """
     qp = strings(form)
     old = old or answer(solver, qp)
     before = _fault(qp, old)
     if before and change != UNCHANGED:
-        raise DeclinedError(f"not solved as it is: {before}")
+        raise DeclinedError(f"not solved without the change: {before}")
     new = CHANGES[change](qp, form)
     s = old if change == UNCHANGED else answer(solver, new.qp)
     if after := _fault(new.qp, s):
@@ -92,7 +95,7 @@ def same_answer(
 
 
 def answer(solver: Solver, qp: QP) -> Solution:
-    """Solve a QP; raise DeclinedError if the solver declines it."""
+    """Solve a QP at the tolerance `TOL`; raise DeclinedError if it is declined."""
     s = measure(solver, qp, TOL).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -100,7 +103,7 @@ def answer(solver: Solver, qp: QP) -> Solution:
 
 
 def _fault(qp: QP, s: Solution) -> str:
-    """Describe, with evidence, why an answer is not a verified success; "" if it is."""
+    """Return the reason why an answer is not verified; "" if it is verified."""
     residuals = kkt_residuals(qp, s)
     judged = verdict(s.status, residuals, TOL)
     if s.status is Status.SOLVED and judged is Verdict.VERIFIED:
@@ -140,10 +143,10 @@ def _rows_scaled(qp: QP, form: str) -> Equivalent:
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: Shift for each form, about half of the largest deflection or contact force.
+#: Shift of the unknowns in each form: about half the largest deflection or force.
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
-#: function of the strings and the form that returns an equivalent QP
+#: Function that maps the QP of the strings and its form to an equivalent QP.
 Change = Callable[[QP, str], Equivalent]
 
 UNCHANGED = "as it is"
@@ -165,7 +168,7 @@ CHANGES: Mapping[str, Change] = {
     "unknowns shifted": lambda qp, form: shift_unknowns(
         qp, np.full(qp.q.size, _SHIFTS[form])
     ),
-    # the load points upwards instead of downwards, and λ ≥ 0 becomes λ ≤ 0
+    # reverse all signs: the load acts upwards, and λ ≥ 0 becomes λ ≤ 0
     "mirrored": lambda qp, _: mirror(qp, np.arange(qp.q.size)),
 }
 
@@ -177,9 +180,9 @@ _ROWS = {
 
 
 def changes_of(form: str) -> list[str]:
-    """Return the changes that apply to a form; the first is `UNCHANGED`.
+    """Return the names of the changes that apply to a form, `UNCHANGED` first.
 
-    Changes of rows do not apply to forms without such rows.
+    A change of equality or inequality rows applies only to forms with such rows.
     """
     return [
         name

@@ -1,4 +1,4 @@
-"""Manufactured QPs, with solutions known by construction, to test solvers."""
+"""Manufactured QPs to test solvers; most have solutions known by construction."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
 
-#: Keys: m equality rows, p inequality rows, numbers of finite lower and upper bounds,
-#: redundant rows, fixed variables, rank of P.
+#: Arguments of each shape. m, p: numbers of equality and inequality rows; lower, upper:
+#: False without such bounds; some: bounds on half of the variables; redundant: linearly
+#: dependent equality rows; fixed: equal bounds on some variables; rank: rank of P.
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
@@ -35,9 +36,10 @@ def manufactured(
 ) -> tuple[QP, Solution]:
     """Return a random QP with a known KKT point.
 
-    x*, the multipliers and the active set are drawn, and stationarity determines q. The
-    matrices are of order one. Every kind of constraint in the shape is active, and the
-    minimiser is unique except for "singular".
+    The point, its multipliers and the active set are drawn at random, and q follows
+    from stationarity. The entries of the matrices are of order one. Of every kind of
+    constraint in the shape, some are active. The minimiser is unique except for the
+    shape "singular".
 
     shape : a key of `SHAPES`
 
@@ -65,9 +67,10 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
-    # multipliers of active rows are at least 0.5: strict complementarity
+    # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of four variables, one is at its lower bound, one at its upper, two are inside
+    # of four variables, one is at its lower bound, one is at its upper bound, and two
+    # are between their bounds
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
     bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
@@ -88,7 +91,7 @@ def _plant(
     return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
-#: discs, cones and rows of QPs over sets, by name
+#: Numbers of discs, of cones, and of rows of each kind, by shape.
 SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
     "discs": (6, 0, 0),
     "discs and rows": (6, 0, 2),
@@ -101,11 +104,13 @@ SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
 def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solution]:
     """Return a random QP over discs and cones, with its solution.
 
-    The blocks have two tangents and sizes between 0.1 and 10. Of three successive
-    discs, two are active and one is not; of three successive cones, one slips, one is
-    open (at the apex) and one sticks. Forces on active blocks are at least 0.5 from the
-    boundary of the normal cone: complementarity is strict. P is positive definite with
-    eigenvalues above 0.1. Two more variables have bounds, one of them active.
+    A block has two tangential components, and a cone also a normal one. Radii and
+    normal components are between 0.1 and 10. Of three successive discs, two are active.
+    Of three successive cones, the point is on the boundary of one (slip), at the apex
+    of one (open), and in the interior of one (stick). Multipliers of active blocks are
+    at least 0.5 from the boundary of the normal cone, so that complementarity is
+    strict. The eigenvalues of P are above 0.1. Two further variables have lower bounds,
+    one of which is active.
 
     shape : a key of `SET_SHAPES`
 
@@ -161,8 +166,9 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
 def degenerate_cone() -> tuple[QP, Vector]:
     """Return min ½‖x‖² − 4x₁ − 4x₂ over the cone ‖(x₂, x₃)‖ ≤ x₁, and x* = (4, 4, 0).
 
-    The unconstrained minimum is on the boundary, with multiplier zero: the error in x
-    is of the order of the square root of an error in complementarity.
+    The unconstrained minimiser is on the boundary of the cone, so its multiplier is
+    zero. The error in x is therefore of the order of the square root of the error in
+    complementarity.
     """
     qp = QP(
         P=csr_array(np.eye(3)),
@@ -177,9 +183,11 @@ def degenerate_cone() -> tuple[QP, Vector]:
 
 
 def one_of_each() -> tuple[QP, dict[str, Vector]]:
-    """Four separate problems min ½x² + qx, one active constraint of each kind.
+    """Return a QP with an active constraint of each kind, and its solution by name.
 
-    x₀ ≤ 1 and x₁ ≥ −1 (bounds), 2x₂ ≤ 2 (row), 2x₃ = 2; all multipliers follow by hand.
+    The QP separates into four problems min ½x² + qx with the constraints x₀ ≤ 1 and
+    x₁ ≥ −1 (bounds), 2x₂ ≤ 2 (inequality row) and 2x₃ = 2 (equality row). The
+    multipliers can be computed by hand.
     """
     inf = np.inf
     qp = QP(
@@ -197,9 +205,10 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
 
 
 def membrane(k: int) -> QP:
-    """Return the QP of a k × k membrane over a paraboloid, with its rim fixed.
+    """Return the QP of a membrane with k × k nodes and fixed rim above a paraboloid.
 
-    The QP has bounds only. Its solution is unknown, but KKT residuals verify answers.
+    The QP has bounds only. Its solution is not known in closed form, but the KKT
+    residuals suffice to verify an answer.
     """
     second = diags_array(
         [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]
@@ -225,14 +234,16 @@ FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 def strings(form: str) -> QP:
     """Return a small frictionless contact problem: a loaded string above a softer one.
 
-    The strings have 24 and 16 cells. The unknown is the deflection u (25 + 17 nodes), K
-    is the stiffness:  min ½uᵀKu − fᵀu.  The ends are fixed by A u = 0. Each row of
-    G u ≤ h keeps an inner node of the upper string above the lower string. Its entries
-    are −1 at the node and the interpolation weights of two lower nodes.
+    The upper string has 24 cells, the lower one 16. The unknown is the deflection u at
+    their 25 + 17 nodes; K is the stiffness and f the load. The primal problem is
+    min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends. Each row of
+    G u ≤ h keeps an inner node of the upper string above the lower string: its entries
+    are −1 at this node, and interpolation weights at two nodes of the lower string.
 
-    form : "primal" is that QP. "dual", with B = [A; G], c = [0; h] and an orthonormal
-        basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  λ_I ≥ 0.
-        "dual-bounds" is the dual of the strings with fixed ends: λ ≥ 0 and no rows
+    form : "primal" is the above QP. "dual", with B = [A; G], c = [0; h] and an
+        orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to
+        RᵀBᵀλ = Rᵀf,  λ_I ≥ 0,  where λ_I are the multipliers of G. "dual-bounds" is the
+        dual after elimination of the fixed ends, with λ ≥ 0 as its only constraint
     """
     K, f, R = _two_strings()
     upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)
@@ -276,7 +287,10 @@ def strings(form: str) -> QP:
 
 
 def _two_strings() -> tuple[Vector, Vector, Vector]:
-    """Return stiffness (42, 42), load (42,) on the upper string, and kernel (42, 2)."""
+    """Return stiffness K (42, 42), load (42,) and an orthonormal kernel of K (42, 2).
+
+    The load acts on the upper string only.
+    """
     K, R = np.zeros((42, 42)), np.zeros((42, 2))
     for body, (tension, cells, nodes) in enumerate(
         [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
@@ -290,7 +304,7 @@ def _two_strings() -> tuple[Vector, Vector, Vector]:
 
 
 def infeasible() -> QP:
-    """Return a QP with the contradicting rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
+    """Return a QP with the contradictory rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
     rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
     return QP(
         P=csr_array(np.eye(20)),
@@ -305,7 +319,7 @@ def infeasible() -> QP:
 
 
 def unbounded() -> QP:
-    """Return a QP that decreases linearly along x₀, which has no upper bound."""
+    """Return a QP that decreases linearly in x₀, a variable without upper bound."""
     return QP(
         P=csr_array(np.diag([0.0] + [1.0] * 19)),
         q=-np.ones(20),

@@ -1,25 +1,25 @@
-"""Equivalent formulations of a QP, each with the map back to the original solution.
+"""Equivalent formulations of a QP, and maps of their solutions to the original QP.
 
-Physically equivalent problems must have the same answer. Changes are: other units,
-another order of unknowns or rows, another origin or sign of unknowns, and scaled or
-duplicated rows (metamorphic relations: T. Y. Chen et al., ACM Computing Surveys 51
+Equivalent problems must have equal answers. The changes are: different units, another
+order of unknowns or rows, another origin or sign of unknowns, and scaled or duplicated
+rows. Such relations are called metamorphic (T. Y. Chen et al., ACM Computing Surveys 51
 (2018) 4). Each change is one of two substitutions:
 
-* of unknowns,  x = T x' + a,  where T has one entry in each row and column, with the
-  objective multiplied by t:
+* of unknowns,  x = T x' + a,  where T has one nonzero in each row and column; the
+  objective is multiplied by t:
 
       P' = t TᵀPT,  q' = t Tᵀ(Pa + q),  A' = AT,  b' = b − Aa,  G' = GT,  h' = h − Ga;
       y = y'/t,  z = z'/t,  z_box = T⁻ᵀz_box'/t,  objective = objective'/t + aᵀ(½Pa + q)
 
-* of rows,  A' = MA, b' = Mb  or  G' = NG, h' = Nh.  M and N have one entry in each row
-  and at least one in each column; the entries of N are positive:
+* of rows,  A' = MA, b' = Mb  or  G' = NG, h' = Nh.  M and N have one nonzero in each
+  row and at least one in each column; the nonzeros of N are positive:
 
       y = Mᵀy',  z = Nᵀz'
 
-If the factors are powers of two, every change except a shift is exact in floating-point
-arithmetic. The structure is transformed as well: P = BK⁺Bᵀ becomes P' = B'K'⁺B'ᵀ with
-B' = TᵀB and K' = K/t. Changes of the unknowns need P as a matrix and raise ValueError
-for an operator.
+If all factors are powers of two, every change except a shift is exact in floating-point
+arithmetic. The structure of the QP is also transformed: P = BK⁺Bᵀ becomes P' =
+B'K'⁺B'ᵀ with B' = TᵀB and K' = K/t. Substitutions of unknowns require P as a matrix;
+they raise ValueError if P is an operator.
 """
 
 from __future__ import annotations
@@ -39,15 +39,16 @@ Order = NDArray[Any]  #: array of indices, or a mask
 
 
 class Equivalent(NamedTuple):
-    """A transformed QP, and the map of its points back to the original QP."""
+    """A transformed QP, and the map of its points to points of the original QP."""
 
     qp: QP
-    recover: Callable[[Solution], Solution]  #: maps a point of the new QP to the old QP
-    scale: float = 1.0  #: old objective = scale·new objective + constant, at all points
+    #: maps a point of the transformed QP to a point of the original QP
+    recover: Callable[[Solution], Solution]
+    scale: float = 1.0  #: original objective = scale·transformed objective + constant
     constant: float = 0.0
 
     def followed_by(self, change: Callable[[QP], Equivalent]) -> Equivalent:
-        """Compose with a change of the transformed QP."""
+        """Return the composition with a further change of the transformed QP."""
         new = change(self.qp)
         return Equivalent(
             new.qp,
@@ -66,11 +67,11 @@ def change_units(qp: QP, *, unknown: float, objective: float) -> Equivalent:
         P' = ts²P,  q' = ts q,  A' = A,  b' = b/s,  G' = G,  h' = h/s,  lb' = lb/s
         y = y'/(ts),  z = z'/(ts),  z_box = z_box'/(ts)
 
-    The entries of contact rows are dimensionless, so rows keep their entries and
+    Since the entries of contact rows are dimensionless, A and G do not change, and
     right-hand sides have the unit of x. If x is a displacement, multipliers are forces.
 
-    unknown : s, the new unit of x in terms of the old one
-    objective : t, the old unit of the objective in terms of the new one
+    unknown : s, the new unit of x, in multiples of the old one
+    objective : t, the old unit of the objective, in multiples of the new one
     """
     s = unknown
     T = diags_array(np.full(qp.q.size, s))
@@ -91,14 +92,15 @@ def permute_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
 
 
 def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
-    """Multiply each row by a positive factor, which divides its multiplier."""
+    """Multiply each row by a positive factor, which divides the row's multiplier."""
     return _rows(qp, diags_array(equalities), diags_array(inequalities))
 
 
 def duplicate_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
     """Append copies of the selected rows.
 
-    The multiplier of a row is the sum of its copies' multipliers, which are not unique.
+    The multiplier of an original row is the sum of the multipliers of its copies, which
+    are not unique.
     """
     every = [np.arange(v.size) for v in (qp.b, qp.h)]
     twice = [
@@ -117,9 +119,11 @@ def shift_unknowns(qp: QP, origin: Vector) -> Equivalent:
 
 
 def mirror(qp: QP, flipped: Order) -> Equivalent:
-    """Reverse the sign of selected unknowns: xᵢ = −xᵢ', lbᵢ' = −ubᵢ, ubᵢ' = −lbᵢ.
+    """Reverse the sign of selected unknowns: xᵢ' = −xᵢ, lbᵢ' = −ubᵢ, ubᵢ' = −lbᵢ.
 
-    Then z_boxᵢ = −z_boxᵢ'; y and z do not change.
+    The multipliers z_boxᵢ of selected unknowns also change sign; y and z do not change.
+
+    flipped : indices or mask of the selected unknowns
     """
     sign = np.ones(qp.q.size)
     sign[flipped] = -1
@@ -129,7 +133,10 @@ def mirror(qp: QP, flipped: Order) -> Equivalent:
 def _unknowns(
     qp: QP, T: Matrix, origin: Vector | None = None, objective: float = 1.0
 ) -> Equivalent:
-    """Substitute x = T x' + a, and multiply the objective by t.
+    """Substitute x = T x' + a, and multiply the objective by a factor.
+
+    origin : a; None for zero
+    objective : factor t of the objective
 
     Raises
     ------
@@ -140,7 +147,7 @@ def _unknowns(
     if not qp.is_explicit:
         raise ValueError(f"QP.P is a {type(qp.P).__name__}, expected a matrix")
     T, t = csr_array(T), objective
-    U = T.copy()  # T⁻ᵀ: one entry in each row and column
+    U = T.copy()  # T⁻ᵀ has the pattern of T, with one nonzero in each row and column
     U.data = 1 / T.data
     a = np.zeros(qp.q.size) if origin is None else origin
     Pa = qp.P @ a
@@ -179,13 +186,13 @@ def _rows(qp: QP, M: Matrix, N: Matrix) -> Equivalent:
 def _selections(
     qp: QP, equalities: Order, inequalities: Order
 ) -> tuple[Matrix, Matrix]:
-    """Return the matrices M, N that select these rows, in this order."""
+    """Return the matrices that select the given equality and inequality rows."""
     M, N = (eye_array(v.size, format="csr") for v in (qp.b, qp.h))
     return M[equalities], N[inequalities]
 
 
 def _sorted(M: Matrix) -> Matrix:
-    """Sort the column indices of sparse rows, which products leave unsorted."""
+    """Sort the indices of a sparse matrix in place; products leave them unsorted."""
     if hasattr(M, "sort_indices"):
         M.sort_indices()
     return M

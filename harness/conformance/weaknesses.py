@@ -1,4 +1,4 @@
-"""Page docs/weaknesses.md: effects of equivalent formulations, by solver."""
+"""Page docs/weaknesses.md: effects of equivalent formulations on each solver."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mortarbench.harness.conformance.equivalence import (
 )
 from mortarbench.harness.conformance.manufactured import FORMS
 
-MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
+MIN_LISTED_WORK_RATIO = 2.0  #: least ratio of iterations that the table shows
 
-Results = Mapping[str, Result]  #: results of one solver, by the name of the check
+Results = Mapping[str, Result]  #: results of one solver, by name of the check
 
 HEAD = f"""\
 # Effects of equivalent formulations
@@ -68,7 +68,10 @@ even if the answer is verified.
 
 
 def weaknesses_page(results: Mapping[str, Results]) -> str:
-    """Return a Markdown page with the results of the checks of equivalence."""
+    """Return the Markdown page on the results of the checks of equivalence.
+
+    results : results of all checks by solver
+    """
     heads = [change for change in CHANGES if change != UNCHANGED]
     lines = [
         *_units(),
@@ -88,12 +91,12 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
 
 
 def line_of(name: str, form: str, change: str) -> str:
-    """Return the beginning of the line that describes a weakness."""
+    """Return the beginning of the line that describes a weakness of a solver."""
     return f"- `{name}`, {form}, {change}: "
 
 
 def _degenerate(results: Mapping[str, Results]) -> Iterator[str]:
-    """Yield the errors of all solvers that accept cones at the degenerate cone."""
+    """Yield the lines of the section on the degenerate cone, for solvers with cones."""
     yield from DEGENERATE_HEAD.splitlines()
     for name, checks in results.items():
         result = checks.get(DEGENERATE)

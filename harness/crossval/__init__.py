@@ -1,1 +1,1 @@
-"""Comparison of the answers of all solvers with each other and with references."""
+"""Cross-validation: comparison of answers with each other and with references."""

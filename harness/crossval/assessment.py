@@ -1,19 +1,20 @@
 """Errors of one answer against the reference solution.
 
-An answer may deviate from the reference by an error that follows from its claim. At
-tolerance t it is verified if its KKT residuals are at most 10t; the residual of the gap
-is g/E with the energy
-E = ‖u*‖². With the identity of Prager and Synge (`harness.verify.certificate`, (2)),
+Let u and λ be the displacement and the multipliers of the answer, u* and λ* those of
+the solution, ‖·‖ the energy norm, and u_λ the equilibrium of the bodies under the load
+and the contact forces −Bᵀλ. An answer is verified at tolerance t if its KKT residuals
+are at most 10t. The residual of the duality gap g is g/‖u*‖². By the identity of Prager
+and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
-so that the errors of the displacement and of the equilibrium u_λ under the contact
-forces are at most √(20t)‖u*‖. The second error is that of the contact forces in the
-dual norm, ‖Bᵀ(λ − λ*)‖; the multipliers themselves need not be unique.
+so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at most √(20t)‖u*‖. The
+latter equals the error of the contact forces in the dual norm, ‖Bᵀ(λ − λ*)‖. The
+multipliers themselves need not be unique.
 
-A row with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. An error of that energy
-changes λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
-contradict each other on a row only if max(λᵢDᵢ, gapᵢ) > sᵢ in both.
+A contact row i with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors within this
+bound change λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
+contradict each other on a row only if max(λᵢDᵢ, gapᵢ) > sᵢ for both.
 """
 
 from __future__ import annotations
@@ -37,42 +38,48 @@ from mortarbench.harness.verify.references import ReferencePoint
 
 @dataclass(frozen=True, kw_only=True)
 class Assessment:
-    """Errors of one answer; None if a quantity does not exist for the problem.
+    """Errors of one answer, in the notation of the docstring of this module.
 
-    Energies are relative to ½‖u*‖². Lengths in the energy norm are relative to ‖u*‖.
+    Energies are relative to ½‖u*‖², energy norms to ‖u*‖. If a problem has no mechanics
+    (it is a QP only), fields that are defined by the mechanics are None.
     """
 
     error: float  #: ‖u − u*‖
     equilibrium_error: float | None  #: ‖u_λ − u*‖
-    energy: float  #: J(u) − J(u*)
-    penetration: float | None  #: max (Bu − c)₊ over the mesh size
-    balance: float | None  #: largest unbalanced relative force or moment on a body
+    energy: float  #: J(u) − J(u*), where J is the potential energy
+    penetration: float | None  #: max (Bu − c)₊ over contact rows, over the mesh size
+    #: largest resultant force or moment on a body, relative to the forces on the body
+    balance: float | None
     active: int | None  #: number of closed contact rows
     rows: tuple[int, ...] = ()  #: rows whose state contradicts that of the reference
-    #: rows with a tensile multiplier, λᵢDᵢ < −sᵢ, or one above the friction bound by sᵢ
+    #: contact rows in tension, λᵢDᵢ < −sᵢ, and friction rows that exceed the friction
+    #: bound by more than sᵢ/Dᵢ
     pulls: tuple[int, ...] = ()
 
 
 class Deviation(NamedTuple):
     """Difference of an answer from the reference, divided by ‖u*‖; see `distances`."""
 
-    u: Vector  #: (n,)
+    u: Vector  #: (n,) difference of u, or of x for a QP without mechanics
     equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
 
 
 def energy_allowed(tol: float) -> float:
-    """Return √(20 tol), the relative error that a verified answer may have."""
+    """Return √(20 tol), the largest relative error of an answer verified at `tol`."""
     return float(np.sqrt(2 * allowed(tol)))
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300
+@np.errstate(all="ignore")  # components of a point may be as large as 1e300
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
 ) -> tuple[Assessment, Deviation]:
-    """Measure `s`, a finite point from ``mechanics.to_primal``, against the solution.
+    """Compute the errors of an answer to a problem with mechanics.
 
-    If the solution is zero, errors are relative to the displacement under the load
-    without contact.
+    If the displacement of the solution is zero, errors are relative to the displacement
+    under the load without contact.
+
+    truth : reference point
+    s : answer as a finite point, returned by ``mechanics.to_primal``
     """
     exact = mechanics.exact
     u, lam = s.x.astype(Real), mechanics.multipliers(s).astype(Real)
@@ -108,10 +115,10 @@ def assess(
 
 @np.errstate(all="ignore")
 def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Deviation]:
-    """Measure a finite point of a QP without mechanics, in the seminorm ‖·‖_P.
+    """Compute the errors of a finite point of a QP without mechanics.
 
-    Errors are relative to `point_norm`. All solutions have the same Px, and the same x
-    if P is positive definite.
+    Errors are measured in the seminorm ‖·‖_P, relative to `point_norm`. They do not
+    depend on the choice of the reference solution, since Px is equal for all solutions.
     """
     norm = point_norm(qp, truth)
     off = s.x - truth.x
@@ -129,7 +136,7 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
 
 
 def point_norm(qp: QP, s: Solution) -> float:
-    """Return √max(xᵀPx, |qᵀx|), the scale of relative errors of x."""
+    """Return √max(xᵀPx, |qᵀx|), to which errors in the seminorm ‖·‖_P are relative."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
 
 
@@ -137,18 +144,22 @@ def point_norm(qp: QP, s: Solution) -> float:
 def distances(
     P: Matrix, kernel: NDArray[np.float64], points: Sequence[Vector]
 ) -> NDArray[np.float64]:
-    """Return ‖v_i − v_j‖_P of all pairs (k, k), inf if one of them is not finite.
+    """Return the distances ‖vᵢ − vⱼ‖_P of all pairs of points (k, k).
 
-    Cancellation in the Gram matrix hides distances below 1e-8 of the norm of the longer
-    vector. The points must therefore be deviations from a common reference.
-    common reference.
+    A distance is inf if one of its points is not finite.
 
+    The distances are computed from the Gram matrix, in which cancellation hides those
+    below 1e-8 of the norm of the longer vector. The points must therefore be deviations
+    from a common reference.
+
+    P : (n, n) stiffness, or matrix of a QP
     kernel : (n, r) orthonormal rigid motions, which are projected out
+    points : k vectors (n,)
     """
     V = np.stack(points, axis=1)
     V = V - kernel @ (kernel.T @ V)
     gram = V.T @ np.asarray(P @ V)
-    norms = np.diag(gram)  # squared
+    norms = np.diag(gram)  # squares of the norms
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
     lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
     np.fill_diagonal(lengths, 0)  # inf − inf would be NaN
@@ -158,13 +169,22 @@ def distances(
 def _closed(
     exact: Exact, lam: Extended, gap: Extended, small: Extended
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks (m,) of closed rows, and of rows that are clearly closed or open."""
+    """Return masks (m,) of the closed rows, and of the rows whose state is certain.
+
+    lam : (m,) multipliers
+    small : (m,) errors sᵢ that the tolerance permits
+    """
     force = lam * exact.compliance
     return force > gap, np.maximum(force, gap) > small
 
 
 def _balance(mechanics: Mechanics, s: Solution) -> float | None:
-    """Return the largest |Rᵀ(f − B_Eᵀy − B_Iᵀz)| of a body, relative to its forces."""
+    """Return the largest resultant force or moment on a body, relative to its forces.
+
+    Resultants are Rᵀ(f − B_Eᵀy − Bᵀλ), where R are the rigid motions of the bodies, B_E
+    the rows of the supports and B those of contact and friction. The value is None if
+    there are no rigid motions.
+    """
     R, primal = mechanics.rigid, mechanics.primal
     if not R.shape[1]:
         return None
@@ -186,7 +206,7 @@ def _numbers(rows: NDArray[np.bool_]) -> tuple[int, ...]:
 
 
 def _over(value: float, scale: float) -> float:
-    """Divide with 0/0 = 0; NaN, which results from overflow, becomes inf."""
+    """Divide with 0/0 = 0; the result is inf instead of NaN after an overflow."""
     if value == 0:
         return 0.0
     ratio = value / scale if scale else np.inf

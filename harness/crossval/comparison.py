@@ -1,11 +1,11 @@
 """Comparison of all answers to one problem with a reference and with each other.
 
-The reference is a point with a proven error (`harness.verify.references`), computed
-independently of the solvers under test. An answer is refuted by its residuals, or if
-its distance to the reference, minus the error of the reference, exceeds what the claim
-allows (`harness.crossval.assessment`). No majority of answers is needed. Distances
-between answers need no reference: if two answers differ by more than both claims allow,
-and neither is refuted, the disagreement is unresolved.
+The reference is a point with a proven error bound (`harness.verify.references`), which
+is computed independently of the solvers under test. An answer is refuted if a residual
+is too large, or if its distance to the reference, minus the error bound of the
+reference, exceeds the error that its claim permits (`harness.crossval.assessment`).
+Majorities of answers play no role. If two answers differ by more than the sum of the
+permitted errors, and neither answer is refuted, the disagreement is unresolved.
 """
 
 from __future__ import annotations
@@ -41,40 +41,40 @@ from mortarbench.harness.verify.verdicts import note_of
 
 #: Least error of an outlier, relative to the median error of the other solvers.
 OUTLIER_RATIO = 100
-MIN_PEERS = 3  #: least number of other solvers' answers for a meaningful median
+MIN_PEERS = 3  #: least number of answers of other solvers from which a median is taken
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """Judgement of one answer; plain data."""
+    """An answer with its verdict, its errors and the reasons that refute it."""
 
     run_id: str
-    repeats: int
+    repeats: int  #: number of measurements that returned exactly this point
     solver: str
     case: str
     form: str
     tol: float
     claimed: str
-    stored: Verdict  #: verdict of the run
-    verdict: Verdict  #: verdict on the stored point, evaluated again at 10·tol
+    stored: Verdict  #: verdict that the run stored
+    verdict: Verdict  #: verdict on the stored point, evaluated again
     residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
     optimum_error: (
         float | None
-    )  #: error against a proven optimum; decides in place of the residuals
+    )  #: error relative to a proven optimum, which decides instead of the residuals
     allowed: float  #: largest residual of a verified answer
-    energy_allowed: float  #: largest relative error in the energy norm that is allowed
-    energy_bound: float | None  #: certificate stored by the run
-    doubt: float | None  #: bound of the uncertainty of the errors in `assessment`
+    energy_allowed: float  #: largest permitted relative error in the energy norm
+    energy_bound: float | None  #: certified error bound that the run stored
+    doubt: float | None  #: bound on the relative error of the reference point
     assessment: Assessment | None
     refuted: tuple[str, ...] = ()  #: reasons why the claim is false
-    #: contradiction between the certificate of the run and the reference, which
-    #: indicates a defect of this program
+    #: description of a contradiction between the certified bound of the run and the
+    #: reference, which indicates a defect of mortarbench; empty if there is none
     contradiction: str = ""
     remarks: tuple[str, ...] = ()
 
     @property
     def error(self) -> float | None:
-        """Certified bound of the errors of displacement and contact forces."""
+        """Bound on the relative errors of displacement and contact forces, or None."""
         if self.assessment is None or self.doubt is None:
             return None
         a = self.assessment
@@ -82,29 +82,32 @@ class Answer:
 
 
 class Pair(NamedTuple):
-    """Distances between two answers, relative to the solution; None without contact."""
+    """Distances between two answers, relative to the norm or energy of the solution."""
 
     a: int  #: index of the first answer
     b: int  #: index of the second answer
     distance: float  #: ‖u − u'‖ in the energy norm
-    equilibrium: float | None  #: ‖u_λ − u_λ'‖ = ‖Bᵀ(λ − λ')‖ in the dual norm
-    energy: float  #: |J(u) − J(u')|
-    allowed: float  #: sum of the errors that both claims allow
+    #: ‖Bᵀ(λ − λ')‖, distance of the contact forces, dual norm; None without mechanics
+    equilibrium: float | None
+    energy: float  #: |J(u) − J(u')|, difference of potential energies
+    allowed: float  #: sum of the errors that the two claims permit
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """All answers to one problem, of every solver and form; plain data."""
+    """The answers of all solvers to one problem, in all its forms."""
 
-    name: str  #: the case without its form
-    truth: str  #: "reference", or the name of the best answer; empty if unknown
-    doubt: float | None  #: bound of the relative error of the truth in the energy norm
-    closed: int | None  #: number of closed rows of the truth
+    name: str  #: name of the case without its form
+    #: origin of the reference point: "reference", or the solver and form of the best
+    #: answer; empty if there is no reference point
+    truth: str
+    doubt: float | None  #: bound on the relative error of the reference, energy norm
+    closed: int | None  #: number of closed rows at the reference point
     answers: tuple[Answer, ...]
-    pairs: tuple[Pair, ...]  #: pairs of answers at one tolerance
+    pairs: tuple[Pair, ...]  #: pairs of answers at equal tolerances
     #: pairs whose distance exceeds `allowed` although neither answer is refuted
     unresolved: tuple[Pair, ...]
-    note: str = ""  #: reason why there is no reference
+    note: str = ""  #: reason why the reference is missing or replaced
 
 
 def compare_answers(
@@ -113,10 +116,11 @@ def compare_answers(
     solve: Reference,
     references: Path | None,
 ) -> Problem:
-    """Judge all answers to one problem.
+    """Assess all answers to one problem.
 
-    answers : answers with equal ``mechanics.program``, or to one QP without mechanics
-    solve : the reference solve
+    answers : answers to cases with equal ``mechanics.program``, or to a single QP
+        without mechanics
+    solve : function that solves a QP accurately
     references : folder in which reference points are cached; None for no cache
     """
     prove = proves(solve)
@@ -137,7 +141,7 @@ def compare_answers(
     for g in answers:
         try:
             assessment, deviation = truth.assess(g)
-        except Exception as e:  # code of the family may raise anything
+        except Exception as e:  # raised by code of the family
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
             judged.append(_answer(g, None, None, prove))
             continue
@@ -168,7 +172,7 @@ def compare_answers(
 def _answer(
     g: StoredAnswer, assessment: Assessment | None, doubt: float | None, prove: Proves
 ) -> Answer:
-    """Judge one answer: its verdict, and the reasons why its claim is false."""
+    """Determine the verdict on one answer, and the reasons why its claim is false."""
     r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
     error = decided(g.case.qp, g.solution, residuals, tol, prove)
     answer = Answer(
@@ -191,7 +195,7 @@ def _answer(
         remarks=g.remarks,
     )
     refuted = tuple(_refutations(answer))
-    twin = (f"the very point that it gave for {g.twin}",) if g.twin and refuted else ()
+    twin = (f"equals its answer to {g.twin}",) if g.twin and refuted else ()
     return replace(
         answer,
         refuted=refuted,
@@ -203,8 +207,8 @@ def _answer(
 def _contradiction(a: Answer) -> str:
     """Describe an error that exceeds the bound certified in the run, or return "".
 
-    A point with remarks, or whose verdict differs from that of the run, is skipped: it
-    may not be the point that was certified.
+    The result is "" for a point with remarks, and for a point whose verdict differs
+    from that of the run, since such a point may differ from the certified one.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
@@ -217,7 +221,7 @@ def _contradiction(a: Answer) -> str:
 
 
 def _refutations(a: Answer) -> Iterable[str]:
-    """Yield the reasons why a claim of success is false."""
+    """Yield the reasons why a claim of success is false; nothing for other claims."""
     if a.claimed != Status.SOLVED:
         return
     if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
@@ -241,11 +245,11 @@ def _refutations(a: Answer) -> Iterable[str]:
         most = brief(a.energy_allowed)
         yield f"{', '.join(off)} in the energy norm, allowed {most}"
     if a.assessment.pulls:
-        yield f"multipliers pull at rows {some(map(str, a.assessment.pulls))}"
+        yield f"inadmissible multipliers at rows {some(map(str, a.assessment.pulls))}"
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Add a remark to answers with a valid claim that are far less accurate."""
+    """Add a remark to answers with a valid claim, but far less accurate than others."""
     groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
     for a in answers:
         if not a.refuted and a.error is not None:
@@ -269,7 +273,10 @@ def _pairs(
     places: Sequence[tuple[int, Deviation]],
     truth: GroundTruth,
 ) -> list[Pair]:
-    """Compute the distances of all pairs of answers at equal tolerances."""
+    """Compute the distances of all pairs of answers at equal tolerances.
+
+    places : index in `answers`, and deviation, of each answer with an assessment
+    """
     if not places:
         return []
     apart = partial(distances, truth.P, truth.kernel)
@@ -295,6 +302,6 @@ def _pairs(
 
 
 def brief(value: float) -> str:
-    """Format a number with two significant digits: 3.2e-9, 1.0e0."""
+    """Format a number with two significant digits, such as 3.2e-9."""
     mantissa, _, exponent = f"{value:.1e}".partition("e")
     return f"{mantissa}e{int(exponent)}" if exponent else mantissa

@@ -1,24 +1,26 @@
 """Estimate of the discretisation error, which bounds the useful accuracy of a solver.
 
-Successive halving of all cells gives solutions u_h, u_{h/2}, u_{h/4}, where u_h is
-interpolated on the finer mesh. Their distances in the energy norm determine the rate of
-convergence and the remaining error (Richardson extrapolation of squares):
+Let u be the exact solution, û the reference solution on the mesh of the case, and u_h,
+u_{h/2}, u_{h/4} solutions on meshes with successively halved cell size h, where each is
+interpolated on the next mesh. Their distances in the energy norm ‖·‖ determine the rate
+of convergence and the remaining error (Richardson extrapolation of squared errors):
 
     2^q = ‖u_h − u_{h/2}‖² / ‖u_{h/2} − u_{h/4}‖²
     ‖u_h − u‖² = ‖u_h − u_{h/2}‖² / (1 − 2^−q)                                       (1)
 
-with q = 2 for linear and bilinear elements if u is smooth. Without contact, (1) is
-Galerkin orthogonality in nested spaces. Contact adds the work of its pressure on the
-gaps between the solutions, which is of higher order if few nodes change state.
-Estimates are relative to ‖û‖, and so are the bounds of `harness.verify.certificate`.
+with q = 2 for linear and bilinear elements if u is smooth. Without contact, (1) follows
+from Galerkin orthogonality in nested spaces. Contact adds the work of the contact
+pressure on the differences of the gaps, which is of higher order if few nodes change
+state. Estimates are relative to ‖û‖, like the bounds of `harness.verify.certificate`.
 
-Differences of energies, ‖u_h − u‖² ≤ 2(J_h − J), would be simpler. But they contain
-terms of the same order in h that are not errors of u: each mesh approximates a curved
-side by another polygon and has other boundary values. They give 1.5 times the true
-error on the membrane, and an eighth of it on a cylinder with four cells per contact
-half-width. Load steps are linearised at the solution of each mesh, which is part of the
-error. Under a point load the energy decreases like log h without a limit; then only the
-distance to the next mesh is reported.
+An estimate by differences of potential energies, ‖u_h − u‖² ≤ 2(J_h − J), would be
+simpler. But these differences contain terms of the same order in h that are not errors
+of u: each mesh approximates a curved side by a different polygon, and its boundary
+values differ. This estimate is 1.5 times the true error on the membrane, and an eighth
+of it on a cylinder with four cells per contact half-width. A load step is linearised at
+the previous solution on the same mesh, and the effect of this counts as part of the
+error. Under a point load, the energy decreases without limit, like log h; in this case,
+only the distance to the solution on the next mesh is reported.
 """
 
 from __future__ import annotations
@@ -43,50 +45,51 @@ from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
 FILE = "discretisation.json"  #: name of the file in the result folder
 SCHEMA = 1  #: version of the format of the file
-MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is solved
-#: Assumed growth of the number of unknowns by the first halving; later halvings use the
-#: observed ratio.
+MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh on which is solved
+#: Assumed ratio of the numbers of unknowns after and before the first halving of the
+#: cell size. For later halvings, the ratio of the previous one is assumed.
 GROWTH = 4.0
-#: Assumed exponent p of the time of a reference solve, unknowns^p.
+#: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: number of meshes, the least that determines a rate
-MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
-#: Least assumed relative error of u, even if certificates prove a smaller one: rounding
-#: of slender bodies in double precision.
+MAX_LEVELS = 3  #: number of meshes; a rate can be determined from no fewer
+MIN_RATE = 0.5  #: least q for extrapolation: below it, 1/(1 − 2^−q) exceeds 3.4
+#: Least assumed relative error of u_h, even if its certificate proves a smaller one,
+#: since coefficients of slender bodies are subject to rounding in double precision.
 ROUNDING = 1e-8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """The solution on one mesh; plain data."""
+    """Sizes of the solution on one mesh."""
 
     case: str  #: canonical name
-    unknowns: int
-    energy: float  #: J_h; J/m in the plane
-    norm: float  #: ‖û‖, in √energy
-    bound: float  #: certified relative error of the reference solution
-    #: distance to the solution on the previous level, in √energy
+    unknowns: int  #: number of unknowns
+    energy: float  #: potential energy J_h, J/m in the plane, J in space
+    norm: float  #: energy norm of u_h, in the square root of the unit of energy
+    #: certified relative error of the reference solve on this mesh
+    bound: float
+    #: energy norm of the difference from the previous level; None on the first level
     distance: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Discretisation:
-    """Discretisation error of one physical case; plain data.
+    """Discretisation error of one physical case.
 
-    kind : "limit": `error` is relative to the limit of fine meshes; "change": it is the
-        difference from the next mesh; "rounding": the error is below `error`, the level
-        of rounding; "unknown": `note` states why there is no estimate
+    kind : meaning of `error`. "limit": extrapolated distance to the limit of fine
+        meshes; "change": distance to the solution on the next mesh; "rounding": upper
+        bound, at the level of rounding errors; "unknown": no estimate, see `note`
     """
 
     case: str  #: canonical name without the form
     kind: str
-    error: float | None = None  #: relative to ‖û‖, energy norm
+    error: float | None = None  #: relative to ‖û‖, in the energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
-    rate: float | None = None  #: q of the squared error, observed
-    #: reason for a kind other than "limit"; for a limit, the geometry that is converged
-    #: to
+    rate: float | None = None  #: observed rate q of the squared error
+    #: for the kind "limit", geometry to which the meshes converge; for other kinds,
+    #: reason why there is no limit
     note: str = ""
-    levels: tuple[Level, ...] = ()  #: coarsest first; the first is the case itself
+    levels: tuple[Level, ...] = ()  #: coarsest mesh first, which is that of the case
     params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
 
     def __str__(self) -> str:
@@ -103,9 +106,10 @@ class Discretisation:
 def estimate_error(
     case: str, levels: Sequence[Level], singular: str = "", note: str = ""
 ) -> Discretisation:
-    """Estimate the error of the first of one to three levels.
+    """Estimate the discretisation error on the first level.
 
-    singular : reason why energies have no limit; empty if they have one
+    levels : at most three levels, coarsest mesh first
+    singular : reason why the energy diverges under refinement; empty if it converges
     note : reason why there are no further levels
     """
     nothing = Discretisation(case=case, kind="unknown", note=note, levels=tuple(levels))
@@ -144,12 +148,13 @@ def discretisation_errors(
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
-    If this call runs out of time, an earlier estimate from more meshes is kept.
+    If there is not enough time for all meshes of a case, an earlier estimate from more
+    meshes is kept.
 
-    cases : cases; all forms of a physical case are one case
+    cases : cases; those that differ only in form are estimated once
     folder : result folder, with the cache of reference points in ``references``
-    budget : seconds; meshes are skipped if their expected time exceeds the remaining
-    one
+    budget : time for all cases, s; a mesh is skipped if its expected time exceeds the
+        remaining time
     tell : progress callback, called with a message before each case
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
@@ -173,12 +178,12 @@ def discretisation_errors(
 
 
 def read_discretisation(folder: Path) -> dict[str, Discretisation]:
-    """Read the file of `discretisation_errors`, by physical case; {} if it is missing.
+    """Return the stored errors by physical case; {} if the file is missing.
 
     Raises
     ------
     InputError
-        When the file is malformed.
+        If the file is malformed.
 
     """
     path = folder / FILE
@@ -199,7 +204,7 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
 
 
 def _continues(old: Discretisation, new: Discretisation) -> bool:
-    """Return True if `old` contains the meshes of `new` and finer ones."""
+    """Return True if `old` contains all meshes of `new`, and finer ones."""
     common = [
         (a.case, a.unknowns) == (b.case, b.unknowns)
         for a, b in zip(old.levels, new.levels, strict=False)
@@ -210,7 +215,7 @@ def _continues(old: Discretisation, new: Discretisation) -> bool:
 
 
 def _write(path: Path, found: Iterable[Discretisation]) -> None:
-    """Replace the file atomically."""
+    """Write the errors to a file, which is replaced atomically."""
     data = {"schema": SCHEMA, "cases": [asdict(d) for d in found]}
     text = json.dumps(data, indent=1, allow_nan=False) + "\n"
     with report_full_disk(path.parent):
@@ -219,7 +224,7 @@ def _write(path: Path, found: Iterable[Discretisation]) -> None:
 
 @dataclass(eq=False)
 class _Halving:
-    """Solutions of a case on successively halved meshes."""
+    """Solutions of a case on meshes with successively halved cell size."""
 
     family: Family
     reference: Reference
@@ -230,7 +235,7 @@ class _Halving:
     _coarse: tuple[Grid, Extended] | None = None
 
     def levels(self, case: CaseId) -> Iterator[Level]:
-        """Yield the affordable levels, coarsest first."""
+        """Yield the levels that fit the limits of size and time, coarsest first."""
         form = "primal" if "primal" in self.family.forms else case.form
         sizes: list[int] = []
         seconds = 0.0
@@ -279,7 +284,7 @@ class _Halving:
     def _level(
         self, params: Mapping[str, object], form: str, *, first: bool
     ) -> Level | None:
-        """Solve one mesh; return None and set `why` if that is impossible."""
+        """Solve on one mesh; if this is impossible, set `why` and return None."""
         text = self.family.name
         try:
             case = assemble(self.family, params, form)
@@ -293,13 +298,13 @@ class _Halving:
                 return None
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):
-                return None  # a single mesh determines no rate: skip its solve
+                return None  # the solve would be useless without a second mesh
             point = reference_point(mechanics, self.reference, self.references)
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
             self.why = f"{text} has no reference solution: {e}"
             return None
-        except (Exception, SystemExit) as e:  # the family's code
+        except (Exception, SystemExit) as e:  # raised by code of the family
             self.why = unbuilt(text, e)
             return None
         root = sqrt(abs(mechanics.scale))
@@ -313,7 +318,10 @@ class _Halving:
         )
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
-        """Return ‖u − u_{2h}‖, or None on the first mesh; store u for the next mesh."""
+        """Return the energy norm of u − u_{2h}, or None on the first mesh.
+
+        u is stored for the comparison with the next mesh.
+        """
         whole = u + grid.lift
         before, self._coarse = self._coarse, (grid, whole)
         if before is None:

@@ -1,7 +1,8 @@
 """Reference point with which the answers to one problem are compared.
 
-It is the point of the reference solve. If that solve fails, it is the answer with the
-smallest certified error, and the page states this. A majority of answers never decides.
+The reference point is computed by the reference solve. If this solve fails, the answer
+with the smallest certified error takes its place, and the report states this.
+Majorities of answers play no role.
 """
 
 from __future__ import annotations
@@ -41,41 +42,48 @@ MAX_REFERENCE_RESIDUAL = 1e-3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredAnswer:
-    """A stored answer, and its case, rebuilt."""
+    """A stored answer, with the case that was rebuilt for it."""
 
     record: Record
-    label: str  #: label of the solver; sequences have a separate label
+    label: str  #: label of the solver; for a sequence, it contains the mode
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
-    remarks: tuple[str, ...] = ()  #: anomalies of the point itself
-    twin: str = ""  #: another case with exactly the same point, or empty
+    remarks: tuple[str, ...] = ()  #: anomalies of the stored point
+    #: another case to which the solver returned exactly the same point, or empty
+    twin: str = ""
 
 
 class GroundTruth(NamedTuple):
     """A reference point, and the norm in which distances to it are measured."""
 
-    name: str  #: "reference", or the solver and form of the answer in its place
-    doubt: float  #: bound of its relative error in the energy norm
+    #: origin of the point: "reference", or the solver and form of an answer
+    name: str
+    doubt: float  #: bound on the relative error of the point in the energy norm
     closed: int | None  #: number of closed contact rows; None without mechanics
-    #: measures an answer against this point
+    #: computes the errors of an answer relative to this point
     assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
-    P: Matrix  #: (n, n) matrix of the norm
-    kernel: NDArray[np.float64]  #: (n, r) rigid motions, which have no norm
-    note: str = ""  #: reason why the point is not the reference solution
+    P: Matrix  #: (n, n) matrix of the norm: the stiffness, or P of the QP
+    kernel: NDArray[np.float64]  #: (n, r) rigid motions, whose norm is zero
+    note: str = ""  #: reason why an answer replaces the reference solution
 
 
 def ground_truth_of(
     answers: Sequence[StoredAnswer], solve: Reference, references: Path | None
 ) -> GroundTruth | str:
-    """Return the reference or the best answer, or the reason why there is neither."""
+    """Return the reference point, or the reason why there is none.
+
+    answers : all answers to the problem; the best may replace a missing reference
+    solve : function that solves a QP accurately
+    references : folder in which reference points are cached; None for no cache
+    """
     mechanics = answers[0].case.mechanics
     if mechanics is None:
         return _plain_truth(answers, solve)
     mechanics = mechanics.whole
     try:
         truth = _elastic_truth(mechanics, answers, solve, references)
-    except Exception as e:  # the factorisation is the family's code
+    except Exception as e:  # raised by the factorisation, which is code of the family
         return note_of("reference", e)
     if isinstance(truth, str):
         return truth
@@ -100,7 +108,10 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return a point, its name and, if it is not the reference, the reason for that."""
+    """Return the reference point, its origin, and the reason if an answer replaces it.
+
+    If there is no reference point, a message with the reason is returned instead.
+    """
     try:
         return reference_point(mechanics, solve, references), "reference", ""
     except UnsolvedError as e:
@@ -113,7 +124,10 @@ def _elastic_truth(
 def _best_certified(
     mechanics: Mechanics, answers: Sequence[StoredAnswer]
 ) -> tuple[ReferencePoint, str] | None:
-    """Return the answer with the smallest certified error, and its label."""
+    """Return the answer with the smallest certified error, and its origin.
+
+    The result is None if no answer can be certified.
+    """
     certified = []
     for g in answers:
         try:
@@ -140,9 +154,10 @@ def _best_certified(
 def _plain_truth(
     answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
-    """Return the reference of a QP without mechanics.
+    """Return the reference point of a QP without mechanics, or why there is none.
 
-    The bound of its error is √(2·residual), which also bounds the errors of claims.
+    Its error is bounded by √(2r), where r is its largest KKT residual, just as the
+    errors of verified answers are.
     """
     qp, why = answers[0].case.qp, ""
     try:
@@ -164,9 +179,9 @@ def _plain_truth(
     )
 
 
-@np.errstate(all="ignore")  # a point may hold 1e300
+@np.errstate(all="ignore")  # components of a point may be as large as 1e300
 def residuals_of(g: StoredAnswer) -> Residuals:
-    """Compute the KKT residuals of a stored point."""
+    """Compute the KKT residuals of a stored answer."""
     return kkt_residuals(g.case.qp, g.solution)
 
 

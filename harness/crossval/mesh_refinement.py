@@ -1,8 +1,9 @@
-"""Interpolation from a mesh to its refinement, by adjacency.
+"""Interpolation from a mesh to its refinement, in which every cell is halved.
 
-Nodes of the coarse mesh are identified by position. New nodes cannot be: on a curved
-side they do not lie on the chord, and their distance from it exceeds the size of a thin
-cell. A new node is identified as the only common neighbour of two coarse nodes.
+A node of the coarse mesh is found in the refined mesh by its position. Positions cannot
+be used for new nodes: on a curved side, a new node does not lie on the chord, and its
+distance from the chord may exceed the size of a thin cell. Instead, a new node is found
+as the only node that is connected by an edge to two given nodes.
 """
 
 from __future__ import annotations
@@ -16,31 +17,33 @@ from mortarbench.harness.mechanics import Grid
 
 Nodes = NDArray[np.int64]
 
-#: Largest distance between shared nodes, relative to the extent of the body.
+#: Largest distance between a coarse node and the same node in the refined mesh,
+#: relative to the extent of the body.
 MAX_NODE_DISTANCE = 1e-9
-#: Corners of the edges of a hexahedron. The centre of a face is the common neighbour of
-#: the midpoints of two opposite edges, and the centre of the cell is that of the
-#: centres of two opposite faces.
+#: Corners of the edges of a hexahedron. In the refined mesh, edges connect the centre
+#: of a face with the midpoints of two opposite edges of the face, and the centre of the
+#: cell with the centres of two opposite faces.
 EDGES = (
     (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5),
     (2, 6), (3, 7),
 )  # fmt: skip
-#: two opposite edges of each face; the first two faces are opposite
+#: Two opposite edges of each face, as indices in `EDGES`; the first two faces are
+#: opposite to each other.
 FACES = ((0, 2), (4, 6), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
 def prolongation(coarse: Grid, fine: Grid) -> csr_array:
-    """Return the interpolation (M, N) from the nodes of `coarse` to those of `fine`.
+    """Return the matrix (M, N) that interpolates from `coarse` to the nodes of `fine`.
 
-    The interpolation is linear on edges and multilinear in the cells of `coarse`: these
-    are segments, quadrilaterals or hexahedra. A quadrilateral whose last two corners
-    coincide is a triangle. It is refined into four triangles, or like a quadrilateral,
-    around the midpoint between that corner and the opposite side.
+    The cells of `coarse` are segments, quadrilaterals or hexahedra, in which the
+    interpolation is linear or multilinear. A quadrilateral whose last two corners
+    coincide is a triangle. A triangle may be refined into four triangles, or like a
+    quadrilateral, with a new node between the double corner and the opposite side.
 
     Raises
     ------
     ValueError
-        When `fine` is not `coarse` with every cell halved.
+        If `fine` is not the mesh `coarse` with every cell halved.
 
     """
     to, near = _shared(coarse, fine), _neighbours(fine)
@@ -56,7 +59,8 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
         places += [*centres, _between(near, *centres[:2])]
         rows += [*of_faces, csr_array((of_faces[0] + of_faces[1]) / 2)]
     if len(corners) == 4:
-        # four triangles: an edge joins the midpoints of the sides at the double corner
+        # a triangle was refined into four triangles if an edge connects the midpoints
+        # of the two sides at the double corner
         joined = np.asarray(near[middles[1], middles[3]]).ravel() > 0
         cut = ~(joined & (corners[2] == corners[3]))
         places.append(_between(near, middles[0][cut], middles[2][cut]))
@@ -68,14 +72,17 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
 
 
 def _edges(corners: list[Nodes]) -> list[tuple[Nodes, Nodes]]:
-    """Return the ends of each edge of all cells."""
+    """Return the two end nodes of the edges of all cells, for each edge of a cell."""
     if len(corners) == 8:
         return [(corners[a], corners[b]) for a, b in EDGES]
     return list(zip(corners, [*corners[1:], corners[0]], strict=True))
 
 
 def _shared(coarse: Grid, fine: Grid) -> Nodes:
-    """Find the nodes (N,) of `fine` at the nodes of `coarse`, body by body."""
+    """Return the nodes (N,) of `fine` at the positions of the nodes of `coarse`.
+
+    Each body is searched separately, since nodes of two bodies may coincide.
+    """
     to = np.zeros(len(coarse.points), dtype=np.int64)
     for body in np.unique(coarse.bodies):
         mine = np.unique(coarse.cells[coarse.bodies == body])
@@ -93,9 +100,9 @@ def _shared(coarse: Grid, fine: Grid) -> Nodes:
 
 
 def _neighbours(grid: Grid) -> csr_array:
-    """Return the adjacency matrix (M, M) of the edges, with a zero diagonal."""
+    """Return the adjacency matrix (M, M) of the nodes, with entry 1 for each edge."""
     a, b = map(np.concatenate, zip(*_edges(list(grid.cells.T)), strict=True))
-    # a triangle repeats its last corner, which is not an edge
+    # exclude the degenerate edge between the repeated corners of a triangle
     differs, n = a != b, len(grid.points)
     ends = a[differs], b[differs]
     edges = coo_array((np.ones(differs.sum()), ends), (n, n)).tocsr()
@@ -105,7 +112,7 @@ def _neighbours(grid: Grid) -> csr_array:
 
 
 def _between(near: csr_array, a: Nodes, b: Nodes) -> Nodes:
-    """Return the only common neighbour of each pair (E,), or the node if a = b."""
+    """Return the only node adjacent to both nodes of each pair (E,); a if a = b."""
     middle, differs = a.copy(), a != b
     common = csr_array(near[a[differs]].multiply(near[b[differs]]))
     if (np.diff(common.indptr) != 1).any():

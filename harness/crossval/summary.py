@@ -1,6 +1,6 @@
 """Summary of a cross-validation: counts, one row per solver, lists of disagreements.
 
-The result is plain data for the page, the terminal and ``--json``.
+The summary is plain data, for the report, the terminal and ``--json``.
 """
 
 from __future__ import annotations
@@ -16,32 +16,33 @@ from mortarbench.harness.errors import some
 from mortarbench.harness.record import finite
 from mortarbench.harness.verify.verdicts import plain
 
-SCHEMA = 1  #: version of the data
+SCHEMA = 1  #: version of the format of the summary
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One solver at one tolerance; None where nothing could be measured."""
+    """Summary of one solver at one tolerance; a value is None if no answer has it."""
 
     solver: str
     tol: float
-    answers: int
-    refuted: int
-    unanswered: int
-    error_median: float | None  #: certified, relative, energy norm
-    error_worst: float | None
-    worst_case: str  #: case of `error_worst`
-    penetration: float | None  #: largest, over the mesh size
-    balance: float | None  #: largest unbalanced force or moment on a body
-    contradicted_rows: int  #: rows whose state differs from the reference
+    answers: int  #: number of answers with a stored point
+    refuted: int  #: number of refuted claims
+    unanswered: int  #: number of measurements without a claim of success
+    error_median: float | None  #: median bound on the relative error, energy norm
+    error_worst: float | None  #: largest bound on the relative error, energy norm
+    worst_case: str  #: case with the error `error_worst`
+    penetration: float | None  #: largest penetration relative to the mesh size
+    balance: float | None  #: largest relative resultant force or moment on a body
+    contradicted_rows: int  #: number of rows whose state contradicts the reference
     primal_dual: float | None  #: largest distance between its primal and dual answers
-    from_ours: float | None  #: largest distance of its answers from those of `ours`
+    from_ours: float | None  #: largest distance between its answers and those of `ours`
 
 
 def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
-    """Return a cross-validation as plain data, summary first.
+    """Return the summary of a cross-validation, followed by all answers and pairs.
 
-    ours : label of the solver with which all others are compared, if it took part
+    folder : name of the result folder
+    ours : label of the solver with which all others are compared
     """
     answers = [a for p in validation.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]
@@ -94,7 +95,10 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
 
 
 def _rows(validation: Validation, ours: str) -> list[Row]:
-    """Summarise each solver at each tolerance: loosest first, `ours` before others."""
+    """Summarise each solver at each tolerance.
+
+    Rows are sorted by tolerance, loosest first, then by solver, with `ours` first.
+    """
     answers = [a for p in validation.problems for a in p.answers]
     keys = {(a.solver, a.tol) for a in answers}
     keys |= {
@@ -143,7 +147,7 @@ def _worst(values: Iterable[float | None]) -> float | None:
 def _between_forms(
     problems: Sequence[Problem], solver: str, tol: float
 ) -> Iterable[float]:
-    """Yield the distances between a solver's primal answers and its dual ones."""
+    """Yield the distances between primal and dual answers of a solver."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
@@ -156,7 +160,7 @@ def _between_forms(
 def _between(
     problems: Sequence[Problem], solver: str, other: str, tol: float
 ) -> Iterable[float]:
-    """Yield the distances between the answers of two solvers, in any form."""
+    """Yield the distances between answers of two solvers, whatever their forms."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
@@ -167,7 +171,7 @@ def _between(
 def _headline(
     agreed: bool, counts: dict[str, int], wrong: Sequence[dict[str, Any]]
 ) -> str:
-    """Return the result as a sentence."""
+    """Return the result of the cross-validation as one or two sentences."""
     answers, solvers, cases, pairs = (
         _many(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case", "pair")
     )
@@ -196,7 +200,7 @@ def _many(count: int, noun: str) -> str:
 
 
 def _disagreement(a: Answer) -> dict[str, Any]:
-    """Describe a refuted answer: the claim, the errors and the rows concerned."""
+    """Return a refuted answer as plain data: claim, reasons, errors and rows."""
     assessment = a.assessment
     return _about(a) | {
         "claimed": a.claimed,
@@ -248,7 +252,7 @@ def _remark(a: Answer, text: str) -> dict[str, Any]:
 
 
 def _problem(p: Problem) -> dict[str, Any]:
-    """Return a problem as plain data; pairs refer to answers by their index."""
+    """Return a problem as plain data, in which pairs refer to answers by index."""
     answers = [asdict(a) | {"error": a.error} for a in p.answers]
     data = {
         "name": p.name,

@@ -1,8 +1,8 @@
 """Cross-validation of a result folder, case by case.
 
-No conclusion of the run is reused: cases are rebuilt, and residuals, errors and
-distances are computed from the stored points. Answers that cannot be judged are listed
-with the reason.
+Nothing that the run computed from the answers is reused: cases are rebuilt, and
+residuals, errors and distances are computed from the stored points. Answers that cannot
+be assessed are listed with the reason.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
-#: Relative difference up to which contact forces count as equal.
+#: Largest relative difference (Euclidean norm) of contact forces that count as equal.
 MAX_FORCE_DIFFERENCE = 1e-3
-#: Largest error bound of a solution that can refute a claim of infeasibility.
+#: Largest error bound of a reference point that refutes a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """A remark on a measurement; plain data."""
+    """A measurement with a remark."""
 
     run_id: str
     solver: str
@@ -60,21 +60,22 @@ class Listed:
 
 @dataclass(frozen=True, kw_only=True)
 class Validation:
-    """Result of a cross-validation; plain data."""
+    """Result of a cross-validation."""
 
     problems: tuple[Problem, ...]
     solvers: tuple[str, ...]  #: labels of all solvers with a record
-    #: false claims without a point, hence not in `problems`
+    #: false claims without a point, which `problems` cannot contain
     false_claims: tuple[Listed, ...]
-    #: measurements with neither claim nor point: crashed, failed, limit
+    #: measurements that ended without a claim of success, such as crashes and limits
     unanswered: tuple[Listed, ...]
-    not_validated: tuple[Listed, ...]  #: stored points that could not be judged
-    declined: int
-    proven: int = 0  #: claims of infeasibility that a certificate proves
+    #: stored points and claims of infeasibility that could not be assessed
+    not_validated: tuple[Listed, ...]
+    declined: int  #: number of measurements that the solver declined
+    proven: int = 0  #: number of claims of infeasibility that a certificate proves
 
     @property
     def agreed(self) -> bool:
-        """True if no claim is refuted and no pair of answers disagrees."""
+        """True if no claim is refuted and no two answers contradict each other."""
         return not self.false_claims and not any(
             p.unresolved or any(a.refuted or a.contradiction for a in p.answers)
             for p in self.problems
@@ -83,12 +84,13 @@ class Validation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Folder:
-    """A result folder, with the families and the reference solve that judge it."""
+    """A result folder, with the families and reference solve for its validation."""
 
     path: Path
     families: Mapping[str, Family]
     reference: Reference
-    twins: Mapping[tuple[str, str], set[str]]  #: (label, digest) → cases
+    #: cases to which a solver returned the same point, by label and digest of the point
+    twins: Mapping[tuple[str, str], set[str]]
 
     @property
     def references(self) -> Path:
@@ -96,13 +98,13 @@ class _Folder:
 
 
 class _Part(NamedTuple):
-    """Judgement of one physical case, in all its forms."""
+    """Result of the cross-validation of one physical case, in all its forms."""
 
     problems: list[Problem]
-    lost: list[Listed]  #: answers that could not be judged
+    lost: list[Listed]  #: answers that could not be assessed
     false: list[Listed]  #: false claims without a point
     suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
-    truths: dict[str, Vector]  #: multipliers of references by the problem's name
+    truths: dict[str, Vector]  #: multipliers of reference points by name of the problem
     proven: int  #: number of proven claims of infeasibility
 
 
@@ -112,15 +114,16 @@ def validate_folder(
     reference: Reference,
     tell: Callable[[str], None],
 ) -> Validation:
-    """Judge all answers of a result folder.
+    """Assess all answers of a result folder.
 
-    reference : the reference solve, which is independent of all solvers
-    tell : called with the name of each case before it is judged
+    reference : function that solves a QP accurately, independent of all solvers
+    tell : progress callback, called with the name of each case before it is assessed
 
     Raises
     ------
     InputError
-        When there is no folder, no journal or no stored point.
+        If the folder or its journal is missing, or if it contains neither a stored
+        point nor a proven claim of infeasibility.
 
     """
     records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
@@ -162,7 +165,7 @@ def validate_folder(
 
 
 def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group records by physical case, in the order of names."""
+    """Group all records that were not declined by physical case, sorted by name."""
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
         if r.verdict is not Verdict.DECLINED:
@@ -171,7 +174,7 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
-    """Judge the answers to one physical case, and claims of its infeasibility."""
+    """Assess the answers to one physical case, and claims of its infeasibility."""
     cases, lost = _built(folder, records)
     answers, damaged = _stored_answers(
         folder, [r for r in records if r.case in cases], cases
@@ -179,17 +182,18 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     lost += damaged
     claims = [r for r in records if _is_proven(r) and r.case in cases]
     contradictory = set()
-    for r in claims:  # certificates of solvers are not stored: search for another one
+    for r in claims:  # the certificate of the solver was not stored: find a new one
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status.INFEASIBLE)
         if infeasibility_margin(qp, claim) is not None:
             contradictory.add(r.run_id)
     lost += [
-        _listed(r, "no certificate of infeasibility was found again")
+        _listed(r, "the proof of infeasibility could not be repeated")
         for r in claims
         if r.run_id not in contradictory
     ]
-    # forms with equal mechanics are one problem; a QP without mechanics is its own
+    # forms with equal mechanics belong to one problem; without mechanics, each form is
+    # a problem of its own
     by_numbers: dict[str, list[StoredAnswer]] = {}
     for g in answers:
         of = g.case.mechanics
@@ -211,7 +215,8 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         p for p in problems if p.doubt is not None and p.doubt < MAX_SOLUTION_ERROR
     ]
     solvable = {a.case: p for p in proven for a in p.answers}
-    elastic = next((p for p in proven if p.closed is not None), None)  # of all forms
+    # a solution of the elastic problem refutes claims in every form
+    elastic = next((p for p in proven if p.closed is not None), None)
     false = [
         _listed(r, text)
         for r in records
@@ -222,9 +227,9 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
 
 
 def _pointless(records: Sequence[Record]) -> str:
-    """Return the reason why a folder has no answers to judge."""
+    """Return the reason why a folder has no answers that could be assessed."""
     if any(r.vectors for r in records):
-        return "its stored points are gone; expected vectors/*.npz, which a run writes"
+        return "its stored points are missing; expected the vectors/*.npz of the run"
     statuses = Counter(r.verdict.words for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
     return f"no solver returned a point ({ends}); expected one that solves a case"
@@ -233,7 +238,7 @@ def _pointless(records: Sequence[Record]) -> str:
 def _built(
     folder: _Folder, records: Sequence[Record]
 ) -> tuple[dict[str, Case], list[Listed]]:
-    """Build the forms that have answers; list the answers to those that fail."""
+    """Rebuild the cases that have answers, and list the answers to those that fail."""
     cases: dict[str, Case] = {}
     lost: list[Listed] = []
     answered = [r for r in records if r.vectors or _is_proven(r)]
@@ -250,7 +255,10 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims, each distinct point once."""
+    """Read the stored points of claims of success, equal points of a solver once.
+
+    Points that cannot be read are returned as a list with the reasons.
+    """
     answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
     lost: list[Listed] = []
     for r in records:
@@ -285,14 +293,16 @@ def _stored_answers(
 
 
 def _is_proven(r: Record) -> bool:
-    """Return True if the run has proven a claim of infeasibility."""
+    """Return True if the run proved the solver's claim of infeasibility."""
     return r.verdict is Verdict.VERIFIED_INFEASIBLE
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
-    """Return the reason why a claim without a point is false, or "".
+    """Return the reason why the claim of a record is false, or "".
 
-    solved : the problem, if its solution is known
+    Only claims without a point are considered.
+
+    solved : the problem if it has a reference point, else None
     """
     if r.claimed == Status.SOLVED and not r.vectors:
         return "claims success without a finite point"
@@ -305,7 +315,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _apart(r: Record) -> Record:
-    """Return a record whose label includes the mode, for a solver run as a sequence."""
+    """Return the record; if it is part of a sequence, the label includes the mode."""
     return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
 
 
@@ -319,11 +329,11 @@ def _true_forces(
     solve: Reference,
     references: Path,
 ) -> Vector | None:
-    """Return the multipliers (m,) of the reference, or None without a reference."""
+    """Return the multipliers (m,) of the reference point, or None if there is none."""
     mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
-    point = reference_point(mechanics, solve, references)  # read from its cache
+    point = reference_point(mechanics, solve, references)  # from the cache
     return np.asarray(point.multipliers, dtype=float)
 
 
@@ -347,7 +357,7 @@ def _with_mix_ups(
     """Add a remark to each refuted answer that solves a different problem.
 
     suspects : multipliers of refuted answers by run_id
-    truths : multipliers of solutions by the name of the problem
+    truths : multipliers of reference points by name of the problem
     """
 
     def remarked(a: Answer, own: str) -> Answer:
@@ -368,10 +378,10 @@ def _with_mix_ups(
 
 
 def _nearest_problem(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
-    """Return the name of the problem with the nearest contact forces.
+    """Return the name of the problem whose contact forces are nearest to z.
 
-    Returns "" if no forces are equal up to MAX_FORCE_DIFFERENCE, or if those of the
-    problem `own` are: the answer is then wrong for another reason.
+    Returns "" if none of them equals z up to MAX_FORCE_DIFFERENCE, or if those of the
+    problem `own` do: in the latter case, the answer is wrong for another reason.
     """
     differences = {
         name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))

@@ -1,1 +1,1 @@
-"""Distributed solves: vectors over MPI ranks, collective failures, factorisation."""
+"""Solves on several MPI ranks: distributed vectors, failures and factorisation."""

@@ -1,4 +1,4 @@
-"""Discs of components that are distributed over MPI ranks."""
+"""Disc constraints whose components are distributed over MPI ranks."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from mortarbench.harness.sets.discs import Discs
 
 
 class DistributedDiscs(Discs):
-    """The discs of one rank; their measures are distributed vectors.
+    """The discs whose components are on this rank, with radii as a distributed vector.
 
-    All components of a disc are on one rank, so that only sums over discs need other
-    ranks. Every rank has a set, possibly without discs, and takes the same steps.
+    All components of a disc are on the same rank, so that only sums over discs need
+    communication. Every rank has such a set, even if it is empty, since all ranks must
+    take part in the sums.
 
     Parameters
     ----------
-    index : (k, d) places of the components in the local slice
-    radius : (k,) a distributed vector
+    index : (k, d) positions of the components in the local slice
+    radius : (k,) radii, a distributed vector
 
     """
 
@@ -33,7 +34,7 @@ class DistributedDiscs(Discs):
     radius: DistributedVector
 
     def __post_init__(self) -> None:
-        """Copy and check both arrays; the copy of the radii is distributed as well."""
+        """Copy and check both arrays; the copied radii are again distributed."""
         ranks = self.radius.ranks
         super().__post_init__()
         object.__setattr__(self, "radius", distributed(self.radius, ranks))
@@ -42,14 +43,15 @@ class DistributedDiscs(Discs):
     def of(
         cls, discs: Discs, owned: NDArray[np.int64], ranks: Ranks
     ) -> DistributedDiscs:
-        """Return those of some discs whose components a rank owns.
+        """Return the discs of this rank, selected from all discs of a QP.
 
-        owned : (o,) global numbers of the components of its slice, ascending
+        discs : all discs, with global numbers of components
+        owned : (o,) global numbers of the components on this rank, ascending
 
         Raises
         ------
         ValueError
-            When a rank owns some components of a disc, but not all.
+            If some components of a disc are on this rank, but not all.
 
         """
         is_owned = np.isin(discs.index, owned)

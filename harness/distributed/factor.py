@@ -1,21 +1,23 @@
 """Cholesky factor of a sum of matrices over ranks, A = Σ_p A_p = LLᵀ.
 
-Rank p stores a symmetric, positive semidefinite A_p on the rows that it *touches*. Rows
-of a single rank are its *inner* rows. No entry couples inner rows of different ranks,
+Rank p stores a symmetric, positive semidefinite A_p on a set of rows, which the rank is
+said to *touch*. A row that only one rank touches is an *inner* row of this rank. Rows
+that several ranks touch are *shared*. No entry couples inner rows of different ranks,
 so each rank eliminates its inner rows independently. The Schur complements on the
-*shared* rows are summed over the ranks, and every rank factorises the sum
-(substructuring; Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A
+shared rows are summed over the ranks, and every rank factorises the sum (this is
+substructuring; Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A
 solve needs one reduction of shared rows; all other work is local.
 
-A vector of rows has one of three representations, each a `DistributedVector`:
+A vector with an entry for each row of A has one of three representations, each of them
+a `DistributedVector`:
 
-* additive: the vector is the sum over ranks, such as G_p v with the local columns G_p
-* consistent: each rank has the entries of the rows that it touches
-* orthonormal: in the order of L, with inner rows on their rank, and with the shared
-  entries divided by √P on each of the P ranks
+* additive: the vector is the sum of the contributions of all ranks
+* consistent: each rank stores the entries of the rows that it touches
+* orthonormal: in the order of L; each rank stores the entries of its inner rows, and
+  all shared entries divided by √P, where P is the number of ranks
 
-The product of an additive and a consistent vector, or of two orthonormal ones, summed
-over ranks, is the inner product of the vectors represented.
+The inner product of two vectors is the sum over ranks of local products if one vector
+is additive and the other consistent, or if both are orthonormal.
 """
 
 from __future__ import annotations
@@ -39,39 +41,39 @@ from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
-#: A pivot up to this value counts as zero, for rows scaled to length one.
+#: Largest pivot that counts as zero, if rows are scaled to length one.
 DEPENDENCE_TOLERANCE = 1e-13
-#: Added to a diagonal of ones, since a pivot of zero would end the factorisation.
+#: Shift of a unit diagonal, without which a zero pivot would end the factorisation.
 PIVOT_SHIFT = 1e-15
-#: Largest size of the dense factor of the shared rows, in entries per row of A.
+#: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
-#: Largest size of a sparse matrix that is factorised as a dense one, which takes less
-#: time than the calls of a sparse library; with 500 it takes more.
+#: Largest number of rows of a matrix that is factorised as an array by compiled code.
+#: For 500 rows, this takes longer than the calls of a sparse library.
 MAX_ARRAY_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """Rows of A that a rank touches."""
+    """The rows of A that this rank touches, and the shared rows of all ranks."""
 
     ranks: Ranks
-    rows: Rows  #: (k,) ascending
-    touching: Rows  #: (k,) number of ranks that touch each row
-    shared: Rows  #: (s,) all rows that several ranks touch, replicated
+    rows: Rows  #: (k,) numbers of the rows that this rank touches, ascending
+    touching: Rows  #: (k,) number of ranks that touch each of these rows
+    shared: Rows  #: (s,) numbers of all shared rows, equal on all ranks
 
     @cached_property
     def is_shared(self) -> NDArray[np.bool_]:
-        """Mask (k,) of the shared rows."""
+        """Mask (k,) of the local rows that are shared."""
         return self.touching > 1
 
     @cached_property
     def place(self) -> Rows:
-        """Positions of the local shared rows in `shared`, ascending."""
+        """Positions in `shared` of the shared rows of this rank, ascending."""
         return np.searchsorted(self.shared, self.rows[self.is_shared])
 
     @property
     def few_shared(self) -> bool:
-        """True if a dense factor of the shared rows is small; see `MAX_FILL`."""
+        """True if the dense factor of the shared rows is small, see `MAX_FILL`."""
         inner = self.ranks.total(np.array([float(np.count_nonzero(~self.is_shared))]))
         s = self.shared.size
         return s**2 <= MAX_FILL * (s + float(inner[0]))
@@ -82,7 +84,10 @@ class Touched:
 
 
 def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
-    """Exchange the rows that ranks touch, and return them with the shared ones."""
+    """Gather the rows that all ranks touch, and determine the shared ones.
+
+    rows : (k,) rows that this rank touches, ascending
+    """
     every, count = np.unique(
         np.concatenate(ranks.comm.allgather(rows)), return_counts=True
     )
@@ -91,25 +96,26 @@ def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
 
 
 class DependentRowsError(ValueError):
-    """Error for a singular A; all ranks raise it."""
+    """Error for a singular A, raised on all ranks."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocalFactor:
-    """A_p with its unchanging inner rows eliminated.
+    """A_p after elimination of those inner rows that do not change.
 
-    The *border* consists of the inner rows that may change, and of the shared rows.
+    The other rows, i.e. the inner rows that may change and the shared rows, form the
+    *border*. In formulas, a denotes the eliminated rows and b the border.
     """
 
     at: Touched
-    changing: int  #: number of changing rows, the first of the border
-    #: factor of A_p with 1 added to the diagonal of shared rows, in the order of
+    changing: int  #: number of inner rows that may change; the border begins with them
+    #: factor of A_p, with 1 added to the diagonal of shared rows; rows are ordered as
     #: unchanging, changing and shared rows
     factor: BorderedFactor
 
     @property
     def border(self) -> Rows:
-        """Positions (b,) of the border in the local rows."""
+        """Positions (b,) of the border among the local rows."""
         return self.factor.border_rows
 
     @cached_property
@@ -121,22 +127,22 @@ class LocalFactor:
         return T
 
     def reduced(self, t: Dense) -> tuple[Dense, Dense]:
-        """Eliminate an additive t (k,); return L_aa⁻¹t_a and t_b − L_baL_aa⁻¹t_a."""
+        """Return L_aa⁻¹t_a and t_b − L_ba L_aa⁻¹t_a for an additive vector t (k,)."""
         u = self.factor.reduced(t)
         first = u.size - len(self.complement)
         return u[:first], u[first:]
 
     def extended(self, u: Dense, x_b: Dense) -> Dense:
-        """Return the x (k,) with  L_aaᵀx_a + L_baᵀx_b = u  and x_b on the border."""
+        """Return x (k,) with  L_aaᵀx_a + L_baᵀx_b = u  for given x_b (b,) and u."""
         return self.factor.extended(np.concatenate([u, x_b]))
 
     def completed(self) -> SummedFactor:
-        """Factorise A; called by all ranks.
+        """Factorise A, the sum over ranks; called by all ranks.
 
         Raises
         ------
         DependentRowsError
-            When A is not positive definite.
+            If A is not positive definite.
 
         """
         ranks, c = self.at.ranks, self.changing
@@ -145,7 +151,7 @@ class LocalFactor:
             L_cc = _cholesky(L_cc)
         except np.linalg.LinAlgError:
             fails = 1.0
-        if ranks.extreme(fails, np.max):  # all ranks raise
+        if ranks.extreme(fails, np.max):  # raise on all ranks if one failed
             raise DependentRowsError("the rows are linearly dependent")
         L_sc, S = self._onto_shared(self.complement, L_cc)
         try:
@@ -154,7 +160,14 @@ class LocalFactor:
             raise DependentRowsError("the rows are linearly dependent") from None
 
     def _onto_shared(self, T: Dense, L_cc: Dense) -> tuple[Dense, Dense]:
-        """Eliminate changing rows of T (b, b); return L_sc and the sum S (s, s)."""
+        """Eliminate the changing rows of T (b, b), and sum over ranks.
+
+        Returns the block L_sc of this rank, and the sum S (s, s) of Schur complements
+        on the shared rows.
+
+        T : Schur complement on the border of this rank
+        L_cc : (c, c) factor of its block of changing rows
+        """
         c, s, place = self.changing, self.at.shared.size, self.at.place
         L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
         S = np.zeros((s, s))
@@ -164,27 +177,28 @@ class LocalFactor:
 
 @dataclass(frozen=True, eq=False)
 class SummedFactor:
-    """Factor L of A, or of (1 + κ)A − Σ_p less_p, over ranks."""
+    """Factor L of A, or of the matrix of `shifted`, distributed over ranks."""
 
     local: LocalFactor
-    root: float  #: √(1 + κ)
+    root: float  #: √(1 + shift), by which L_aa is multiplied
     L_cc: Dense  #: (c, c) block of the changing rows of this rank
     L_sc: Dense  #: (s_p, c) block of the shared rows of this rank
     L_ss: Dense  #: (s, s) block of all shared rows, replicated
 
     @property
     def least_pivot(self) -> float:
-        """Smallest diagonal entry of L on all ranks; inf without rows."""
+        """Smallest diagonal entry of L on all ranks; inf if A has no rows."""
         inner = self.root * self.local.factor.least_inner_pivot
         pivots = np.concatenate([[inner], np.diag(self.L_cc), np.diag(self.L_ss)])
         return self.local.at.ranks.extreme(float(pivots.min(initial=np.inf)), np.min)
 
     def shifted(self, shift: float, less: Dense) -> SummedFactor:
-        """Factorise (1 + shift)A − Σ_p `less`_p with the factor of A.
+        """Factorise (1 + shift)A − Σ_p `less`_p, where L is the factor of A.
 
-        less : (b, b) on the border, with Σ_p `less`_p ≤ A. The matrix is then at least
-            shift·A. Schur complements are monotone, so those formed here are at least
-            `shift` times those of A, whose factors are L_cc and L_ss.
+        less : (b, b) matrix of this rank on its border, such that Σ_p `less`_p ≤ A. The
+            result is then at least shift·A. Since Schur complements are monotone, those
+            of the result are at least `shift` times those of A, whose factors are L_cc
+            and L_ss.
         """
         local, c, scale = self.local, self.local.changing, 1 + shift
         T = scale * local.complement - less
@@ -194,7 +208,11 @@ class SummedFactor:
         return SummedFactor(local, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
 
     def forward(self, t: Dense) -> DistributedVector:
-        """Map an additive t (k,) to the orthonormal L⁻¹t (k - s_p + s,)."""
+        """Return L⁻¹t in orthonormal representation for an additive vector t (k,).
+
+        The result has k − s_p + s components, where s_p is the number of shared rows
+        that this rank touches.
+        """
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
             u, r = self.local.reduced(np.asarray(t))
@@ -204,7 +222,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Map an orthonormal vector a (k - s_p + s,) to the consistent L⁻ᵀa (k,)."""
+        """Return the consistent L⁻ᵀa (k,) for a in orthonormal representation."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)
@@ -216,7 +234,7 @@ class SummedFactor:
             return distributed(y, ranks)
 
     def __call__(self, t: Dense) -> DistributedVector:
-        """Solve A y = t for the consistent y (k,) of an additive t (k,)."""
+        """Return the consistent solution y (k,) of A y = t for an additive t (k,)."""
         local = self.local
         with local.at.ranks.clocked("coarse"):
             u, r = local.reduced(np.asarray(t))
@@ -228,7 +246,7 @@ class SummedFactor:
             return distributed(y, local.at.ranks)
 
     def _changing(self, r: Dense) -> tuple[Dense, Dense]:
-        """Eliminate the changing rows of a border vector (c + s_p,).
+        """Eliminate the changing rows from a vector r (c + s_p,) on the border.
 
         Returns L_cc⁻¹r_c and r_s − L_sc L_cc⁻¹r_c.
         """
@@ -237,7 +255,7 @@ class SummedFactor:
         return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense) -> Dense:
-        """Sum the entries (s_p,) of shared rows over all ranks: (s,)."""
+        """Return the sum (s,) over all ranks of their entries (s_p,) in shared rows."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared) if shared.size else shared
@@ -246,21 +264,23 @@ class SummedFactor:
 def local_factor(
     A: csc_array, at: Touched, changing: NDArray[np.bool_] | None = None
 ) -> LocalFactor:
-    """Eliminate the unchanging inner rows of the local A_p (k, k).
+    """Eliminate the inner rows of A_p (k, k) that do not change; called by all ranks.
 
-    A : A_p, with diagonal entries that sum to about one over the ranks
-    changing : (k,) mask of the inner rows that may change; None for no rows
+    A : A_p, scaled such that the diagonal entries of the sum A are about one
+    changing : (k,) mask of the rows that may change, of which shared rows are ignored;
+        None for no rows
 
     Raises
     ------
     DependentRowsError
-        When the inner rows of any rank are linearly dependent.
+        If the inner rows of any rank are linearly dependent.
 
     """
     changes = np.zeros(at.rows.size, bool) if changing is None else changing
     changing_rows = np.flatnonzero(changes & ~at.is_shared)
     border = np.concatenate([changing_rows, np.flatnonzero(at.is_shared)])
-    raised = np.where(at.is_shared, 1.0, 0.0)  # A_p alone may be singular there
+    # A_p may be singular on shared rows, since other ranks contribute to them
+    raised = np.where(at.is_shared, 1.0, 0.0)
     factor, fails = None, 0.0
     try:
         factor = bordered_factor(csc_array(A) + diags_array(raised), border)
@@ -274,14 +294,14 @@ def local_factor(
 def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
     """Factorise a symmetric, positive definite A (n, n), with the border last.
 
-    Other rows are ordered for little fill.
+    The other rows are ordered such that the factor has few nonzeros.
 
-    border : (b,) rows whose block may change
+    border : (b,) rows whose diagonal block may change later
 
     Raises
     ------
     DependentRowsError
-        When A is not positive definite.
+        If A is not positive definite.
 
     """
     if A.shape[0] <= MAX_ARRAY_ROWS:
@@ -308,12 +328,14 @@ def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
 
 
 def independent_rows(gram: Matrix) -> Rows:
-    """Return a maximal set of independent rows of a matrix G, from GGᵀ (r, r).
+    """Return a maximal set of linearly independent rows of a matrix G.
 
     The pivot of a row is the square of its distance from the span of the previous rows.
     A row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times its squared
-    length. Only the first dependent row is dropped before the pivots are computed
-    again, since the pivots after it are rounding errors.
+    length. After a dependent row, pivots consist of rounding errors. Therefore, only
+    the first dependent row is dropped before the pivots are computed again.
+
+    gram : (r, r) matrix GGᵀ
 
     Returns
     -------
@@ -336,7 +358,7 @@ def independent_rows(gram: Matrix) -> Rows:
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return L with LLᵀ = M; its upper triangle is undefined."""
+    """Return the lower triangular L with LLᵀ = M; do not use its upper triangle."""
     if not len(M):
         return np.zeros((0, 0), order="F")
     L, failed = lapack.dpotrf(M, lower=1, clean=0)
@@ -346,14 +368,14 @@ def _cholesky(M: Dense) -> Dense:
 
 
 def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
-    """Return L⁻¹x or L⁻ᵀx."""
+    """Return L⁻¹x, or L⁻ᵀx if `transposed`."""
     if not x.size:
         return x
     return np.asarray(blas.dtrsv(L, x, lower=1, trans=int(transposed)))
 
 
 def with_int32(M: Matrix) -> csc_matrix:
-    """Return a sparse M (k, l) with the 32-bit indices that `Factor` needs."""
+    """Return a sparse matrix with the 32-bit indices that CHOLMOD needs here."""
     M = csc_matrix(M)
     M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
     return M

@@ -1,10 +1,11 @@
 """Collective handling of failures: all ranks raise, or all processes end.
 
-If one rank raised an exception while others wait for its messages, they would wait for
-ever. Ranks therefore exchange the outcome of each piece of work (`run_collectively`),
-on a communicator that is used only for this purpose. A rank that failed waits there for
-the others. If they do not arrive in time, they are waiting for its messages, and the
-failed rank ends all processes (`abort`).
+If a single rank raised an exception, the other ranks would wait for its messages for
+ever. Work that may fail is therefore called by `run_collectively`, which then exchanges
+the outcomes of all ranks, on a communicator that is used only for this purpose. A rank
+whose work failed waits in this exchange for the others. If they do not arrive in time,
+they are waiting for messages of the failed rank, which then ends all processes
+(`abort`).
 """
 
 from __future__ import annotations
@@ -24,29 +25,30 @@ from mortarbench.harness.distributed.vectors import Ranks
 
 T = TypeVar("T")
 
-PEER_TIMEOUT = 5.0  #: time that a failed rank waits for the others, s
-#: Environment variable with the file descriptor on which `harness.processes.ranks`
-#: reads failures of ranks, separately from the output of solvers.
+PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the others, s
+#: Environment variable with the number of a file descriptor. `harness.processes.ranks`
+#: reads failures of ranks from it, separately from the output of solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
-_POLL_SECONDS = 1e-3  #: time between two tests whether the other ranks have arrived
-_MESSAGE_BYTES = 500  #: longer descriptions of a failure are truncated
+_POLL_SECONDS = 1e-3  #: interval at which a failed rank tests for the other ranks, s
+_MESSAGE_BYTES = 500  #: length to which descriptions of failures are truncated
 
 
 class RankFailedError(Exception):
-    """Failure of a rank; the message names the rank and its exception."""
+    """Error for the failure of a rank; the message names the rank and its exception."""
 
 
 def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
-    """Execute `work` on all ranks, and raise on all of them if any fails.
+    """Call `work` on all ranks, and raise on all ranks if it fails on any of them.
+
+    If all ranks raise exceptions with equal messages, these are raised unchanged.
 
     Raises
     ------
     RankFailedError
-        On every rank, if only some ranks failed or their exceptions differ. An
-        exception that all ranks raise with equal messages is raised unchanged.
+        If `work` failed on some ranks only, or with different messages.
 
     """
-    # created here, since all ranks are here: Dup is collective
+    # Dup is collective: its first access must be at a place that all ranks reach
     comm = ranks.private_comm
     failure: Exception | None = None
     try:
@@ -76,7 +78,7 @@ def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
 
 
 def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
-    """Record the failure of this rank, and end all ranks."""
+    """Report the failure of this rank, and end the processes of all ranks."""
     record(ranks.rank, _named(ranks.rank, ranks, in_a_line(failure)))
     with suppress(OSError, ValueError):  # a solver may have closed stderr
         traceback.print_exception(failure)
@@ -88,7 +90,7 @@ def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
 def record(rank: int, failure: str) -> None:
     """Report the failure of a rank to the process that launched the ranks, if any.
 
-    The line is a single write, so that lines of several ranks do not mix.
+    The report is a single write, so that reports of several ranks do not interleave.
     """
     entry = {"rank": rank, "failed": failure[:_MESSAGE_BYTES]}
     with suppress(OSError, KeyError):
@@ -96,7 +98,7 @@ def record(rank: int, failure: str) -> None:
 
 
 def in_a_line(failure: BaseException) -> str:
-    """Return the type and the message of an exception in one line."""
+    """Return the type and the message of an exception as one line."""
     return " ".join(f"{type(failure).__name__}: {failure}".split())
 
 

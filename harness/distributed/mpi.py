@@ -17,7 +17,10 @@ MISSING = (
 
 
 def mpiexec() -> str | None:
-    """Return the path of mpiexec, beside this Python or on PATH; None without MPI."""
+    """Return the path of mpiexec, or None if it or mpi4py is not installed.
+
+    An mpiexec in the folder of the Python interpreter is preferred to one on PATH.
+    """
     if find_spec("mpi4py") is None:
         return None
     beside = Path(sys.executable).with_name("mpiexec")
@@ -25,14 +28,15 @@ def mpiexec() -> str | None:
 
 
 def ranks_asked(count: object, where: str) -> int:
-    """Check a number of ranks; if it exceeds one, check also that MPI is available.
+    """Check a number of ranks, and return it.
 
-    where : option or key, for the message
+    where : option or key that sets the number, for the message
 
     Raises
     ------
     InputError
-        When `count` is not an integer from 1 to MAX_RANKS, or MPI is missing.
+        If `count` is not an integer from 1 to MAX_RANKS, or if it exceeds 1 and MPI is
+        not available.
 
     """
     if type(count) is not int or not 1 <= count <= MAX_RANKS:

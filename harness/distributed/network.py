@@ -12,21 +12,22 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE_BYTES = 2**20  #: size of a message whose time is determined by bandwidth
-_BATCHES = 5  #: number of batches of timed calls; the first one warms up
+LARGE_BYTES = 2**20  #: size of a message whose time depends on the bandwidth only
+_BATCHES = 5  #: number of batches of timed calls; the first is discarded as warm-up
 
 
 def network(comm: Comm) -> dict[str, float]:
-    """Time reductions and messages; called by all ranks. Takes a few milliseconds.
+    """Measure the times of reductions and messages; called by all ranks.
 
-    All ranks send around a ring simultaneously, as in the exchange of a product. The
-    times are medians over batches.
+    The ranks form a ring, and all of them send to the next rank at the same time, since
+    all ranks also send at the same time in a matrix-vector product. Times are medians
+    over batches. The measurement takes a few milliseconds.
 
     Returns
     -------
     reduction_seconds : time to reduce one number over all ranks, s
-    message_seconds : time to send eight bytes to a neighbour, s
-    seconds_per_byte : time per byte of long messages to a neighbour, s
+    message_seconds : time to send eight bytes to the next rank, s
+    seconds_per_byte : time per byte of a long message to the next rank, s
 
     """
     right, left = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
@@ -49,7 +50,7 @@ def network(comm: Comm) -> dict[str, float]:
 
 
 def _seconds(call: Callable[[], None], times: int) -> float:
-    """Return the median over batches of the time of a call, s."""
+    """Return the time of a call in s, as the median over batches of `times` calls."""
     seconds = []
     for _ in range(_BATCHES):
         start = perf_counter()

@@ -1,12 +1,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Linear maps whose products compiled code calls without Python.
+"""Linear maps that compiled code applies to vectors without calling Python.
 
-A `LinearMap` is a sparse matrix, the inverse of a factorised one, or a composition of
-other maps. Operators of decomposed bodies are such maps, and so are the rows of their
-coarse problem: on short vectors, the overhead of library calls, and another pass over
-the vectors for a linear combination, would cost more than the product. The module is
-compiled when the package is installed; `sparse.pyi` declares its types, and
-`sparse.pxd` those for compiled callers.
+A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, or a composition
+of other maps. Operators of decomposed bodies, and the rows of their coarse problem, are
+implemented as such maps: for short vectors, a product takes less time than the overhead
+of library calls, or than another pass over the vectors for a linear combination. The
+module is compiled when the package is installed. `sparse.pyi` declares its types for
+Python, `sparse.pxd` for compiled callers.
 """
 
 from libc.math cimport sqrt
@@ -21,7 +21,7 @@ from scipy.sparse import csc_array
 
 
 cdef class LinearMap:
-    """A linear map x ↦ Ax with A (n, k), for vectors (k,) and matrices (k, w)."""
+    """A linear map x ↦ Ax with A (n, k), for vectors x (k,) and matrices x (k, w)."""
 
     cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
         """y ← Ax for x (k, columns) and y (n, columns), stored by rows."""
@@ -66,7 +66,7 @@ cdef class CompressedRows(LinearMap):
 
     @staticmethod
     def of_array(const double[:, ::1] M):
-        """Return the nonzero entries of an array."""
+        """Return the matrix M, without the zero entries of the array."""
         cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
         cdef Py_ssize_t i, j, count = 0, n = M.shape[0], k = M.shape[1]
         entries, columns = np.empty(n * k), np.empty(n * k, dtype=np.int32)
@@ -96,7 +96,7 @@ cdef class CompressedRows(LinearMap):
         return 0
 
     def rows(self, chosen):
-        """Return the matrix of the rows `chosen` (b,)."""
+        """Return the matrix (b, k) of the rows with numbers `chosen` (b,)."""
         cdef const long long[::1] at = np.ascontiguousarray(chosen, dtype=np.int64)
         cdef Py_ssize_t i, count = 0
         cdef int j
@@ -118,9 +118,9 @@ cdef class CompressedRows(LinearMap):
         return new
 
     def unit_columns(self):
-        """Return the matrix with columns of norm 1, and their norms (k,).
+        """Return M with columns scaled to norm 1, and the original norms (k,).
 
-        Columns of norm zero are left as they are.
+        Columns of norm zero are not scaled.
         """
         cdef Py_ssize_t j, count = self.indptr[self.n]
         cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
@@ -137,7 +137,7 @@ cdef class CompressedRows(LinearMap):
         return new, sizes
 
     def transposed(self):
-        """Return Mᵀ (k, n) by rows."""
+        """Return Mᵀ (k, n) in CSR format."""
         cdef Py_ssize_t i, count = self.indptr[self.n]
         cdef int j, at
         cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
@@ -162,7 +162,7 @@ cdef class CompressedRows(LinearMap):
 
     @property
     def touched(self):
-        """Mask (k,) of the columns with entries."""
+        """Mask (k,) of the columns that have entries."""
         cdef Py_ssize_t j
         mask = np.zeros(self.k, dtype=bool)
         cdef unsigned char[::1] has_entry = mask.view(np.uint8)
@@ -172,7 +172,7 @@ cdef class CompressedRows(LinearMap):
 
     @property
     def by_columns(self):
-        """Mᵀ (k, n) in CSC format, sharing the arrays."""
+        """Mᵀ (k, n) in CSC format, with the same arrays as M."""
         data, indices, indptr = map(np.asarray, self.arrays)
         return csc_array((data, indices, indptr), shape=(self.k, self.n))
 
@@ -200,7 +200,7 @@ cdef class CompressedRows(LinearMap):
         cdef const int *indptr = self.indptr
         j = indptr[0]
         for i in range(self.n):
-            y_i = z_i = 0  # two sums, as each addition waits for the one before
+            y_i = z_i = 0  # two sums, since an addition waits for the previous one
             last = indptr[i + 1]
             while j + 1 < last:
                 y_i += data[j] * x[indices[j]]
@@ -254,7 +254,7 @@ cdef class CompressedRows(LinearMap):
             y[i] = weights[i] * (v[i] - y_i)
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
-        """Return sv + tMx (n,) of v (n,) and x (k,)."""
+        """Return sv + tMx (n,) for v (n,) and x (k,)."""
         self.expect(v.shape[0], self.n)
         self.expect(x.shape[0], self.k)
         product = np.empty(self.n)
@@ -266,7 +266,7 @@ cdef class CompressedRows(LinearMap):
     def weighted_difference(
         self, const double[::1] v, const double[::1] x, const double[::1] weights
     ):
-        """Return diag(weights)(v − Mx) (n,) of v (n,), x (k,) and weights (n,)."""
+        """Return diag(weights)(v − Mx) (n,) for v (n,), x (k,) and weights (n,)."""
         self.expect(v.shape[0], self.n)
         self.expect(x.shape[0], self.k)
         self.expect(weights.shape[0], self.n)
@@ -277,7 +277,7 @@ cdef class CompressedRows(LinearMap):
         return product
 
     def transposed_times(self, const double[::1] x):
-        """Return Mᵀx (k,) of x (n,)."""
+        """Return Mᵀx (k,) for x (n,)."""
         self.expect(x.shape[0], self.n)
         product = np.zeros(self.k)
         cdef double[::1] y = product
@@ -286,9 +286,11 @@ cdef class CompressedRows(LinearMap):
         return product
 
     def outer_products(self, const double[::1] weights, const int[::1] place, int size):
-        """Return Σᵢ wᵢmᵢmᵢᵀ (size, size) over the rows mᵢ, for weights w (n,).
+        """Return Σᵢ wᵢmᵢmᵢᵀ (size, size), where mᵢ are the rows of M as columns.
 
-        place : (k,) new numbers of the columns, below `size` where M has entries
+        weights : (n,) wᵢ
+        place : (k,) new numbers of the columns, from 0 to `size` − 1 for columns that
+            have entries
         """
         self.expect(weights.shape[0], self.n)
         self.expect(place.shape[0], self.k)
@@ -319,7 +321,7 @@ cdef void add_outer_products(
 
 
 cdef class Composition(LinearMap):
-    """The map x ↦ A₁A₂…Aᵣx of maps with fitting shapes; the last one acts first."""
+    """The composition x ↦ A₁A₂…Aᵣx of maps, of which the last is applied first."""
 
     cdef tuple maps
     cdef double *between[2]
@@ -366,7 +368,7 @@ cdef class Identity(LinearMap):
 
 
 cdef class DirectSum(LinearMap):
-    """The block diagonal map of consecutive parts of a vector, each with its own map."""
+    """The block diagonal map diag(A₁, …, Aᵣ) of maps Aᵢ."""
 
     cdef tuple maps
 
@@ -385,7 +387,7 @@ cdef class DirectSum(LinearMap):
 
 
 cdef class Sum(LinearMap):
-    """The map x ↦ A₁x + … + Aᵣx of maps with the same shape."""
+    """The sum x ↦ A₁x + … + Aᵣx of maps of equal shape."""
 
     cdef tuple maps
     cdef double *term
@@ -426,24 +428,27 @@ cdef double *resized(double *held, Py_ssize_t size) except NULL:
 # --- factors ------------------------------------------------------------------------
 
 
-# Relative amount by which a pivot may fall below its lower bound: both are rounded.
+# Largest relative amount by which a squared pivot may be below its lower bound, since
+# both are rounded.
 cdef double PIVOT_TOLERANCE = 1e-3
 
 
 def factor_above(M, double share, L_0):
     """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
 
-    M is a difference of matrices as large as L₀L₀ᵀ. If the share is below the rounding
-    of these, eigenvalues of M may have either sign. In exact arithmetic the pivots of M
-    are at least those of share·L₀L₀ᵀ. If computed ones are smaller, L₀⁻¹ML₀⁻ᵀ ≥ share·I
-    is decomposed instead, its eigenvalues λ are raised to the share, and
+    M is a difference of matrices of the size of L₀L₀ᵀ. If `share` is smaller than their
+    relative rounding errors, the computed M may have negative eigenvalues. In exact
+    arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ. If a computed pivot
+    is smaller, the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed
+    instead. Eigenvalues below `share` are set to `share`, and L follows from
 
-        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   from a QR factorisation of √λ QᵀL₀ᵀ,
+        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
 
-    which involves no subtraction and keeps the lower bound in spite of cancellation.
+    which involves no subtraction and so preserves the lower bound.
 
     M : (k, k) symmetric
-    L_0 : (k, k) lower triangular
+    share : factor of the lower bound, which is small and positive
+    L_0 : (k, k) lower triangular L₀
     """
     cdef Py_ssize_t k = len(M)
     L = np.array(M, dtype=np.float64, order="F")
@@ -463,7 +468,7 @@ def factor_above(M, double share, L_0):
 cdef bint factorised_above(
     double *M, Py_ssize_t k, double share, const double *L_0
 ) noexcept:
-    """Factorise M (k, k) in place; return False if its pivots are below their bounds."""
+    """Factorise M (k, k) in place; return False if a pivot is below its lower bound."""
     cdef int n = k, info = 0
     cdef Py_ssize_t i
     cdef double pivot, least
@@ -482,15 +487,16 @@ cdef class BorderedFactor(LinearMap):
 
     ::
 
-        A = LLᵀ,   L = ⎡L_aa     ⎤     with rows in the given order.
+        A = LLᵀ,   L = ⎡L_aa     ⎤     with the rows of A in the order `order`.
                        ⎣L_ba  L_bb⎦
 
-    Changes of the border only require a new factor of its Schur complement L_bbL_bbᵀ.
-    As a linear map, the factor is x ↦ A⁻¹x.
+    If A changes on the border only, it suffices to factorise the new Schur complement
+    L_bbL_bbᵀ. As a linear map, the object is x ↦ A⁻¹x.
 
-    order : (n,) permutation of the rows, the border last
-    columns : the first n − b columns of L (n, n − b) in CSC format, diagonal first
-    L_bb : (b, b); its upper triangle is not used
+    order : (n,) permutation of the rows, with the border last
+    columns : first n − b columns of L (n, n − b) in CSC format, each with its diagonal
+        entry first
+    L_bb : (b, b) lower triangular; the upper triangle is not used
     """
 
     def __init__(self, order, columns, L_bb):
@@ -525,7 +531,7 @@ cdef class BorderedFactor(LinearMap):
         for j in range(b):
             for i in range(j, b):
                 self.L[j * b + i] = corner[i, j]
-        if b:  # both triangles of L_bbL_bbᵀ
+        if b:  # dsyrk computes the lower triangle of L_bbL_bbᵀ, which is then mirrored
             dsyrk(b"L", b"N", &size, &size, &one, self.L, &size, &zero, self.schur,
                   &size)
         for j in range(b):
@@ -548,17 +554,17 @@ cdef class BorderedFactor(LinearMap):
 
     @staticmethod
     def of_array(A, border):
-        """Factorise an array A (n, n) with few nonzero entries.
+        """Factorise an array A (n, n) with few nonzeros.
 
-        The row with the fewest entries is eliminated first (minimum degree), those of
-        the border last.
+        In each step, the remaining row with the fewest nonzeros is eliminated (minimum
+        degree). Rows of the border are eliminated last.
 
-        border : (b,) rows
+        border : (b,) numbers of the rows of the border
 
         Raises
         ------
         numpy.linalg.LinAlgError
-            When A is not positive definite.
+            If A is not positive definite.
 
         """
         cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
@@ -629,10 +635,10 @@ cdef class BorderedFactor(LinearMap):
         new.hold(order, begin, indices[:count], data[:count], corner)
         return new
 
-    # the two halves of a solve
+    # forward and backward substitution, with a factor that is not yet scaled
 
     cdef void reduce(self, const double *t, double *u) noexcept:
-        """u ← (L_aa⁻¹t_a, t_b − L_baL_aa⁻¹t_a), in the order of L and without `scale`."""
+        """u ← (L_aa⁻¹t_a, t_b − L_baL_aa⁻¹t_a), in the order of L, before scaling."""
         cdef Py_ssize_t i, j
         cdef int l
         cdef double u_j
@@ -645,7 +651,7 @@ cdef class BorderedFactor(LinearMap):
                 u[self.indices[l]] -= self.data[l] * u_j
 
     cdef void extend(self, double *u, double *y) noexcept:
-        """y ← the solution of L_aaᵀy_a + L_baᵀy_b = u_a with y_b = u_b; u is lost."""
+        """y ← solution of L_aaᵀy_a + L_baᵀy_b = u_a with y_b = u_b; overwrites u."""
         cdef Py_ssize_t i, j
         cdef int l
         cdef double u_j
@@ -658,12 +664,12 @@ cdef class BorderedFactor(LinearMap):
             y[self.order[i]] = u[i]
 
     cdef void solve_border(self, double *r, bint transposed) noexcept:
-        """r ← L_bb⁻¹r, or L_bb⁻ᵀr."""
+        """r ← L_bb⁻¹r, or L_bb⁻ᵀr if `transposed`."""
         cdef int b = self.border, one = 1
         if b:
             dtrsv(b"L", b"T" if transposed else b"N", b"N", &b, self.L, &b, r, &one)
 
-    # with the scale
+    # solves with the scaled factor, whose L_aa and L_ba are multiplied by √scale
 
     cdef void forward_to(self, const double *t, double *a) noexcept:
         """a ← L⁻¹t."""
@@ -708,7 +714,7 @@ cdef class BorderedFactor(LinearMap):
         return 0
 
     def forward(self, const double[::1] t):
-        """Return L⁻¹t, in the order of L."""
+        """Return L⁻¹t (n,), in the order of L."""
         self.expect(t.shape[0], self.n)
         result = np.empty(self.n)
         cdef double[::1] a = result
@@ -717,7 +723,7 @@ cdef class BorderedFactor(LinearMap):
         return result
 
     def backward(self, const double[::1] a):
-        """Return L⁻ᵀa for a in the order of L."""
+        """Return L⁻ᵀa (n,) for a vector a in the order of L."""
         self.expect(a.shape[0], self.n)
         result = np.empty(self.n)
         cdef double[::1] y = result
@@ -757,7 +763,7 @@ cdef class BorderedFactor(LinearMap):
 
     @property
     def least_inner_pivot(self):
-        """Smallest diagonal entry of L_aa; inf without rows outside of the border."""
+        """Smallest diagonal entry of L_aa; inf if all rows belong to the border."""
         cdef Py_ssize_t i
         cdef double least = float("inf")
         for i in range(self.inner):
@@ -775,23 +781,23 @@ cdef class BorderedFactor(LinearMap):
 
     @property
     def entries(self):
-        """Number of entries of L."""
+        """Number of stored entries of L."""
         return self.indptr[self.inner] + self.border * (self.border + 1) // 2
 
     @property
     def rows(self):
-        """Rows (n,) of A in the order of L."""
+        """Numbers (n,) of the rows of A, in the order of L."""
         return np.asarray(self.arrays[0]).astype(np.int64)
 
     @property
     def border_rows(self):
-        """Rows (b,) of the border."""
+        """Numbers (b,) of the rows of the border, in the order of L."""
         return self.rows[self.inner:]
 
     # changes of the border
 
     cdef BorderedFactor less(self, double shift, const double *block):
-        """Return the factor of (1 + shift)A less a block (b, b) on the border."""
+        """Return the factor of (1 + shift)A minus a block (b, b) on the border."""
         cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
         cdef Py_ssize_t i, b = self.border
         new.n, new.k, new.shape = self.n, self.k, self.shape
@@ -809,7 +815,7 @@ cdef class BorderedFactor(LinearMap):
         return new
 
     cdef int raise_border(self, double shift) except -1:
-        """Factorise the complement in `L` by its eigenvalues (`factor_above`)."""
+        """Factorise the Schur complement stored in `L` by `factor_above`."""
         cdef Py_ssize_t i, j, b = self.border
         M, L_0 = np.empty((b, b), order="F"), np.zeros((b, b), order="F")
         cdef double[::1, :] at = M
@@ -828,10 +834,7 @@ cdef class BorderedFactor(LinearMap):
     cdef BorderedFactor without(
         self, double shift, CompressedRows columns, const double *removed
     ):
-        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ over the rows of `columns`.
-
-        removed : the weights wᵢ, 0 or 1
-        """
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ, see `shifted_without`."""
         cdef Py_ssize_t b = self.border
         cdef double *block = <double *> calloc(max(b * b, 1), sizeof(double))
         if not block:
@@ -843,10 +846,12 @@ cdef class BorderedFactor(LinearMap):
             free(block)
 
     def shifted(self, double shift, block):
-        """Return the factor of (1 + shift)A less a symmetric block (b, b) of the border.
+        """Return the factor of (1 + shift)A minus a symmetric block on the border.
 
-        The difference is at least shift·A, which bounds its pivots from below even
-        where rounding does not: see `factor_above`.
+        In exact arithmetic, the difference must be at least shift·A. The computed
+        pivots satisfy the resulting lower bounds despite rounding, see `factor_above`.
+
+        block : (b, b) matrix, in the order of `border_rows`
         """
         cdef const double[:, ::1] less = np.ascontiguousarray(block, dtype=np.float64)
         self.expect(less.shape[0], self.border)
@@ -855,10 +860,10 @@ cdef class BorderedFactor(LinearMap):
     def shifted_without(
         self, double shift, CompressedRows columns, const double[::1] removed
     ):
-        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ; see `shifted`.
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ, see `shifted`.
 
-        columns : rows mᵢ (n,) with entries in the border only
-        removed : weights wᵢ, 0 or 1
+        columns : matrix whose rows are the mᵢ (n,), with entries on the border only
+        removed : weights wᵢ, each 0 or 1
         """
         columns.expect(removed.shape[0], columns.n)
         return self.without(shift, columns, &removed[0] if columns.n else NULL)

@@ -1,15 +1,15 @@
 """Vectors distributed over the processes of one solve, the *ranks* of MPI.
 
-Every rank runs the same code on its local slice. Elementwise operations need no
-communication; reductions to a number run over all ranks and return the same number on
-each, so that all ranks take the same branches. An algorithm written for NumPy vectors
-therefore runs on ranks unchanged:
+Every rank runs the same code, and stores a slice of each vector. Elementwise operations
+need no communication. Reductions to a number are collective and return the same number
+on every rank, so that all ranks take the same branches. An algorithm written for NumPy
+vectors therefore runs unchanged on several ranks:
 
-    x + alpha*p, np.where(free, g, 0)   on each slice
-    x @ y, v.max(), moves.any()         over all ranks
+    x + alpha*p, np.where(free, g, 0)   elementwise, on the local slice
+    x @ y, v.max(), moves.any()         reduction over all ranks
 
-A `DistributedVector` raises TypeError for any other operation, whose result would
-depend on the local slice only.
+A `DistributedVector` raises TypeError for all other operations, since their results
+would depend on the local slice only.
 """
 
 from __future__ import annotations
@@ -39,34 +39,33 @@ if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
 T = TypeVar("T")
-#: Arrays of up to this size are gathered and added in the order of the ranks, so that
-#: rounding is the same on all ranks. Allreduce sums longer arrays.
+#: Largest size of arrays that are gathered and added in the order of the ranks, so that
+#: every rank obtains the same rounding errors. Longer arrays are summed by Allreduce.
 MAX_ORDERED_SUM = 64
 
-#: Parts of the time of a solve: products with local operators; packing and unpacking of
-#: exchanged values; solves of the coarse problem and other work repeated on all ranks;
-#: waiting in MPI for other ranks.
+#: Categories of the time of a solve. products: products with local operators; exchange:
+#: packing and unpacking of exchanged values; coarse: solves of the coarse problem and
+#: other work that every rank repeats; waiting: waiting in MPI for other ranks.
 PARTS = ("products", "exchange", "coarse", "waiting")
 
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """The processes of one solve, with timers and counters of this process."""
+    """The MPI processes of one solve, with timers and counters of this process."""
 
     comm: Comm
-    #: time spent on each of the `PARTS`, which do not overlap, s
+    #: time that this process spent in each of the `PARTS`, without overlap, s
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
-    #: numbers of reductions, of messages to single ranks, and of their bytes
+    #: numbers of reductions, of messages to single ranks, and of bytes in the messages
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
-    #: latencies and time per byte, s, from `harness.distributed.network.network`;
-    #: empty if they were not measured
+    #: result of `harness.distributed.network.network`; empty if it was not measured
     network: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def private_comm(self) -> Comm:
-        """A duplicate of the communicator; the first access is collective."""
+        """A duplicate of `comm`; the first access is collective."""
         return self.comm.Dup()
 
     @property
@@ -76,11 +75,11 @@ class Ranks:
 
     @property
     def rank(self) -> int:
-        """Index of this rank, from 0."""
+        """Number of this rank, from 0."""
         return int(self.comm.rank)
 
     def total(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Sum arrays of equal shape over all ranks; every rank gets the same result."""
+        """Return the sum over all ranks of arrays of equal shape, on every rank."""
         part = np.ascontiguousarray(part, dtype=float)
         if part.size <= MAX_ORDERED_SUM:
             return np.asarray(self.gather_all(part).sum(axis=0))
@@ -91,14 +90,14 @@ class Ranks:
         return total
 
     def extreme(self, value: float, pick: Callable[[Any], Any]) -> float:
-        """Return the least or largest number of all ranks.
+        """Return the least or the largest of the numbers on all ranks, on every rank.
 
         pick : np.min or np.max
         """
         return float(pick(self.gather_all(np.array([value], dtype=float))))
 
     def gather_all(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Gather the arrays of all ranks, of equal shape, to (size, …) on each."""
+        """Return the stacked arrays (size, …) of all ranks, which have equal shapes."""
         parts = np.empty((self.size, *part.shape))
         self.counts["reductions"] += 1
         with self.clocked("waiting"):
@@ -111,14 +110,15 @@ class Ranks:
         sizes: NDArray[np.int64],
         coming: NDArray[np.int64],
     ) -> Callable[[], NDArray[np.float64]]:
-        """Start to exchange consecutive parts of an array with other ranks.
+        """Start to send consecutive parts of an array to other ranks.
 
+        out : entries to be sent, in the order of the ranks
         sizes, coming : (size,) numbers of entries sent to and received from each rank
 
         Returns
         -------
-        a function that waits for all messages and returns the entries received, in the
-        order of the ranks; work done before its call overlaps with communication
+        a function that waits for all messages, and returns the received entries in the
+        order of the ranks; work done before its call overlaps with the communication
 
         """
         out, received = np.ascontiguousarray(out), np.empty(int(coming.sum()))
@@ -144,9 +144,11 @@ class Ranks:
         return arrived
 
     def clocked(self, part: str) -> _Clock:
-        """Return a context that adds its time to one of the `PARTS`.
+        """Return a context manager that adds the time of its block to a category.
 
-        The time of nested contexts counts only for their own parts.
+        The time of a nested block is added to the category of the nested block only.
+
+        part : one of the `PARTS`
         """
         return _Clock(self.seconds, part)
 
@@ -162,7 +164,7 @@ def single_process() -> Ranks:
 
 
 class _SingleProcess:
-    """Communicator of a single process without other ranks."""
+    """Replacement of an MPI communicator for a single process."""
 
     size = 1
     rank = 0
@@ -172,11 +174,11 @@ class _SingleProcess:
         return self
 
     def allgather(self, part: T) -> list[T]:
-        """Return the objects of all ranks, in their order."""
+        """Return the list of the objects of all ranks."""
         return [part]
 
     def alltoall(self, parts: list[T]) -> list[T]:
-        """Return the objects that all ranks send to this one."""
+        """Return the list of the objects that all ranks send to this rank."""
         return parts
 
     def Allgather(self, part: NDArray[Any], parts: NDArray[Any]) -> None:
@@ -189,9 +191,10 @@ class _SingleProcess:
 
 
 class _Clock:
-    """Timer of a block for one part, without the time of nested blocks.
+    """Timer that adds the time of a block, without nested blocks, to a category.
 
-    This is a class because a generator-based context is a few times slower.
+    This is a class, since a context manager based on a generator is several times
+    slower.
     """
 
     __slots__ = ("before", "part", "seconds", "start")
@@ -211,16 +214,16 @@ class _Clock:
 
 
 class DistributedVector(np.ndarray):
-    """The local slice (n_rank,) of a vector; reductions run over all ranks.
+    """The local slice (n_rank,) of a vector, with reductions over all ranks.
 
-    Selected components may form rows (k, d), each of them on one rank: sums and norms
-    along axis 1 need no other rank.
+    A slice may also be a matrix (k, d) whose rows are blocks of components. Since every
+    block is on a single rank, sums and norms along axis 1 need no communication.
 
     Raises
     ------
     TypeError
         If an operation is neither elementwise nor one of the reductions sum, min, max,
-        any, all, dot product, norm and count.
+        any, all, dot product, norm and count of nonzeros.
 
     """
 
@@ -231,7 +234,7 @@ class DistributedVector(np.ndarray):
             self.ranks = obj.ranks
 
     def dot(self, other: Any) -> Any:  # type: ignore[override]  # no `out`
-        """Return the dot product over all ranks."""
+        """Return the dot product, summed over all ranks."""
         return self @ other
 
     def _refused(self, *args: Any, **kwargs: Any) -> Any:
@@ -272,7 +275,7 @@ class DistributedVector(np.ndarray):
 
 
 def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
-    """Wrap an array (n_rank,) as the local slice of a vector."""
+    """Return an array (n_rank,) as the local slice of a distributed vector."""
     vector = np.ascontiguousarray(part).view(DistributedVector)
     vector.ranks = ranks
     return vector
@@ -289,7 +292,7 @@ def _rewrap(ranks: Ranks, result: Any) -> Any:
 
 
 def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
-    """Multiply (n,) or (k, n) by (n,) or (n, k), and sum over all ranks."""
+    """Return the product of local slices (n,) or (k, n), (n, k), summed over ranks."""
     product = ranks.total(np.atleast_1d(a @ b))
     return product if np.ndim(a) + np.ndim(b) > 2 else float(product[0])
 
@@ -298,21 +301,21 @@ def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
 class DistributedColumns:
     """A sparse matrix G (r, n) whose columns are distributed over the ranks.
 
-    Vectors (r,) are replicated on all ranks: r is the size of a coarse problem.
+    Vectors (r,) are equal on all ranks; r is small, the size of a coarse problem.
     """
 
-    part: csr_array  #: (r, n_rank)
+    part: csr_array  #: (r, n_rank) columns of this rank
     ranks: Ranks
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows, and of local columns."""
+        """Numbers of rows and of local columns."""
         rows, columns = self.part.shape
         return rows, columns
 
     @property
     def T(self) -> _DistributedRows:
-        """Gᵀ, which maps (r,) to the local slice of (n,)."""
+        """Gᵀ, which maps a vector (r,) to the local slice of a vector (n,)."""
         return _DistributedRows(self)
 
     def __matmul__(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -322,16 +325,16 @@ class DistributedColumns:
         return DistributedColumns(abs(self.part), self.ranks)
 
     def scaled(self, s: NDArray[np.float64]) -> DistributedColumns:
-        """Multiply row i by s[i]."""
+        """Return the matrix with each row i multiplied by s[i]."""
         return DistributedColumns(csr_array(diags_array(s) @ self.part), self.ranks)
 
     def __getitem__(self, rows: NDArray[np.int64]) -> DistributedColumns:
         return DistributedColumns(csr_array(self.part[rows]), self.ranks)
 
     def gram(self, columns: NDArray[np.bool_] | None = None) -> csc_array:
-        """Return G_F G_Fᵀ (r, r) for the columns F, or GGᵀ.
+        """Return G_F G_Fᵀ (r, r), where G_F consists of selected columns of G.
 
-        columns : (n_rank,) mask of F; None for all columns
+        columns : (n_rank,) mask of the selected local columns; None for all columns
         """
         part = self.part
         if columns is not None:
@@ -352,42 +355,46 @@ class _DistributedRows:
 
 
 class Share(NamedTuple):
-    """The part of a distributed QP on one rank."""
+    """The part of a distributed QP that is stored on one rank."""
 
-    qp: QP  #: vectors and the columns of A are distributed, b is replicated
+    qp: QP  #: vectors and the columns of A are distributed; b is equal on all ranks
     #: gathers a solution on rank 0; returns None on other ranks
     whole: Callable[[Solution], Solution | None]
 
 
-#: Prefix of the digest of a QP that is not stored as a whole: `DistributedQP.digest`.
+#: Prefix of the digest of a QP that no process stores as a whole, see `DistributedQP`.
 DISTRIBUTED_DIGEST = "emitted-"
 
 
 class Evaluation(NamedTuple):
-    """Collective evaluation of a solution; its functions are called by all ranks."""
+    """Evaluation of a solution that is distributed over ranks."""
 
     #: arguments of `certify_over_ranks` (`harness.verify.over_ranks`); None if a
     #: certificate needs the whole QP
     certifiable: Any | None
-    #: returns physical results, SI, equal on all ranks; None if they need the whole QP
+    #: function, called by all ranks, that returns the physical results in SI units,
+    #: equal on all ranks; None if the results need the whole QP
     quantities: Callable[[], Mapping[str, Any]] | None
 
 
 class DistributedQP(NamedTuple):
-    """A QP assembled by ranks, each its share; no process stores it as a whole."""
+    """A QP of which each rank assembles its own part; no process stores the whole QP.
 
-    variables: int  #: total number
-    equality_rows: int  #: total number
-    bounds: int  #: total number of finite bounds
-    #: assembles the local share; each call builds a new operator. Collective.
+    All ranks must call the functions `share`, `digest` and `answer`.
+    """
+
+    variables: int  #: number of variables on all ranks
+    equality_rows: int  #: number of equality rows
+    bounds: int  #: number of finite bounds on all ranks
+    #: assembles the part of this rank; each call builds a new operator
     share: Callable[[], Share]
-    #: digest of the coefficients. Collective. It differs from
+    #: returns a digest of the coefficients. It differs from
     #: `harness.files.qpfile.qp_digest`, which needs the whole QP, and therefore has the
-    #: prefix `DISTRIBUTED_DIGEST`.
+    #: prefix `DISTRIBUTED_DIGEST`
     digest: Callable[[], str]
-    #: evaluates a solution from its local slice. Collective.
+    #: evaluates a solution, given by its local slice
     answer: Callable[[Solution], Evaluation]
-    discs: int = 0  #: total number
+    discs: int = 0  #: number of discs on all ranks
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -401,7 +408,8 @@ class DistributedQP(NamedTuple):
         return {**sizes, "discs": self.discs} if self.discs else sizes
 
 
-#: Assembles a case, given by family, params and form, on all ranks. Collective.
+#: Function, called by all ranks, that assembles the QP of a case. The case is given as
+#: a mapping with family, params and form.
 Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 
 
@@ -409,20 +417,21 @@ Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 class Distributable(Protocol):
     """A product x ↦ Px that can be distributed over ranks.
 
-    A maker of an operator (`harness.operators`) may return one.
+    The function that builds an operator (`harness.operators`) may return an object of
+    this kind.
     """
 
     @property
     def parts(self) -> int:
-        """Number of parts, which is the largest number of ranks."""
+        """Number of parts of the operator, and so the largest number of ranks."""
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Return the local share of a `qp` with this P; called by all ranks.
+        """Return the part of a `qp` with this P on this rank; called by all ranks.
 
         Raises
         ------
         InputError
-            When there are more ranks than parts.
+            If there are more ranks than parts.
 
         """
 

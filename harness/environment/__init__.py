@@ -1,1 +1,1 @@
-"""Description of the machine and its software, fitness checks and noise."""
+"""Machine and software of a measurement: description, checks and noise floor."""

@@ -1,4 +1,4 @@
-"""Checks of a machine's fitness for measuring, with advice on what to change."""
+"""Checks whether a machine is fit for measuring times, with advice on changes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.environment.noise import NoiseFloor
 
 MIN_MEMORY_MIB = 2048
-MAX_QUIET_LOAD = 0.5  #: largest load of other programs: one-minute average, in cores
+MAX_QUIET_LOAD = 0.5  #: largest acceptable one-minute load average, in cores
 MAX_CLOCK_STEP_SECONDS = 1e-6
-#: Difference that 95 % of the pairs of equal measurements may have at most.
+#: Largest acceptable value of `NoiseFloor.one_pair`.
 MAX_PAIR_SCATTER = 0.10
-MAX_RATIO_BIAS = 0.01  #: deviation of an A/A ratio from 1 that is ignored
+MAX_RATIO_BIAS = 0.01  #: largest deviation of an A/A ratio from 1 that is ignored
 ONE_THREAD = (
     "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
     "RAYON_NUM_THREADS=1"
@@ -39,7 +39,7 @@ _STYLES = {Level.OK: "green", Level.WARN: "bold yellow", Level.UNKNOWN: "dim"}
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One property of the machine, with its rating."""
+    """One property of the machine or its software, with its rating."""
 
     section: str
     name: str
@@ -49,7 +49,7 @@ class Check:
 
 
 def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
-    """Check everything on which measured times depend.
+    """Check the properties of machine and software on which measured times depend.
 
     environment : result of `harness.environment.environment.capture`
     """
@@ -65,7 +65,7 @@ def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
 def as_json(
     environment: Mapping[str, Any], noise: NoiseFloor, checks: Sequence[Check]
 ) -> dict[str, Any]:
-    """Return the input and the result of `examine` as plain data."""
+    """Return the input and the result of `examine` as plain data, for JSON."""
     return {
         "digest": digest(environment),
         "fit": all(check.level is not Level.WARN for check in checks),
@@ -76,7 +76,10 @@ def as_json(
 
 
 def load_advice(load: float) -> str:
-    """Return advice on other programs; "" if the load average is low."""
+    """Return the advice to stop other programs, or "" if the load average is low.
+
+    load : one-minute load average, in cores
+    """
     if load <= MAX_QUIET_LOAD:
         return ""
     return (
@@ -86,7 +89,10 @@ def load_advice(load: float) -> str:
 
 
 def _check(section: str, name: str, value: object, advice: str = "") -> Check:
-    """Return a check: WARN with advice, UNKNOWN without a value, otherwise OK."""
+    """Return a check with the level that follows from the value and the advice.
+
+    The level is WARN if there is advice, UNKNOWN if the value is None, otherwise OK.
+    """
     level = Level.WARN if advice else Level.UNKNOWN if value is None else Level.OK
     text = "not reported by the system" if value is None else str(value)
     return Check(section=section, name=name, value=text, level=level, advice=advice)
@@ -100,14 +106,14 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
         "processor",
         f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
         f"{usable} usable{virtual})",
-        "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch",
+        "" if usable > 1 else "Provide 2 cores: for measurements and for supervision",
     )
     limit = machine["cpu_limit"]
     throttled = limit is not None and limit < 2
     yield check(
         "cpu limit",
         "none" if limit is None else f"{limit:g} cores",
-        "The container is throttled: give it 2 cores or more (docker run --cpus=2)"
+        "The container is throttled: allow at least 2 cores (docker run --cpus=2)"
         * throttled,
     )
     yield check(
@@ -119,7 +125,7 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "turbo",
         _SWITCH[machine["turbo"]],
-        "Frequencies above the nominal one depend on temperature and on neighbours: "
+        "Frequencies above nominal depend on temperature and on other cores: "
         "echo 0 | sudo tee /sys/devices/system/cpu/cpufreq/boost "
         "(Intel: echo 1 | sudo tee /sys/devices/system/cpu/intel_pstate/no_turbo)"
         * bool(machine["turbo"]),
@@ -156,14 +162,14 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
         advice = (
             "The reference BLAS is several times slower: "
             "sudo apt-get install libopenblas0-pthread "
-            f"(if it is there already: sudo update-alternatives --auto {link})"
+            f"(if it is installed: sudo update-alternatives --auto {link})"
         )
     linked = blas and f"{blas}, linked by CHOLMOD {version or '?'}"
     yield _check("BLAS", "of CHOLMOD", linked, advice)
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the BLAS in a package's wheel, or the system's BLAS without a wheel."""
+    """Return the BLAS in a package's wheel, else the BLAS of the system, or None."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":
@@ -195,7 +201,7 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
         "A/A ratio",
         f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
         f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
-        "A kernel seems to differ from itself: repeat when the machine is idle"
+        "Equal measurements seem to differ: repeat when the machine is idle"
         if biased
         else "",
     )
@@ -224,7 +230,7 @@ def _versions(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def render(checks: Sequence[Check], environment: str) -> Text:
-    """Lay out the output of `mortarbench doctor`: sections, levels and advice.
+    """Return the output of `mortarbench doctor`: all checks by section, with advice.
 
     environment : digest of the environment, as in records
     """

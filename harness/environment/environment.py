@@ -1,7 +1,7 @@
 """Environment of a measurement: machine, versions, source, threads and BLAS.
 
-The result is plain data without host names, user names and absolute paths, so that
-result folders can be shared.
+The description is plain data. It contains no host names, user names or absolute paths,
+so that result folders can be shared.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.registry import PluginFile
 
-#: Packages that affect every measurement, whatever the solver.
+#: Packages whose versions may affect the measurements of all solvers.
 PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
 
 THREAD_VARIABLES = (
@@ -36,23 +36,24 @@ THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
 )  # fmt: skip
 
-#: Libraries that contain a BLAS. The plain name is last: wrappers of an optimised BLAS
-#: have that name as well.
+#: Beginnings of the file names of libraries that contain a BLAS. libblas is last, since
+#: wrappers of an optimised BLAS have the same name as the reference BLAS.
 BLAS_LIBRARIES = (
     ("libopenblas", "OpenBLAS"), ("libmkl", "MKL"), ("libblis", "BLIS"),
     ("libflexiblas", "FlexiBLAS"), ("libatlas", "ATLAS"), ("libsatlas", "ATLAS"),
     ("libblas", "reference BLAS"),
 )  # fmt: skip
-#: owners of the libraries whose thread pools our code may use
+#: owners of libraries whose thread pools the code of mortarbench may use: the operating
+#: system, or the wheel of a package
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
 CHOLMOD_OWNERS = (
     "system",
     "scikit_sparse",
 )  #: owners of libraries that CHOLMOD may use
 
-VOLATILE = ("now",)  #: parts of an environment that its digest excludes
+VOLATILE = ("now",)  #: keys of an environment that its digest excludes
 
-#: folders of the code in a checkout
+#: folders of a checkout that contain code
 _CODE = ("harness", "problems", "solvers", "reports", "mortarbench")
 _CPU = Path("/sys/devices/system/cpu")
 _CGROUP = Path("/sys/fs/cgroup")
@@ -63,17 +64,17 @@ def capture(
 ) -> dict[str, Any]:
     """Describe the environment of this process as nested plain data.
 
-    Entries that cannot be read are None. The threads refer to the calling process;
-    use `capture_in` for those of a worker.
+    Values that cannot be read are None. The entries on threads describe the calling
+    process; `capture_in` returns those of a worker.
 
-    plugins : files of plug-ins, whose code is measured along with ours
-    packages : additional packages, of solvers, whose versions are recorded
+    plugins : plug-in files, of whose code digests are included
+    packages : packages of solvers whose versions are included
     """
-    # threadpoolctl finds only libraries that are loaded
+    # import these, since threadpoolctl finds only libraries that are loaded
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
-    # plug-ins or a notebook may have loaded other libraries: filter by owner
+    # filter by owner, since plug-ins or a notebook may have loaded other libraries
     pools = sorted(
         (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
         key=lambda p: (p["library"], p["owner"]),
@@ -95,7 +96,7 @@ def capture(
             "kernel": platform.release(),
             "libc": " ".join(platform.libc_ver()).strip() or None,
             "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-            "governor": ", ".join(sorted(governors)) or None,  # that of each CPU
+            "governor": ", ".join(sorted(governors)) or None,  # of all CPUs
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
         },
@@ -126,10 +127,10 @@ def capture_in(
     plugins: Iterable[str | Path | PluginFile] = (),
     packages: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Describe the environment of a new process, with environment variables set.
+    """Describe the environment of a new process with the given environment variables.
 
-    A new process is needed because libraries read their thread variables once, when
-    they are loaded.
+    A new process is needed, since libraries read their thread variables only when they
+    are loaded.
     """
     program = (
         "import json, sys, mortarbench.harness.environment.environment as e; "
@@ -149,15 +150,16 @@ def capture_in(
 
 
 def packages_of(environment: Mapping[str, Any]) -> list[str]:
-    """Return the packages of solvers whose versions an environment contains."""
+    """Return the names of the solvers' packages in the versions of an environment."""
     common = ("python", *PACKAGES)
     return [name for name in environment.get("versions", ()) if name not in common]
 
 
 def digest(environment: Mapping[str, Any]) -> str:
-    """Return 12 hex digits that identify an environment, ignoring load and free memory.
+    """Return 12 hexadecimal digits that identify an environment.
 
-    Times of environments with equal digests may be compared.
+    Load and free memory do not affect the digest. Times may be compared if the digests
+    of their environments are equal.
     """
     lasting = {k: v for k, v in environment.items() if k not in VOLATILE}
     canonical = json.dumps(lasting, sort_keys=True, separators=(",", ":"))
@@ -165,15 +167,15 @@ def digest(environment: Mapping[str, Any]) -> str:
 
 
 def source(root: Path) -> dict[str, Any] | None:
-    """Identify the code of a checkout; return None outside of one.
+    """Identify the code of a checkout; return None if `root` is not a checkout.
 
     Returns
     -------
     a dict with
-    commit : the full hash
-    dirty : True if code differs from the commit
-    changes : 12 hex digits, a digest of the differences and of new Python files; None
-        if there are none
+    commit : full hash of the commit
+    dirty : True if the code differs from the commit
+    changes : digest, 12 hexadecimal digits, of the differences and of new Python files;
+        None if the code does not differ
 
     """
 
@@ -199,7 +201,7 @@ def source(root: Path) -> dict[str, Any] | None:
 
 
 def mapped_libraries() -> list[str]:
-    """List the files that this process has mapped; [] if /proc cannot be read."""
+    """Return the paths of the files mapped by this process; [] if unknown."""
     lines = _read(Path("/proc/self/maps")).splitlines()
     return sorted({line.split(maxsplit=5)[5] for line in lines if " /" in line})
 
@@ -209,12 +211,12 @@ def system_blas(
 ) -> str | None:
     """Return the BLAS that CHOLMOD uses, such as "OpenBLAS 0.3.21 (pthreads)".
 
-    CHOLMOD does not call the BLAS in other packages' wheels: libraries in site-packages
-    are ignored, except those of scikit-sparse. A system library libblas is the
-    reference BLAS only if no optimised one is loaded: in Debian's alternatives system,
-    libblas.so.3 can be a wrapper of OpenBLAS or MKL.
+    Since CHOLMOD does not call a BLAS in the wheel of another package, libraries in
+    site-packages are ignored, except those of scikit-sparse. A system library libblas
+    is the reference BLAS only if no optimised BLAS is loaded: in the alternatives
+    system of Debian, libblas.so.3 may be a wrapper of OpenBLAS or MKL.
 
-    mapped : absolute paths, as in /proc/self/maps
+    mapped : absolute paths of loaded libraries, see `mapped_libraries`
     pools : entries ``threads.pools`` of `capture`
     """
     names = {Path(file).name for file in mapped if not _in_foreign_wheel(file)}
@@ -229,7 +231,10 @@ def system_blas(
 
 
 def cholmod_version(mapped: Iterable[str]) -> str | None:
-    """Return the version of CHOLMOD, from the file name of its library."""
+    """Return the version of CHOLMOD from the file name of its library, or None.
+
+    mapped : absolute paths of loaded libraries, see `mapped_libraries`
+    """
     for path in mapped:
         if name := re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", path):
             return name[1]
@@ -244,7 +249,7 @@ def _in_foreign_wheel(path: str) -> bool:
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a threadpoolctl record that are not paths."""
+    """Return a record of threadpoolctl without paths; the owner replaces the path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],
@@ -264,7 +269,10 @@ def _version(package: str) -> str | None:
 
 
 def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
-    """Return digests of the code of plug-ins, by name; equal names share one."""
+    """Return digests of the code of plug-ins by name.
+
+    If several files have the same name, the result contains a digest of all of them.
+    """
     contents: dict[str, list[bytes]] = defaultdict(list)
     for file in files:
         contents[file.name].extend(file.content())
@@ -274,7 +282,7 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
 def _cpu_limit() -> float | None:
     """Return the container's CPU limit, in cores; None if unlimited or unknown."""
     quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
-    if not quota:  # the older layout of control groups
+    if not quota:  # version 1 of control groups
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
         period = _read(_CGROUP / "cpu/cpu.cfs_period_us")
     return int(quota) / int(period) if quota.isdigit() and period.isdigit() else None
@@ -288,7 +296,7 @@ def _turbo() -> bool | None:
 
 
 def _meminfo(key: str) -> int | None:
-    """Return an entry of /proc/meminfo, in MiB; None if it is missing."""
+    """Return the value of an entry of /proc/meminfo in MiB; None if it is missing."""
     entry = re.search(rf"^{key}:\s+(\d+) kB", _read(Path("/proc/meminfo")), re.M)
     return int(entry[1]) // 1024 if entry else None
 

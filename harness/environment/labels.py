@@ -1,4 +1,4 @@
-"""Readable names for the entries of an environment, and sentences on differences."""
+"""Readable names for entries of an environment, and texts on their differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mortarbench.harness.errors import shortened
 Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 
 _MAX_VALUE_CHARACTERS = 48
-_MAX_LISTED = 3  #: number of differences that are spelt out
+_MAX_LISTED = 3  #: largest number of differences that are described in words
 
 _NAMES = {
     "machine.cpu": "processor",
@@ -35,7 +35,7 @@ _NAMES = {
     "plugins": "plug-ins",
     "threads.pools": "libraries with threads",
     "cholmod.version": "version of CHOLMOD",
-    "cholmod.blas": "BLAS behind CHOLMOD",
+    "cholmod.blas": "BLAS used by CHOLMOD",
 }
 _GROUPS = {
     "versions.": "version of {}",
@@ -60,7 +60,8 @@ def named(key: str) -> str:
 def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
     """Describe the first few differences in words, and count the others.
 
-    one, other : words that distinguish the two values, such as "then" and "now"
+    changes : differences between two environments
+    one, other : words for the two environments, such as "then" and "now"
 
     >>> in_words([("machine.kernel", "6.1", "6.2")], "then", "now")
     'kernel: 6.1 then, 6.2 now'

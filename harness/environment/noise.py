@@ -1,7 +1,8 @@
-"""Noise floor of a machine, by an A/A comparison.
+"""Noise floor of a machine, determined by an A/A comparison.
 
-A fixed kernel is timed against itself in pairs, just as solvers are compared in blocks.
-A difference between two solvers that is smaller than this noise is not significant.
+The two times of a pair are measured with the same kernel, one after the other, just as
+solvers are compared within blocks. A difference between two solvers is not significant
+if it is smaller than the differences within such pairs.
 """
 
 from __future__ import annotations
@@ -16,36 +17,37 @@ from math import exp
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-_SIDE = 120  #: nodes per side of the kernel's square grid; 14 400 rows
-_PRODUCTS = 10  #: matrix-vector products per timing, about 1 ms
+_SIDE = 120  #: nodes per side of a square grid, whose matrix has 14 400 rows
+_PRODUCTS = 10  #: number of matrix-vector products in a timed call, about 1 ms
 _BLOCKS = 20  #: number of blocks of consecutive pairs in the bootstrap
-_DRAWS = 1000  #: bootstrap samples
+_DRAWS = 1000  #: number of bootstrap samples
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseFloor:
-    """Result of an A/A comparison; ratios are times of arm A over those of arm B."""
+    """Result of an A/A comparison, in which arms A and B run the same kernel."""
 
     clock_seconds: float  #: smallest observed step of the clock
     kernel_seconds: float  #: median time of the kernel
-    pairs: int  #: number of pairs
-    ratio: float  #: exp of the median log ratio of pairs; 1 without noise
-    low: float  #: lower end of the ratio's 95 % bootstrap interval
-    high: float  #: upper end
-    one_pair: float  #: relative difference that 95 % of the single pairs do not exceed
+    pairs: int  #: number of pairs of times
+    ratio: float  #: median ratio of the times of arm A to those of arm B
+    low: float  #: lower end of the 95 % bootstrap interval of `ratio`
+    high: float  #: upper end of this interval
+    one_pair: float  #: relative difference that 95 % of single pairs do not exceed
 
 
 def noise_floor(
     seconds: float = 2.0, clock: Callable[[], float] = time.perf_counter
 ) -> NoiseFloor:
-    """Time a kernel against itself, on the CPU of the workers of a run.
+    """Compare the times of a kernel with each other, on the CPU of a run's workers.
 
-    Pairs are run as AB, BA, AB, …, and two successive pairs are averaged, so that a
-    linear drift of the machine cancels. The bootstrap resamples blocks of consecutive
-    pairs instead of single pairs, because disturbances last longer than one pair.
+    Pairs are measured in the order AB, BA, AB, …, and the log ratios of two successive
+    pairs are averaged, so that a linear drift of the machine cancels. The bootstrap
+    resamples blocks of consecutive pairs instead of single pairs, since disturbances
+    last longer than one pair.
 
-    seconds : duration of the comparison, by `clock`
-    clock : returns seconds
+    seconds : duration of the comparison, measured with `clock`
+    clock : function that returns the time in s
     """
     with _on_the_workers_cpu():
         one = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(_SIDE, _SIDE))
@@ -59,7 +61,7 @@ def noise_floor(
                 v /= np.abs(v).max()
             return clock() - start
 
-        timed()  # discarded, since caches are cold
+        timed()  # discard the first time, for which caches are cold
         arms: tuple[list[float], list[float]] = ([], [])
         end = clock() + seconds
         while clock() < end or not arms[0]:
@@ -87,7 +89,7 @@ def noise_floor(
 
 @contextmanager
 def _on_the_workers_cpu() -> Iterator[None]:
-    """Run on the last CPU, to which `harness.processes.supervisor` binds workers."""
+    """Run the block on the last CPU, to which `harness.processes` binds workers."""
     usable = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(usable)})
     try:
@@ -97,7 +99,7 @@ def _on_the_workers_cpu() -> Iterator[None]:
 
 
 def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:
-    """Return the smallest non-zero step between consecutive readings of a clock."""
+    """Return the smallest nonzero difference of consecutive readings of a clock."""
     readings = np.array([clock() for _ in range(tries)])
     steps = np.diff(readings)
     return float(steps[steps > 0].min(initial=np.inf))

@@ -1,9 +1,9 @@
 """Faults of the harness or the machine, in ``FOLDER/faults.jsonl``.
 
-A fault prevents a measurement and implies nothing about the solver, so it is not
-written to the journal. Each fault is one line, in the format of the journal. The
-measurement counts as missing until the journal contains it, and the same command
-retries it.
+A fault prevents a measurement, but implies nothing about the solver. Faults are
+therefore not written to the journal, but to this file, a JSON object on each line. The
+measurement counts as missing until it is in the journal. If the same run command is
+given again, missing measurements are repeated.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ _TYPES: dict[str, type] = {
 class Fault:
     """A failure of the harness or the machine that prevented a measurement once."""
 
-    time: str  #: UTC, ISO 8601
+    time: str  #: time of the fault, UTC, ISO 8601
     run_id: str  #: run_id of the prevented measurement
     case: str  #: canonical name
     solver: str  #: label of the solver
     what: str  #: reason, one line
-    tried_again: bool  #: True if the same run retried at once, False if it gave up
+    tried_again: bool  #: True if the same run then repeated the measurement
 
     def to_json(self) -> str:
-        """Serialise to one line."""
+        """Return the fault as one line of JSON."""
         return json.dumps(asdict(self))
 
 
 def read_faults(folder: Path) -> list[Fault]:
-    """Read the faults of a result folder; return [] if there is no such file.
+    """Read the faults of a result folder; return [] if it contains no file of faults.
 
     Raises
     ------
     InputError
-        If a line other than a partial last one is damaged, or if
+        If a line is damaged, unless it is the last line and incomplete, or if
         `harness.files.lines.read_lines` refuses the file.
 
     """
@@ -66,7 +66,7 @@ def read_faults(folder: Path) -> list[Fault]:
 def remaining_faults(faults: Iterable[Fault], measured: Iterable[str]) -> list[Fault]:
     """Return the last fault of each measurement that is still missing.
 
-    measured : run_ids of the measurements in the journal
+    measured : run_ids of the measurements that are in the journal
     """
     last = {fault.run_id: fault for fault in faults}
     for run_id in measured:
@@ -75,7 +75,7 @@ def remaining_faults(faults: Iterable[Fault], measured: Iterable[str]) -> list[F
 
 
 def in_words(faults: Iterable[Fault]) -> str:
-    """Return a sentence with the number of faults and their reasons; "" for none."""
+    """Return a sentence with the number of faults and their reasons, or ""."""
     faults = list(faults)
     if not faults:
         return ""

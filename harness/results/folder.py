@@ -1,4 +1,4 @@
-"""Result folder: locked by one run at a time, for one suite and one environment."""
+"""Result folder, which is locked by a run and has one suite and one environment."""
 
 from __future__ import annotations
 
@@ -33,18 +33,19 @@ from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, read_stored
 
-#: everything that a run and its evaluations write; `fresh` deletes these, nothing else
+#: Folders and files that commands write to a result folder; ``--fresh`` deletes or
+#: overwrites these, and nothing else.
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-#: file written by `mortarbench validate`, and file of the faults of runs
+#: results of `mortarbench validate`, and faults of runs
 _RESULT_FILES = ("validation.json", FAULTS)
 REMEDY = "choose another --out or use --fresh"
-MAX_FOLDER_DEPTH = 30  #: levels accepted in a result folder; runs write three
+MAX_FOLDER_DEPTH = 30  #: largest depth of nested folders; runs write three levels
 _LOCK = ".lock"
 _LOCK_CONTENT = b"held by runs of mortarbench\n"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
-#: beginnings of the names of files that are written beside the folders
+#: beginnings of the names of files in the result folder itself
 _FILE_PREFIXES = (
     _LOCK,
     FAULTS,
@@ -58,15 +59,15 @@ _FILE_PREFIXES = (
 def refuse_links(folder: Path) -> None:
     """Refuse a result folder that contains links, pipes, devices or too deep nesting.
 
-    The folder may come from anyone. Through a link, files elsewhere would be
-    overwritten or deleted; opening a pipe would block for ever; deeply nested folders
-    would exhaust any recursion.
+    The folder may come from an untrusted source. Through a link, files elsewhere could
+    be overwritten or deleted; opening a pipe could block for ever; deeply nested
+    folders could cause a stack overflow.
 
     Raises
     ------
     InputError
-        If there is a link, device or pipe, a folder that is nested too deeply, or one
-        that cannot be listed; the message names the first.
+        If there is a link, a device or a pipe, or a folder that is nested too deeply or
+        cannot be listed; the message names the first of these.
 
     """
     try:
@@ -88,7 +89,7 @@ def refuse_links(folder: Path) -> None:
 
 
 def _only_plain(folder: str) -> None:
-    """Refuse links, pipes and devices in a folder, and folders nested too deeply."""
+    """Raise `InputError` for links, pipes, devices and too deeply nested folders."""
     level = [folder]
     for _ in range(MAX_FOLDER_DEPTH):
         inner = []
@@ -108,9 +109,9 @@ def _only_plain(folder: str) -> None:
 
 
 def _only_plain_copies(folder: os.DirEntry[str]) -> None:
-    """Refuse links, pipes and devices among copies of files.
+    """Raise `InputError` for links, pipes and devices among copies of input files.
 
-    The folder may be a user's own of the same name, so other files in it are ignored.
+    Other entries are ignored, since a user may have a folder of the same name.
     """
     if folder.is_symlink():
         raise _not_plain(folder.path, "a folder of its own")
@@ -138,13 +139,13 @@ def _not_plain(path: str, expected: str) -> InputError:
 
 
 def refuse_foreign(folder: Path) -> None:
-    """Refuse a folder in which a run would overwrite or delete files of others.
+    """Refuse a folder in which a run would overwrite or delete files of the user.
 
     Raises
     ------
     InputError
-        If it contains a link, or if no run has written it but it contains files with
-        names that runs use.
+        If `refuse_links` refuses the folder, or if the folder is not a result folder
+        and contains files with names that runs use.
 
     """
     if folder.is_dir():
@@ -154,7 +155,7 @@ def refuse_foreign(folder: Path) -> None:
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
     with suppress(InputError), opened(folder / _LOCK) as lock:
-        # left by a run that was killed before it wrote anything else
+        # a run that was killed at once leaves nothing but its lock
         if lock.read(len(_LOCK_CONTENT) + 1) == _LOCK_CONTENT:
             return
     ours = (*_FOLDERS, *_FILES, *_RESULT_FILES)
@@ -167,14 +168,14 @@ def refuse_foreign(folder: Path) -> None:
 
 
 class FolderLock:
-    """Lock of a result folder against every other run.
+    """Exclusive lock of a result folder.
 
     Raises
     ------
     InputError
-        If another run has locked it.
+        If another run has locked the folder.
     OSError
-        If it cannot be created or written.
+        If the folder cannot be created or written.
 
     """
 
@@ -183,14 +184,14 @@ class FolderLock:
         self._take()
 
     def is_there(self) -> bool:
-        """Return True if the path still leads to the locked folder, False if deleted.
+        """Return True if the folder still exists, False if it had been deleted.
 
-        A deleted folder, or a deleted lock, is created and locked again.
+        If the folder or its lock was deleted, it is created and locked again.
 
         Raises
         ------
         InputError
-            If the folder was moved, or another run locked it meanwhile.
+            If the folder was moved, or if another run has locked a new one.
 
         """
         is_there = _is_same_file(self._folder, self._folder_fd)
@@ -221,14 +222,14 @@ class FolderLock:
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[FolderLock]:
-    """Lock a result folder against every other run, creating it if necessary.
+    """Lock a result folder within the block; create the folder if necessary.
 
-    Unfinished files of writers that were killed are deleted.
+    Unfinished files that killed runs left in the folder are deleted.
 
     Raises
     ------
     InputError
-        If another run has locked it, or it cannot be written.
+        If another run has locked the folder, or the folder cannot be written.
 
     """
     try:
@@ -239,7 +240,7 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        # only now: while another run had the lock, these files were not left over
+        # only after locking, since another run may still have been writing these files
         folders = [folder / name for name in _FOLDERS]
         remove_unfinished(folder, folders, shared=[folder / COPIES])
         yield lock
@@ -250,16 +251,16 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
 def _open_lock(folder: Path) -> int:
     """Lock a folder until the returned file descriptor is closed.
 
-    The content of the lock file marks the folder as one of ours: a run that was killed
-    at once leaves nothing else by which it could be recognised.
+    The content of the lock file identifies a result folder, even if the run is killed
+    before it has written any other file.
     """
-    # if the lock were a link, a file elsewhere would be overwritten
+    # O_NOFOLLOW: if the lock were a link, a file elsewhere would be overwritten
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:  # until the locked file is the one at the path
+    while True:  # until the file at the path is the locked file
         fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # without this, the lock would be on a file deleted between open and flock
+            # the file may have been deleted between open and flock
             if _is_same_file(folder / _LOCK, fd):
                 os.pwrite(fd, _LOCK_CONTENT, 0)
                 return fd
@@ -275,7 +276,7 @@ def _open_lock(folder: Path) -> int:
 
 
 def _is_same_file(path: Path, fd: int) -> bool:
-    """Return True if a path leads to an open file or folder."""
+    """Return True if a path leads to the open file or folder of a descriptor."""
     try:
         return os.path.samestat(path.stat(), os.fstat(fd))
     except FileNotFoundError:
@@ -284,9 +285,10 @@ def _is_same_file(path: Path, fd: int) -> bool:
 
 @contextmanager
 def scratch_in(folder: Path) -> Iterator[Path]:
-    """Create a temporary folder in a locked result folder, for the duration of a run.
+    """Create a temporary folder in a locked result folder, for use within the block.
 
-    Files that a killed run left there are deleted first.
+    The temporary folder is deleted after the block. If a killed run left such a folder,
+    it is deleted first.
     """
     scratch = folder / _SCRATCH
     shutil.rmtree(scratch, ignore_errors=True)
@@ -300,10 +302,11 @@ def scratch_in(folder: Path) -> Iterator[Path]:
 def claim(
     out: Path, suite: Suite, environment: Mapping[str, Any], *, fresh: bool
 ) -> None:
-    """Assign a locked folder to a suite and an environment.
+    """Write suite and environment to a locked folder, for a run.
 
     environment : environment, with its digest under the key ``digest``
-    fresh : delete the previous content first; without it, call `refuse_other` before
+    fresh : True to delete previous results first; if False, the caller must have called
+        `refuse_other`
     """
     if fresh:
         for name in _FOLDERS:
@@ -315,25 +318,31 @@ def claim(
 
 
 def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
-    """Write the suite and the environment; `environment` as for `claim`."""
+    """Write the suite and the environment to a locked folder.
+
+    environment : environment, with its digest under the key ``digest``
+    """
     replace_file(out / "suite.toml", suite.text.encode())
     text = json.dumps(environment, indent=1) + "\n"
     replace_file(out / "environment.json", text.encode())
 
 
 def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
-    """Refuse a folder of another suite or environment.
+    """Check that a folder belongs to this suite and environment.
 
-    environment : see `claim`
+    The suite may have been extended, see `harness.suite.growth`.
+
+    environment : environment, with its digest under the key ``digest``
 
     Returns
     -------
-    True if the suite has changed, which it may only by asking for more
+    True if the suite has been extended
 
     Raises
     ------
     InputError
-        If they differ; the message names the difference and the remedy.
+        If the suite has changed in another way, or the environment differs; the message
+        states the difference and a remedy.
 
     """
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
@@ -363,7 +372,7 @@ def suite_text(folder: Path) -> str:
     Raises
     ------
     InputError
-        If the file is missing, or not a suite.
+        If the file is missing, or is not a suite.
 
     """
     path = folder / "suite.toml"
@@ -372,15 +381,17 @@ def suite_text(folder: Path) -> str:
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:
-    """Read the environment of a digest from a result folder.
+    """Read the environment with a given digest from a result folder.
 
     Raises
     ------
     InputError
-        If the folder does not contain it, or the digest or the file is malformed.
+        If the folder does not contain the environment, or if the digest or a file is
+        malformed.
 
     """
-    if not _DIGEST.fullmatch(digest):  # as a path it could lead out of the folder
+    # check first, since the digest is part of a path, which might leave the folder
+    if not _DIGEST.fullmatch(digest):
         raise InputError(
             f"{folder}: {shortened(digest)!r} is not the digest of an environment"
         )
@@ -391,7 +402,7 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
 
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
-    """Store the environment of one machine of a cluster under its digest."""
+    """Store an environment, such as that of a cluster node, under its digest."""
     text = json.dumps({"digest": digest, **environment}, indent=1) + "\n"
     replace_file(_node_file(folder, digest), text.encode())
 
@@ -403,9 +414,9 @@ def _node_file(folder: Path, digest: str) -> Path:
 def differences(
     old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the differences between the lasting parts of two environments.
+    """Yield the differences between two environments, except load and free memory.
 
-    Each is (dotted key, old value, new value); a missing value is None.
+    A difference is (dotted key, old value, new value); a missing value is None.
     """
     for key in sorted((old.keys() | new.keys()) - {"digest", *VOLATILE}):
         a, b = old.get(key), new.get(key)
@@ -418,7 +429,8 @@ def differences(
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Return True if the environments agree in everything that can affect times.
 
-    A plug-in that only one of them has does not affect measurements that both can make.
+    A plug-in that occurs in only one of the environments is ignored, since it does not
+    affect measurements that are possible in both.
     """
     return all(
         key.startswith("plugins.") and None in values

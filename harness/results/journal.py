@@ -1,7 +1,7 @@
 """Journal of a result folder: append-only, with one fsynced line per measurement.
 
-A process may die at any instant. It then leaves whole lines and at most one partial
-line at the end; readers ignore that, and the next writer truncates it.
+If a process is killed while it writes, the journal ends with a partial line. Readers
+ignore this line, and the next writer removes it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from mortarbench.harness.results.folder import refuse_links
 class Journal:
     """Writer of a file ``FOLDER/journal/NAME.jsonl``.
 
-    Hold `harness.results.folder.lock_folder` while one is open: a second writer could
-    truncate a line that this one is writing. The other files of the journal are kept
-    open as well, so that files which are deleted meanwhile can be restored.
+    The folder must be locked by `harness.results.folder.lock_folder` while the writer
+    is open: a second writer could truncate a line that this one is writing. All files
+    of the journal are kept open, so that a file that is deleted meanwhile can be
+    restored.
 
-    restored : receives a message, one line, when a file was restored
+    restored : called with a message of one line if a file was restored
     """
 
     def __init__(
@@ -43,7 +44,9 @@ class Journal:
         )
 
     def append(self, record: Record) -> None:
-        """Append one line, and return when it is on the disk; write none on an error.
+        """Append a record, and return when its line is on the disk.
+
+        If an error occurs, the journal does not change.
 
         Raises
         ------
@@ -80,17 +83,17 @@ def read_journal(
 ) -> list[Record]:
     """Read all records of a result folder, in the order of file names and lines.
 
-    Every run_id occurs once: a line that equals an earlier one in all fields is
-    skipped. Equal strings and tables of different records share memory.
+    Every run_id occurs once: a line is skipped if its record equals an earlier one.
+    Equal strings and tables of different records are stored once.
 
-    tell : receives a message, one line, with the number of skipped lines
+    tell : called with a message of one line if lines are skipped
 
     Raises
     ------
     InputError
-        If the folder or its journal is missing, or the folder contains a link; if a
-        line other than a partial last one is damaged; or if two different lines have
-        the same run_id.
+        If the folder or its journal is missing; if the folder contains a link; if a
+        line is damaged, unless it is the last line and incomplete; or if two different
+        records have the same run_id.
 
     """
     if not os.path.isdir(folder):
@@ -132,7 +135,7 @@ def read_journal(
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:
-    """Yield the records of one file, with their line numbers."""
+    """Yield the line number and the record of each line of a file."""
     shared: dict[Any, Any] = {}
     for number, line in enumerate(read_lines(path, "a journal"), 1):
         try:

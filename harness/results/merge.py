@@ -1,11 +1,13 @@
-"""Merging of result folders: every measurement once, environments kept apart.
+"""Merging of result folders, in which measurements of all environments are kept.
 
 A measurement is identified by its run_id and its environment. If two folders contain
-the same measurement, that of the first folder is kept. Measurements with one run_id in
-different environments are all kept; later ones get a new run_id, a digest of both.
+the same measurement, that of the first folder is kept. Measurements with equal run_ids
+but different environments are all kept; each later one gets a new run_id, a digest of
+its run_id and its environment.
 
-The journal of the new folder is written last, as a whole. Until then nothing counts as
-part of the folder, so that the same command repeats a merge that was killed.
+The journal of the new folder is written last, in a single step. Without a journal, the
+folder contains no measurements. If a merge was killed, the same command can therefore
+be given again.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_DUPLICATES_NOTE = "are there already, and count once"
+_DUPLICATES_NOTE = "measurements are already present, and count once"
 JOURNAL = "merged"  #: name of the only journal of a merged folder
 
 
@@ -49,8 +51,8 @@ class _Union:
 
     def add(self, record: Record) -> bool:
         """Add a measurement; return True if it was present already."""
-        # Content first: a record that an earlier merge gave a new run_id is recognised
-        # when its source is merged again.
+        # Compare the content first, since an earlier merge may have added the same
+        # record with a new run_id.
         content = hex_digest([record.replace(run_id="").to_json().encode()], 32)
         if content in self._contents:
             return True
@@ -72,9 +74,9 @@ class _Union:
 def merge(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None] = lambda _: None
 ) -> list[Record]:
-    """Merge result folders into a new one, or into one that was merged before.
+    """Merge result folders into a new folder, or into the result of an earlier merge.
 
-    tell : receives messages, one line each, on duplicates and missing files
+    tell : called with messages of one line on duplicates and missing files
 
     Returns
     -------
@@ -83,10 +85,10 @@ def merge(
     Raises
     ------
     InputError
-        If a folder contains no measurements, or a link; if the suites differ in
-        settings that measurements depend on; if `out` is one of the folders, lies in
-        one or contains one; if it contains a run or foreign files; or if its disk is
-        full. The journal of `out` is then unchanged.
+        If a source contains no measurements, or contains a link; if the suites differ
+        in settings on which measurements depend; if `out` is one of the sources, or
+        lies in one, or contains one; if `out` contains results of a run or files of the
+        user; or if the disk is full. The journal of `out` then does not change.
 
     """
     for source in sources:
@@ -128,10 +130,10 @@ def _journal(folder: Path) -> Path:
 
 
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
-    """Read a folder; records of old versions, without a session, get one.
+    """Read the records of a folder, and add a session to old records without one.
 
-    The session is a digest of the environment and of the start of the earliest
-    measurement among these records with that environment.
+    This session is a digest of the environment and of the earliest start of such a
+    record in that environment.
     """
     records = read_journal(source, tell)
     if not records:
@@ -153,7 +155,7 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
 
 
 def _refuse_nested(source: Path, out: Path) -> None:
-    """Refuse an `out` that is a source, lies in one, or contains one."""
+    """Raise `InputError` if `out` equals `source`, lies in it or contains it."""
     target, origin = out.resolve(), source.resolve()
     if target == origin:
         raise InputError(
@@ -168,7 +170,7 @@ def _refuse_nested(source: Path, out: Path) -> None:
 
 
 def _refuse_run(out: Path) -> None:
-    """Refuse to add to the folder of a run, as opposed to a merged one."""
+    """Raise `InputError` if `out` contains measurements of a run."""
     if not out.is_dir():
         return
     refuse_links(out)
@@ -197,7 +199,7 @@ def _copy_environments(
     records: Iterable[Record],
     tell: Callable[[str], None],
 ) -> None:
-    """Store every environment under its digest, the first also as environment.json."""
+    """Store the environments of all records, the first also as environment.json."""
     stored: list[Mapping[str, Any]] = []
     for digest in dict.fromkeys(r.environment for r in records):
         environment = _environment(folders, digest)

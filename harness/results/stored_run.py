@@ -1,4 +1,4 @@
-"""Stored measurements, with everything needed to repeat them or rebuild their case."""
+"""Access to stored measurements, in order to repeat them or to rebuild their case."""
 
 from __future__ import annotations
 
@@ -33,13 +33,14 @@ class StoredRun:
     """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    repeats: list[Record]  #: all repeats of its cell, including itself
-    #: case of the measurement; in a sequence, after the earlier steps
+    #: records that differ only in the repeat, including `record`
+    repeats: list[Record]
+    #: case of the measurement; for a sequence, preceded by the earlier steps
     cases: tuple[CaseId, ...]
     spec: SolverSpec
-    environment: Mapping[str, Any]
-    time_limit: float  #: s
-    memory_limit: float  #: MiB
+    environment: Mapping[str, Any]  #: environment in which it was measured
+    time_limit: float  #: time limit of a measurement, s
+    memory_limit: float  #: memory limit of a measurement, MiB
 
 
 def open_stored_run(
@@ -48,15 +49,15 @@ def open_stored_run(
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> StoredRun:
-    """Find a measurement, and resolve its case and solver in the current registries.
+    """Find a measurement, and look up its case and solver in the current registries.
 
     run_id : a run_id, or an unambiguous prefix of one
 
     Raises
     ------
     InputError
-        If there is no such measurement, if its family, its solver or one of their keys
-        is unknown or not loaded, or if a file of its case has changed.
+        If there is no such measurement; if its family or solver, or a key or option of
+        these, is unknown; or if the family refuses the values of the keys.
 
     """
     records = read_journal(folder)
@@ -89,7 +90,7 @@ def work_unit_of(
     solvers: Mapping[str, Solver],
     environment: str,
 ) -> WorkUnit:
-    """Return a block that repeats a stored measurement, as its last result.
+    """Return a work unit whose last measurement repeats a stored one.
 
     environment : digest of the current environment
     """
@@ -137,10 +138,10 @@ def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record
 
 
 def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
-    """Return the solver of a record's label, from the suite or the command line.
+    """Return the spec of the solver that a record's label denotes.
 
-    specs : solvers of the suite by label; a label that is not among them came from
-        ``--solver``, and is a name
+    specs : solvers of the suite by label. A label that is not among them was set by
+        ``--solver``, and is the name of a solver
     """
     name = record.solver
     for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):
@@ -155,7 +156,7 @@ def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
 def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
-    """Set the stored options that differ from the current defaults."""
+    """Return `spec` with the record's options that differ from current defaults."""
     default = replace(spec, options={})
     if spec.name not in solvers and f"{spec.name.rpartition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")
@@ -167,24 +168,24 @@ def _with_options(
 
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:
-    """Return the end of a message that names the plug-ins of a measurement, or ""."""
+    """Return a hint for a message that a measurement needs plug-ins, or ""."""
     plugins = environment.get("plugins")
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
-    return f"; it was measured with plug-ins, give {options}" if options else ""
+    return f"; it was measured with plug-ins: add {options}" if options else ""
 
 
 def rebuild(
     r: Record, folder: Path, families: Mapping[str, Family], reference: Reference
 ) -> Case:
-    """Build the case of a record.
+    """Build the case of a record again.
 
     Raises
     ------
     InputError
-        If its family is unknown or fails, or if its QP differs from that of the record.
-        QPs assembled by several ranks are not compared, because the digest of the
-        shares differs from that of the entire QP.
+        If the family is unknown or raises an exception, or if the digest of the QP
+        differs from that in the record. The digests are not compared if several ranks
+        assembled the QP, since their digest is computed in another way.
 
     """
     if r.family not in families:
@@ -196,7 +197,7 @@ def rebuild(
     name = assemble(families[r.family], r.params, r.form)
     try:
         case = name.build(reference)
-    except (Exception, SystemExit) as e:  # the family's code
+    except (Exception, SystemExit) as e:  # raised by code of the family
         raise InputError(unbuilt(r.case, e)) from None
     if r.qp is None or r.qp.startswith(DISTRIBUTED_DIGEST):
         return case

@@ -1,8 +1,9 @@
-"""Unit of work of a run, as plain data that can be sent to any process or machine.
+"""Blocks, the work units of a run, as plain data for any process or machine.
 
 In a block, every solver is measured once on one case at one tolerance, in random order.
-A drift of the machine then affects all solvers of a block alike, and they are compared
-within blocks. In a block of a sequence, every solver solves all steps once, in order.
+A drift of the machine then affects all solvers of a block in the same way. For this
+reason, solvers are compared within blocks. In a block of a sequence, every solver
+solves all steps once, in their order.
 """
 
 from __future__ import annotations
@@ -19,92 +20,98 @@ from mortarbench.harness.record import Record
 
 @dataclass(frozen=True, kw_only=True)
 class Commands:
-    """Command lines of the processes of a run, without the two pipes of each."""
+    """Command lines of the processes of a run, without the arguments for pipes."""
 
-    #: commands by label; they run `harness.processes.worker`
+    #: commands that run `harness.processes.worker`, by label of the solver
     solvers: Mapping[str, list[str]]
-    case_worker: list[str]  #: runs `harness.processes.case_worker`
-    #: True if all code in the solvers' processes is ours; ranks then judge answers
+    case_worker: list[str]  #: command that runs `harness.processes.case_worker`
+    #: True if the processes of solvers run no code of plug-ins; verdicts on distributed
+    #: QPs may then be computed in these processes
     own_code_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkUnit:
-    """A block: the measurements to be made, in order."""
+    """A block: measurements of all solvers on one case, or on one sequence."""
 
     number: int
-    #: one turn per solver, in the order of measurement: its records, to be completed,
-    #: one for the case or one for each step of the sequence
+    #: incomplete records of each solver, in the order of measurement: a single one for
+    #: a case, or one for each step of a sequence
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
-    #: Fields of a small case that a new process builds first, so that the time of its
-    #: next build excludes first calls. None: cases of earlier blocks may be reused
+    #: plain data of a small case. If it is set, a new process builds the small case and
+    #: then the case of the block, whose time then excludes the cost of first calls. If
+    #: it is None, a case that was built for an earlier block may be reused
     warm_up: Mapping[str, Any] | None = None
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """Names of its cases, in order."""
+        """Names of the cases of the block, in order."""
         return tuple(record.case for record in self.turns[0])
 
     @property
     def is_sequence(self) -> bool:
-        """True if solvers may use, in a step, data of the earlier steps."""
+        """True for a sequence, in which solvers may reuse results of earlier steps."""
         return self.turns[0][0].mode != "cold"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
-    """One measurement of a block."""
+    """Outcome of a measurement that was completed."""
 
     record: Record  #: complete except for the digests of `point` and `fields`
-    part: int = 0  #: part of its block; parts were not measured next to each other
-    point: Arrays | None = None  #: None if the solver returned none
-    fields: Arrays | None = None  #: deformed state, if it is to be stored
+    #: number of the part of the block, if its measurements were interrupted; only
+    #: measurements in the same part ran consecutively
+    part: int = 0
+    point: Arrays | None = None  #: None if the solver returned no point
+    fields: Arrays | None = None  #: deformed state; None if it is not to be stored
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuildFailure:
-    """Outcome of a block with a case that could not be built."""
+    """Outcome of a block whose case, or one of whose cases, could not be built."""
 
     block: WorkUnit
     reason: str  #: one line
-    trace: str = ""  #: traceback of the family's code
+    trace: str = ""  #: traceback of the exception, if raised by the family's code
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementFault:
     """Outcome of a measurement that the harness or the machine prevented."""
 
-    record: Record  #: record of the missing measurement
+    record: Record  #: incomplete record of the missing measurement
     reason: str  #: one line
-    tried_again: bool  #: True if another `MeasurementFault`, or a `Result`, follows
+    tried_again: bool  #: True if the measurement is repeated and has another outcome
 
 
 Outcome = Result | BuildFailure | MeasurementFault
 
 
 class Engine(Protocol):
-    """Executor of blocks, on this machine one by one, or elsewhere.
+    """Function that executes blocks, on this machine or on the nodes of a cluster.
 
-    An engine may take several blocks before it yields results, yield the outcomes of
-    several blocks in any order, and yield those of a lost block again. Blocks are
-    created when they are taken, and the stopping rule sees only earlier results. So an
-    engine should take as few as possible in advance.
+    An engine may take several blocks from the iterator before it yields outcomes, yield
+    outcomes of several blocks in any order, and yield those of a lost block again.
+    Since a block is created when it is taken, the decision whether more repeats are
+    needed can take into account only outcomes that were yielded before. An engine
+    should therefore take as few blocks as possible in advance.
     """
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Execute all of `blocks`."""
+        """Execute all `blocks`, and yield the outcomes of their measurements."""
 
 
 class EngineFactory(Protocol):
-    """Factory of the engine of a run."""
+    """Function that opens the engine of a run."""
 
     def __call__(
         self, commands: Commands, scratch: Path, cases: Path
     ) -> AbstractContextManager[Engine]:
-        """Open an engine.
+        """Return a context manager that opens an engine, and closes it at the end.
 
+        commands : command lines of the processes that the engine starts
         scratch : temporary folder that exists for the duration of the run
         cases : folder of built cases, see `harness.processes.case_folder`
         """

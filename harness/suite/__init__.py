@@ -1,1 +1,1 @@
-"""Suites: TOML files that specify measurements."""
+"""Suites: TOML files that specify the cases, solvers and settings of a run."""

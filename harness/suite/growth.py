@@ -1,9 +1,9 @@
-"""Permitted changes of a suite with a result folder, and unions of suites.
+"""Permitted changes of a suite that has a result folder, and unions of suites.
 
-A suite may only be extended: solvers, cases and tolerances may be added, repeats
-raised, and a precision set or tightened. Limits, accuracy and the solver behind a label
-must not change, because the stored measurements depend on them. Suites that agree in
-these settings can be united.
+Such a suite may only be extended: solvers, cases and tolerances may be added, the
+number of repeats may be raised, and a precision may be set or tightened. Limits,
+accuracy, and the solver that belongs to a label must not change, since the stored
+measurements depend on them. Suites with equal settings of this kind can be united.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.suite.suite import DEFAULTS, suite_text
 
-#: settings that stored verdicts and times depend on
+#: settings that must not change, since stored verdicts and times depend on them
 FIXED_KEYS = ("time_limit", "memory_limit", "accuracy")
-GROWING_KEYS = ("repeats", "max_repeats", "budget")  #: may grow
+GROWING_KEYS = ("repeats", "max_repeats", "budget")  #: settings that may only grow
 
 _AND = "-and-"  #: separator of the names of united suites
 
@@ -25,9 +25,9 @@ Table = Mapping[str, Any]  #: content of a suite's TOML
 
 
 def incompatibility(old: Table, new: Table) -> str:
-    """Return a change that a suite may not make, or "" if it only asks for more.
+    """Return the first change that is not permitted, or "" if all changes are.
 
-    Cases are not compared here: `harness.running.run` compares them with the journal.
+    Cases are not compared: `harness.running.run` compares them with the journal.
     """
     both = {**DEFAULTS, **old}, {**DEFAULTS, **new}
     return next(chain(_settings(*both), _members(*both)), "")
@@ -41,7 +41,7 @@ def _settings(old: Table, new: Table) -> Iterator[str]:
         if new[key] < old[key]:
             yield f"{_change(key, old[key], new[key])}; it may only grow"
     finer = "it may only become finer"
-    # no precision at all counts as the loosest one, 1
+    # None counts as the loosest precision, 1
     if old["precision"] is not None and (new["precision"] or 1) > old["precision"]:
         yield f"{_change('precision', old['precision'], new['precision'])}; {finer}"
 
@@ -70,14 +70,14 @@ def _text(value: object) -> str:
 
 
 def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
-    """Return the union of suites: settings of the first, and the measurements of all.
+    """Return the union of suites: the settings of the first, the measurements of all.
 
-    tables : results of `harness.suite.suite.read_stored` by their folders
+    tables : results of `harness.suite.suite.read_stored` by folder
 
     Raises
     ------
     InputError
-        If two differ in a limit, in the accuracy, or in the solver behind a label.
+        If suites differ in a limit, in the accuracy, or in the solver of a label.
 
     """
     union: dict[str, Any] = {}
@@ -109,7 +109,7 @@ def _refuse_unequal(first: str, union: Table, folder: str, table: Table) -> None
 
 
 def _add(union: dict[str, Any], table: Table) -> None:
-    """Add the measurements of a suite to a union."""
+    """Add the measurements of a suite to the union, in place."""
     if not union:
         union |= table
         return
@@ -130,7 +130,7 @@ def _add(union: dict[str, Any], table: Table) -> None:
 
 
 def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
-    """Return name and options of a suite's solvers by label."""
+    """Return the name and the options of each solver of a suite by label."""
     entries = (
         entry if isinstance(entry, Mapping) else {"name": entry}
         for entry in table.get("solvers", ())
@@ -145,7 +145,7 @@ def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
 
 
 def as_toml(table: Table) -> str:
-    """Return a suite as TOML; nested tables are written on one line."""
+    """Return a suite as TOML, with nested tables on one line each."""
     blocks = table.get("problems", ())
     head = suite_text({k: v for k, v in table.items() if k != "problems"})
     return "\n[[problems]]\n".join([head, *map(suite_text, blocks)])

@@ -1,4 +1,4 @@
-"""Overrides of a suite by options of the command line."""
+"""Changes of a suite by options of the command line."""
 
 from __future__ import annotations
 
@@ -30,16 +30,19 @@ def with_overrides(
     memory_limit: float | None = None,
     options: Mapping[str, Sequence[str]] | None = None,
 ) -> Suite:
-    """Return a suite with the overrides of the command line.
+    """Return a suite changed by options of the command line.
 
-    solvers : labels of the suite to keep, or names of the registry to add
-    cases : cases to keep: names, or shell globs over canonical names
-    options : options of the solvers, as texts; several values are swept
+    solvers : labels of solvers to select from the suite, or names of solvers in the
+        registry to run instead; empty to keep all solvers of the suite
+    cases : names of cases to select, or shell globs over canonical names; empty to
+        keep all cases
+    options : values of solver options, as texts; there is a variant of each solver for
+        each of several values
 
     Raises
     ------
     InputError
-        If a solver is unknown, a pattern matches nothing, or a value is out of range.
+        If a solver is unknown, a pattern matches no case, or a value is out of range.
 
     """
     changes: dict[str, Any] = {}
@@ -52,8 +55,8 @@ def with_overrides(
                 with checked.located("--solver"):
                     resolve(chosen[name], {**resolved, **registry})
         selected = dict.fromkeys(solvers)
-        # keep the second copy of an A/A comparison if the first is selected: without
-        # it there is no ratio
+        # if a solver with an A/A comparison is selected, its second copy is needed for
+        # the ratio
         null = [
             name
             for name in chosen
@@ -71,9 +74,10 @@ def with_overrides(
     for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
         if limit is not None:
             changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
-            # Results depend on the limits, unlike on the choice of solvers, cases and
-            # repeats. So other limits make another suite, and its text must show them.
-            # In TOML, top-level keys come before those of any table.
+            # A suite with different limits counts as a different suite, since results
+            # depend on them; the stored text must therefore contain the limits. In
+            # contrast, results do not depend on the selection of solvers and cases. In
+            # TOML, top-level keys must precede all tables.
             line = f"{key} = {limit!r}"
             if key in toml(text):
                 old = rf"^[ \t]*{key}[ \t]*=.*$"
@@ -86,7 +90,7 @@ def with_overrides(
 def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
 ) -> dict[str, Any]:
-    """Return the cases that match a pattern, and the entire sequences of such cases."""
+    """Return the cases that match a pattern, and the sequences with such a case."""
     names = [case.name for case in suite.names]
     selected: set[str] = set()
     for pattern in patterns:

@@ -1,4 +1,4 @@
-"""Expansion of the ``problems`` of a suite into grids and sequences of cases."""
+"""Expansion of the ``problems`` of a suite into single cases and sequences of cases."""
 
 from __future__ import annotations
 
@@ -21,37 +21,39 @@ _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence", "growing")
 
 @dataclass(frozen=True)
 class Growth:
-    """Place of a case in a series of growing sizes."""
+    """Position of a case in a series of growing sizes."""
 
     smaller: str  #: name of the next smaller case of the series; empty for the smallest
-    warm_up: CaseId  #: the same case at the default size of its family
+    warm_up: CaseId  #: the same case with the default size of its family
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Problems:
     """All cases of a suite."""
 
-    cold: tuple[CaseId, ...]
-    sequences: tuple[tuple[CaseId, ...], ...]
-    growing: Mapping[str, Growth]  #: position of each case of a growing series, by name
+    cold: tuple[CaseId, ...]  #: cases that are solved without use of other cases
+    sequences: tuple[tuple[CaseId, ...], ...]  #: steps of each sequence, in order
+    growing: Mapping[str, Growth]  #: position of each case in a series of growing sizes
 
 
 def expand_problems(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Problems:
-    """Return all cold cases in the order of the suite, and all sequences of cases.
+    """Return all cases of a suite: single cases, sequences and series of growing sizes.
 
-    A case that occurs in two blocks is returned once. A sequence, like a series of
-    growing sizes, consists of the cases that differ only in its key and in the keys
-    zipped with that, in the order of their values.
+    A case that occurs in several blocks is returned once. The cases of a sequence, or
+    of a series of growing sizes, differ only in the key of the sequence or series, and
+    in keys that are zipped with this key. They are in the order of its values.
 
-    folder : folder of the suite; relative paths that do not exist are looked up there
-    most : largest number of cases of all blocks
+    blocks : value of ``problems`` in the suite
+    folder : folder of the suite, in which relative paths are searched if they do not
+        exist relative to the working directory
+    most : largest total number of cases
 
     Raises
     ------
     InputError
-        If a block is wrong or there are too many cases; the message names the place.
+        If a block is invalid or there are too many cases; the message names the block.
 
     """
     cold: dict[str, CaseId] = {}
@@ -83,16 +85,17 @@ def expand_problems(
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Block:
     cases: list[CaseId]
-    given: list[dict[str, object]]  #: keys of each case in the suite
-    kind: str  #: "sequence", "growing" or ""
-    along: tuple[str, ...]  #: keys of the sequence or series; empty if kind is ""
+    given: list[dict[str, object]]  #: keys that the suite sets, for each case
+    kind: str  #: "sequence", "growing" or, for single cases, ""
+    along: tuple[str, ...]  #: keys that vary in the sequence or series, else ()
 
 
 def _blocks(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Iterator[_Block]:
-    """Yield the blocks of the tables under ``problems``."""
-    count = 0  # of cases, checked before they are created: a grid may span billions
+    """Check the entries of ``problems``, and yield their cases as blocks."""
+    # number of cases, checked before they are created: a grid may span billions
+    count = 0
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
             table = checked.table("entry", block)
@@ -132,7 +135,7 @@ def _blocks(
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:
-    """Replace shell patterns among paths by the files that match, sorted."""
+    """Replace each shell pattern among paths by the matching files, sorted by name."""
     entries = paths if isinstance(paths, list) else [paths]
     if not any(_is_pattern(path, folder, family) for path in entries):
         return paths
@@ -146,7 +149,7 @@ def _expanded(paths: object, folder: Path, family: Family) -> object:
 
 
 def _is_pattern(path: object, folder: Path, family: Family) -> bool:
-    """Return True if a path has wildcards and is not the literal name of a file."""
+    """Return True if a path contains wildcards and no file has exactly this path."""
     if not isinstance(path, str) or not set("*?[") & set(path):
         return False
     if os.path.exists(path) or (folder / path).exists():
@@ -155,9 +158,10 @@ def _is_pattern(path: object, folder: Path, family: Family) -> bool:
 
 
 def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
-    """List matching files of the working directory, or else of the suite's folder.
+    """Return the files that match a pattern, relative to the working directory.
 
-    Files that are missing but have a copy in the result folder are included.
+    Files that are missing but have a copy in the result folder are included. If there
+    is no match, the pattern is taken as relative to the folder of the suite.
     """
     missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
     if paths := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
@@ -172,7 +176,7 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
 
 
 def _copied(pattern: str, family: Family) -> list[str]:
-    """List the paths with a copy in the result folder whose last parts match."""
+    """Return the paths of copies in the result folder whose last components match."""
     if not PurePath(pattern).parts:
         return []
     return [path for path in family.copied_paths() if PurePath(path).match(pattern)]
@@ -181,10 +185,11 @@ def _copied(pattern: str, family: Family) -> list[str]:
 def _located(
     point: dict[str, object], folder: Path, family: Family
 ) -> dict[str, object]:
-    """Interpret a path that does not exist as relative to the suite's folder.
+    """Return the keys of a case, with a path that leads to its file.
 
-    If the file is missing there as well, it may have a copy in the result folder, under
-    the path at the time of the run.
+    If the path does not exist relative to the working directory, it is taken as
+    relative to the folder of the suite. If the file is missing there as well, the path
+    is replaced by that of a copy in the result folder, if only one copy matches.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():
@@ -197,7 +202,7 @@ def _located(
 
 
 def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the kind of a block and its key, which must have several values."""
+    """Return the kind of a block and the key that varies; "", "" for single cases."""
     kinds = [kind for kind in ("sequence", "growing") if kind in table]
     if not kinds:
         return "", ""
@@ -217,7 +222,10 @@ def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, st
 
 
 def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:
-    """Return the axes of a grid, lists of dicts; zipped keys share one axis."""
+    """Return the axes of a grid; an axis is a list of dicts from keys to values.
+
+    Keys that are zipped belong to the same axis; any other key has its own axis.
+    """
     columns = {
         key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
         for key, v in table.items()
@@ -247,6 +255,6 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
 
 
 def _points(axes: Sequence[list[dict[str, object]]]) -> Iterator[dict[str, object]]:
-    """Yield the points of a grid; the first axis varies slowest."""
+    """Yield the points of a grid as dicts, with the first axis varying slowest."""
     for point in product(*axes):
         yield {k: v for part in point for k, v in part.items()}

@@ -1,7 +1,7 @@
 """Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
 
-A value is converted to the type that the solver declares for the option: the annotation
-of the dataclass field or, if that is not specific, the type of its default.
+A value is converted to the type of the option: the annotation of the dataclass field
+or, if there is none or it is Any or object, the type of the default.
 """
 
 from __future__ import annotations
@@ -30,17 +30,19 @@ _NUMBERS = {
     ),
 }  # stricter than int() and float(), which accept 1_0 and digits of other scripts
 _TRUTH = {"true": True, "false": False}
-_PLAIN = (bool, Real, str, NoneType)  #: types of values from a Python program
-_MAX_VARIANTS = 1000  #: variants of one solver in a sweep
+_PLAIN = (bool, Real, str, NoneType)  #: types of values that Python callers may pass
+_MAX_VARIANTS = 1000  #: largest number of variants of one solver in a sweep
 
 
 def parse_options(texts: Iterable[str]) -> dict[str, list[str]]:
-    """Split texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE``; repeated keys are joined.
+    """Parse texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE``, and return the values by key.
+
+    Values of a key that occurs in several texts are joined.
 
     Raises
     ------
     InputError
-        If a text has another form.
+        If a text does not have this form.
 
     >>> parse_options(["max_iter=50,100", "rho=0.1", "max_iter=200"])
     {'max_iter': ['50', '100', '200'], 'rho': ['0.1']}
@@ -58,12 +60,12 @@ def parse_options(texts: Iterable[str]) -> dict[str, list[str]]:
 
 
 def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Convert options of a Python program to texts, as on the command line.
+    """Convert options from a Python caller to texts, as on the command line.
 
     Raises
     ------
     InputError
-        If they are not a mapping from names to plain values or lists of these.
+        If `options` is not a mapping from names to plain values or lists of these.
 
     """
     if not isinstance(options, Mapping):
@@ -89,14 +91,15 @@ def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
 def options_for(
     name: str, texts: Iterable[str], registry: Mapping[str, Solver]
 ) -> dict[str, Any]:
-    """Return the options of one solver, with one value for each.
+    """Return the values of the options of one solver by key, from texts ``KEY=VALUE``.
 
     name : name of the solver in the registry
 
     Raises
     ------
     InputError
-        If an option has several values or is unknown, or the solver refuses its value.
+        If an option has several values, is unknown, or has a value that the solver
+        refuses.
 
     """
     options_of_texts = parse_options(texts)
@@ -120,17 +123,19 @@ def sweep(
     given: Mapping[str, Sequence[str]],
     registry: Mapping[str, Solver],
 ) -> tuple[SolverSpec, ...]:
-    """Return a variant of each solver for every combination of the options' values.
+    """Return a variant of each solver for every combination of option values.
 
-    Labels distinguish the variants, as in ``LABEL max_iter=50``. A solver that has only
-    some of the options is varied in these; one that has none is returned unchanged.
+    The label of a variant contains its values, as in ``LABEL max_iter=50``. If a solver
+    lacks some of the options, only the others are varied; if it lacks all of them, it
+    is returned unchanged.
 
     given : values by option
 
     Raises
     ------
     InputError
-        If no solver has one of the options, or a solver refuses a value of it.
+        If one of the options exists for no solver, or a solver refuses one of its
+        values.
 
     """
     if not given:
@@ -171,14 +176,17 @@ def _combinations(
 
 
 def _typed(name: str, solver: Solver, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Convert the texts of options to the types that a solver declares."""
+    """Convert the texts of options to the types of the solver's options.
+
+    name : name of the solver, for messages
+    """
     defaults, annotated = options_of(solver), option_types(solver)
     values = {}
     for key, text in texts.items():
         if key not in defaults:
             raise unknown("option", key, defaults, where=name)
         kind = annotated.get(key, type(defaults[key]))
-        if kind is NoneType:  # not annotated, and None by default
+        if kind is NoneType:  # without an annotation, a default of None has no type
             kind = bool | int | float | str
         readings = [*_readings(text, kind, defaults[key])]
         if not readings:
@@ -199,7 +207,7 @@ def with_options(label: str, options: Mapping[str, Any]) -> str:
 
 
 def without_options(label: str) -> Iterator[str]:
-    """Yield a label, then the same without its last option, and so on.
+    """Yield a label, then successively the label without its last options.
 
     >>> list(without_options("LABEL max_iter=50 scaling=true"))
     ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']
@@ -211,13 +219,13 @@ def without_options(label: str) -> Iterator[str]:
 
 
 def _text(value: object) -> str:
-    """Return a value as one word, which `_readings` converts back."""
+    """Return a value as a text without blanks, which `_readings` converts back."""
     match value:
         case None | bool():
             return str(value).lower()
-        case str():  # labels are split at blanks, see `without_options`
+        case str():  # replace blanks, at which `without_options` splits labels
             return "_".join(value.split())
-        case Integral():  # numpy's as well
+        case Integral():  # includes integers of NumPy
             return repr(int(value))
         case Real():
             return repr(float(value))
@@ -225,9 +233,9 @@ def _text(value: object) -> str:
 
 
 def _readings(text: str, kind: Any, default: object) -> Iterator[Any]:
-    """Yield the values of type `kind` that a text may stand for.
+    """Yield the values of type `kind` that a text may represent.
 
-    default : default of the option; "none" is accepted only if it is None
+    default : default of the option; if it is None, "none" represents None
     """
     if text == "none" and default is None:
         yield None

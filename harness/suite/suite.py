@@ -1,4 +1,4 @@
-"""Suites read from TOML: cases, solvers, repeats, limits and tolerances."""
+"""Suites in TOML: cases, solvers, repeats, limits and tolerances of a run."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ DEFAULTS: Mapping[str, Any] = {
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
-NULL_SUFFIX = " (A/A)"  #: end of the label of a solver's second copy, see `null_arm`
+#: End of the label of the second copy of a solver in an A/A comparison (``null_arm``).
+NULL_SUFFIX = " (A/A)"
 
 
 def _between(key: str, value: Any) -> float | None:
-    """Return None, or a number strictly between 0 and 1; refuse other values."""
+    """Check that `value` is None or strictly between 0 and 1, and return it."""
     if value is None:
         return None
     if not checked.is_number(value) or not 0 < value < 1:
@@ -51,7 +52,7 @@ def _between(key: str, value: Any) -> float | None:
     return float(value)
 
 
-#: checks of the keys that are numbers
+#: Functions that check the values of keys with a number.
 _NUMBERS: Mapping[str, Callable[[str, Any], float | None]] = {
     "repeats": checked.at_least_one,
     "time_limit": checked.positive,
@@ -68,15 +69,15 @@ def _most_cases(table: Mapping[str, Any]) -> int:
 
 
 class Group(NamedTuple):
-    """Cases of one block: a single case, or the steps of a sequence."""
+    """The cases of one block: a single case, or the steps of a sequence."""
 
     cases: tuple[CaseId, ...]
-    mode: str  #: mode of the records
+    mode: str  #: value of `harness.record.Record.mode` for these cases
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """Measurements of a run: every solver on every case at every tolerance."""
+    """A suite, which specifies a run: every solver on every case at every tolerance."""
 
     name: str
     tolerances: tuple[float, ...]
@@ -84,26 +85,27 @@ class Suite:
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
-    cases: tuple[CaseId, ...]  #: cases that are solved cold, all distinct
+    cases: tuple[CaseId, ...]  #: distinct cases that are solved without use of others
     text: str  #: TOML of the suite, with the limits that apply
-    #: sequences of cases, in the order of their steps
+    #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
-    #: place in a series of growing sizes, by name of the case
+    #: positions of cases in series of growing sizes, by name of the case
     growing: Mapping[str, Growth] = field(default_factory=dict)
-    #: values of θ (`harness.record.Record.tighten`); each sequence is solved with each
+    #: values of θ, see `harness.record.Record.tighten`; each sequence is solved once
+    #: for each value, and 0 stands for constant tolerances
     tighten: tuple[float, ...] = (0.0,)
-    #: relative half-width of every ratio to the fastest solver at which repeats end;
-    #: None: `repeats` alone decides
+    #: relative half-width of confidence intervals: no further repeats are measured once
+    #: it is reached for every ratio to the fastest solver; None for `repeats` repeats
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
-    #: tolerance of the verdicts; None: the one that the solver was asked for
+    #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
-    every: frozenset[str] = frozenset()  #: names of all cases, before ``--case``
+    every: frozenset[str] = frozenset()  #: names of all cases, regardless of ``--case``
 
     @property
     def groups(self) -> tuple[Group, ...]:
-        """Groups of cases that form a block: single cases, then sequences."""
+        """Groups of cases that form a block: single cases, followed by sequences."""
         return (
             *(Group((case,), "cold") for case in self.cases),
             *(
@@ -115,19 +117,19 @@ class Suite:
 
     @property
     def names(self) -> tuple[CaseId, ...]:
-        """All cases, cold or in a sequence."""
+        """All cases: single cases, followed by the steps of sequences."""
         return tuple(case for group in self.groups for case in group.cases)
 
 
 def load_suite(
     path: Path, families: Mapping[str, Family], solvers: Mapping[str, Solver]
 ) -> Suite:
-    """Read a suite and check it completely, before a run starts.
+    """Read a suite from a file, and check all of its values.
 
     Raises
     ------
     InputError
-        If the suite is wrong; the message names file, place and correct form.
+        If a value is invalid; the message states the file, the key and valid values.
 
     """
     text = read_text(path, "a TOML file", MAX_TOML_MIB)
@@ -141,15 +143,15 @@ def parse_suite(
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> Suite:
-    """Parse the TOML of a suite and check it completely.
+    """Parse the TOML of a suite, and check all of its values.
 
-    where : name of the text in messages
-    folder : base of relative paths
+    where : origin of the text, for messages
+    folder : folder of the suite, see `expand_problems`
 
     Raises
     ------
     InputError
-        If the suite is wrong; the message names the place and the correct form.
+        If a value is invalid; the message states the key and valid values.
 
     """
     with checked.located(where):
@@ -188,7 +190,7 @@ def parse_suite(
 
 
 def name_in(text: str) -> str:
-    """Return the name in the TOML of a suite; "" if `parse_suite` would refuse it."""
+    """Return the name in the TOML of a suite, or "" if it is missing or invalid."""
     with suppress(InputError):
         name = toml(text).get("name")
         if isinstance(name, str) and _NAME.fullmatch(name):
@@ -199,14 +201,13 @@ def name_in(text: str) -> str:
 def read_stored(path: Path) -> dict[str, Any]:
     """Read the suite of a result folder, and check only the types of its values.
 
-    Names and ranges are not checked, since the suite may come from another version or
-    need a plug-in.
+    Names and ranges are not checked, since the suite may have been written by another
+    version, or need a plug-in.
 
     Raises
     ------
     InputError
-        If a value does not have the type that a run writes; the message names the file
-        and the value.
+        If a value has the wrong type; the message states the file and the value.
 
     """
     table = read_toml(path, "the suite of a result folder")
@@ -238,12 +239,12 @@ def _is_finite(value: Any) -> bool:
 
 
 def suite_text(suite: Mapping[str, Any]) -> str:
-    """Return a suite as TOML, one line per key.
+    """Return a suite as TOML, with one line per key.
 
     Raises
     ------
     InputError
-        If TOML cannot express a value, such as None.
+        If a value, such as None, cannot be written as TOML.
 
     >>> print(suite_text({"name": "demo", "tolerances": [1e-6]}), end="")
     name = "demo"
@@ -261,7 +262,10 @@ def _toml_key(key: object) -> str:
 
 
 def _toml_value(where: str, value: Any) -> str:
-    """Return a value as TOML on one line; numpy arrays and ranges become lists."""
+    """Return a value as TOML on one line; NumPy arrays and ranges become lists.
+
+    where : path of the value, for messages
+    """
     if hasattr(value, "tolist"):
         value = value.tolist()
     match value:
@@ -269,9 +273,9 @@ def _toml_value(where: str, value: Any) -> str:
             return str(value).lower()
         case int() | float():
             return repr(value)
-        # A TOML string is a JSON string except for two things: it must not contain DEL,
-        # which JSON leaves as it is, nor surrogate pairs, into which JSON in ASCII
-        # splits characters beyond 16 bits.
+        # JSON strings are valid TOML strings with two exceptions, avoided here: JSON
+        # does not escape DEL, and its ASCII form splits characters beyond 16 bits into
+        # surrogate pairs.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
@@ -290,7 +294,10 @@ def _toml_value(where: str, value: Any) -> str:
 
 
 def solvers_by_label(text: str) -> dict[str, SolverSpec]:
-    """Return the solvers in the TOML of a suite by label, not resolved."""
+    """Return the specs of the solvers in the TOML of a suite by label.
+
+    The names and options are not looked up in a registry.
+    """
     table = toml(text)
     specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
     return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
@@ -299,7 +306,9 @@ def solvers_by_label(text: str) -> dict[str, SolverSpec]:
 def steps_up_to(
     text: str, name: CaseId, families: Mapping[str, Family]
 ) -> tuple[CaseId, ...]:
-    """Return the steps of a sequence in the TOML of a suite, up to the case `name`.
+    """Return the steps of a sequence from its first case to the case `name`, inclusive.
+
+    text : TOML of the suite
 
     Raises
     ------
@@ -318,7 +327,7 @@ def steps_up_to(
 
 
 def limits(text: str) -> tuple[float, float]:
-    """Return the time limit (s) and the memory limit (MiB) in the TOML of a suite."""
+    """Return the time limit in s and the memory limit in MiB from a suite's TOML."""
     table = {**DEFAULTS, **toml(text)}
     time_limit, memory_limit = (
         checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
@@ -347,10 +356,12 @@ def _on_ranks(
     registry: Mapping[str, Solver],
     sequences: object,
 ) -> tuple[SolverSpec, ...]:
-    """Return each solver for every number of ranks; without support, for one rank.
+    """Return specs of each solver for every number of ranks in the suite.
 
-    With ``copies``, each number of ranks n > 1 is accompanied by n independent solves.
-    Sequences are refused: the data that a solver carries are in one process.
+    A solver that does not support ranks is returned for a single rank. If ``copies`` is
+    true, each number of ranks n > 1 is followed by n independent copies of the solver.
+    Sequences on several ranks are refused, since the results that a solver reuses are
+    stored in a single process.
     """
     ranks, copies = table["ranks"], table["copies"]
     counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
@@ -398,7 +409,7 @@ def _spec(entry: object) -> SolverSpec:
 
 
 def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
-    """Add a second copy of the solver with that label, for an A/A comparison."""
+    """Append a second copy of the solver with this label, for an A/A comparison."""
     if label is None:
         return specs
     by_label = {spec.label: spec for spec in specs}
@@ -409,7 +420,10 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
-    """Return the values of θ; refuse them without sequences, or with an accuracy."""
+    """Check the values of θ, and return them.
+
+    Nonzero values are refused if there are no sequences, or if an accuracy is set.
+    """
     thetas = checked.filled_list("tighten", table["tighten"])
     if not all(checked.is_number(t) and 0 <= t < 1 for t in thetas) or len(
         set(thetas)

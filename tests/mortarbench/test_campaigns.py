@@ -173,7 +173,7 @@ def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
         r.run_id for name in "ab" for r in read_journal(tmp_path / name)
     }
     assert [line.rpartition(": ")[2] for line in again] == [
-        "4 of 4 are there already, and count once"
+        "4 of 4 measurements are already present, and count once"
     ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
     assert read_toml(tmp_path / "all/suite.toml") == {

@@ -106,7 +106,7 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
     assert (code, json.loads(out)["environment"]) == (0, [])
     code, _, err = cli("replay", "out/mine", run_id)
     assert code == 2
-    assert err.endswith("give --plugin old=mine.py --plugin new=mine.py\n")
+    assert err.endswith("add --plugin old=mine.py --plugin new=mine.py\n")
 
     (tmp_path / "old" / "step.py").write_text("LENGTH = 3")
     code, _, err = cli("run", "mine.toml", *versions)

@@ -434,7 +434,7 @@ def test_a_form_that_is_not_solved_has_no_weakness():
     other = run_check("keeps its answer: dual-bounds, mirrored", MindsTheOrder())
     assert weak.grade is Grade.WEAK
     assert other.grade is Grade.DECLINE
-    assert other.message.startswith("not solved as it is: ended as failed")
+    assert other.message.startswith("not solved without the change: ended as failed")
 
 
 def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
@@ -524,7 +524,7 @@ def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
     named = ["piqp-dense", "piqp-sparse", "sound"]
     assert [row["solver"] for row in rows] == np.repeat(named, 2).tolist()
     for row in rows[1::2]:
-        assert re.fullmatch(r"\d+ iterations, \d+ as it is", row["message"])
+        assert re.fullmatch(r"\d+ iterations, \d+ without the change", row["message"])
 
     assert command("test-solver", "nobody*") == 2
     assert "nobody*" in capsys.readouterr().err
