@@ -50,7 +50,7 @@ HARNESS_SECONDS = 0.005
 #: were measured; the margin avoids false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor, and also by one of the times below, since ratios of tiny times are unreliable.
+#: factor, and also by one of the times below: ratios of tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
 MIN_GAIN_SECONDS = 1e-3  #: smallest gain between the solves of one measurement
 MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: smallest gain between two measurements

@@ -137,13 +137,13 @@ def measures(request: Mapping[str, Any]) -> bool:
 
 
 class Source(StrEnum):
-    """Origin of the QP of a measurement, which also determines who judges the answer."""
+    """Origin of the QP of a measurement, which determines who judges the answer."""
 
     #: The worker reads the QP from a file. The parent reads it too, and judges
     FILE = "file"
     #: Each MPI rank emits its share of the QP. The parent judges with the entire QP
     SHARES = "shares"
-    #: Each rank emits its share, and the ranks judge jointly; no process has the entire QP
+    #: Each rank emits its share, and the ranks judge jointly; none has the entire QP
     RANKS = "ranks"
 
     @property

@@ -440,16 +440,16 @@ class ParallelSolver:
 def _emit_on_ranks(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
 ) -> tuple[DistributedQP, dict[str, Any]]:
-    """Emit a case on all ranks; return the local part and the "emitted" event's entries.
+    """Emit a case on all ranks; return the local part and the entries of the event.
 
     Any error is raised on all ranks.
 
     Raises
     ------
     InputError
-        If the family raises it.
+        If the family raises it on every rank.
     RankFailedError
-        If a rank fails with another error.
+        If some ranks fail in another way.
 
     """
     start = time.perf_counter()
