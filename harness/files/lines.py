@@ -116,8 +116,8 @@ class Lines:
         os.close(self._fd)
         self._open()
         self._restored(
-            f"{self._path} was deleted or replaced; its {len(lost)} "
-            f"line{'s' * (len(lost) != 1)} that were missing are there again"
+            f"{self._path} was deleted or replaced; {len(lost)} missing "
+            f"line{'s' * (len(lost) != 1)} restored"
         )
 
     def _open(self) -> None:

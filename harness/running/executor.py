@@ -193,7 +193,7 @@ class Executor:
     def _request(
         self, block: WorkUnit, record: Record, step: int, source: Source
     ) -> tuple[dict[str, Any], Record]:
-        """Return the request for a measurement, and the record with data of its case."""
+        """Return the request for a measurement, and the record with the case's data."""
         request = {
             "out": str(self._point),
             "source": source,
