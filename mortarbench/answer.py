@@ -1,5 +1,4 @@
-"""Answers to single cases: compute and verify one (`solve`), or only verify (`verify`).
-"""
+"""Answers to single cases: computed and verified (`solve`), or verified (`verify`)."""
 
 from __future__ import annotations
 
@@ -90,7 +89,7 @@ class Answer:
 
     @property
     def residuals(self) -> Residuals | None:
-        """Relative KKT residuals, evaluated by the harness; None if there is no point."""
+        """Relative KKT residuals, evaluated by the harness; None without a point."""
         values: list[Any] = [getattr(self.record, name) for name in Residuals._fields]
         return None if None in values else Residuals(*values)
 

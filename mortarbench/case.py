@@ -252,7 +252,7 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
                 extended.__dict__["family_case"] = problem.family_case
             return extended
         case QP():
-            # our code expects sparse arrays: for sparse matrices, `*` is a matrix product
+            # Our code expects sparse arrays; `*` of sparse matrices is their product.
             family = BareQP(problem.with_matrices(csc_array))
             name = CaseId(family=family, name="qp", params={}, form="qp")
             return Case(id=name, registries=load_registries(plugins))

@@ -44,7 +44,7 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Plug-in with an executor in every Dask worker, including later ones.
+    """Plug-in with an executor in every Dask worker, including those that join later.
 
     commands : commands of the parent; its Python interpreter is replaced by that of the
         node
