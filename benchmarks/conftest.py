@@ -21,13 +21,16 @@ def pytest_configure(config):
 
 @pytest.fixture
 def note(request):
-    """Return ``note(text)``, which adds a line to the summary."""
+    """Return a function ``note(text)`` that adds a line to the summary."""
     return request.config.stash[NOTES].append
 
 
 @pytest.fixture
 def race(request):
-    """Return ``race(first=f, second=g, rounds=9)``, which returns median times in s."""
+    """Return a function ``race(first=f, second=g, rounds=9)``.
+
+    The function returns the median times by name, in s.
+    """
 
     def run(*, rounds=9, **contestants):
         for function in contestants.values():

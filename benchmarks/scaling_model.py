@@ -33,7 +33,8 @@ from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.solvers.smalbe.rows import equality_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-SIDE, CELLS, TOL = 8, 4, 1e-6  #: subdomains per side, H/h, tolerance of a solve
+#: subdomains per side of the cube, elements per side of a subdomain (H/h), tolerance
+SIDE, CELLS, TOL = 8, 4, 1e-6
 RANKS, CLUSTERS = (1, 2, 4), (1, 2, 4)
 CALLS = 60
 LOCAL, DISTINCT = "local products, s", "local products of distinct blocks, s"
@@ -49,7 +50,7 @@ class Row:
     ranks: int
     cluster: int  #: subdomains per side of a cluster
     measured: dict[str, float]  #: measurements by name of the quantity
-    machine: dict[str, float]  #: fields of `Machine`
+    machine: dict[str, float]  #: measured speeds, the fields of `Machine`
 
     @property
     def run(self) -> Distribution:

@@ -31,7 +31,7 @@ WAYS = {
 
 
 def one(form, Nr):
-    """Measure one size in this process."""
+    """Measure one size in this process; return sizes, times in s and peak memory."""
     model(1, 1, 2, "strain")  # loads compiled modules before the clock starts
     factorise, transform = WAYS[form]
     marks = [perf_counter()]

@@ -70,7 +70,8 @@ SUBDOMAINS = (
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
 REPEATS = 20  #: number of products timed together, since a single one is too short
 
-Times = dict[str, tuple[float, float]]  #: median, and median of the fastest tenth
+#: median time by name, and median of the fastest tenth, in s
+Times = dict[str, tuple[float, float]]
 
 
 def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
@@ -203,7 +204,7 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
 
 
 def incomplete(tol: float = 1e-6) -> None:
-    """Print times of bound-constrained sparse QPs, with and without incomplete factors."""
+    """Print times of sparse QPs with bounds, with and without incomplete factors."""
     print("case | products, factors, ms | without: products, ms | ratio of times")
     for name, several in INCOMPLETE.items():
         for params in several:
@@ -287,7 +288,7 @@ def _subdomains(case: str, qp: QP, tol: float) -> None:
 
 
 def kept() -> None:
-    """Print times of duals with and without recycling of CG directions."""
+    """Print times of duals with and without recycling of CG search directions."""
     for form, *size in KEPT:
         for tol in (1e-6, 1e-8):
             _kept(form, beam_ring(form, *size), tol)
@@ -318,7 +319,14 @@ def _kept(form: str, qp: QP, tol: float) -> None:
 
 
 def positive(text: str) -> float:
-    """Return a positive number from its text."""
+    """Convert the text of a tolerance to a positive number.
+
+    Raises
+    ------
+    InputError
+        If the text is not a positive number.
+
+    """
     try:
         value = float(text)
     except ValueError:

@@ -26,7 +26,8 @@ WAYS = {
     "dual": (factorise_floating, dualise),
     "dual-bounds": (factorise_clamped, dual_bounds),
 }
-TIP = [0.04101815, -0.29791196]  #: m, see tests/problems/families/test_beam_ring.py
+#: displacement of the tip in m, see tests/problems/families/test_beam_ring.py
+TIP = [0.04101815, -0.29791196]
 
 
 def analysis(form, Nr=30, Nh=15, steps=10):

@@ -80,7 +80,7 @@ class Answer:
     spec: SolverSpec  #: name and options of the solver
     solver: str | Solver  #: name or object, as passed to `solve`
     defaults: Mapping[str, Any]  #: default options of the solver
-    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, a line each
+    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, one line each
 
     @property
     def verdict(self) -> Verdict:
@@ -328,7 +328,7 @@ def _is_open(case: Case, record: Record, solution: Solution) -> bool:
 
 
 def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
-    """Yield a remark if a body moves by more than its size, with linear kinematics."""
+    """Yield a remark if kinematics is linear but a body moves by more than its size."""
     if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
         return
     mechanics = case.family_case.mechanics

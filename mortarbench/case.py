@@ -84,7 +84,7 @@ class Case(plugin.Case):
 
     @property
     def matrices(self) -> Mapping[str, Any]:
-        """Matrices of a dual form in the notation of the paper."""
+        """Matrices of a dual form by their names in the paper."""
         return self.family_case.matrices
 
     @property

@@ -115,7 +115,7 @@ def defer_parts_of_numpy() -> None:
         spec.loader = LazyLoader(spec.loader)
         module = sys.modules[spec.name] = module_from_spec(spec)
         spec.loader.exec_module(module)
-        setattr(numpy, part, module)  # otherwise numpy.__getattr__ imports it again
+        setattr(numpy, part, module)  # so that numpy.__getattr__ does not import it
 
 
 def reference(qp: QP) -> Solution:

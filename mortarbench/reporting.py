@@ -39,7 +39,7 @@ class Report:
         return next((file for file in self.files if file.suffix == ".html"), None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain data, as ``report --json`` prints it."""
+        """Return the report as plain data, the output of ``report --json``."""
         return {
             "said": [*self.said],
             "changes": [*self.changes],

@@ -141,7 +141,8 @@ class Results:
         Parameters
         ----------
         kind : name of the figure in the folder ``figures`` of the report, such as
-            ``accuracy`` or ``scaling-1``; ``scaling`` if there is only one such figure
+            ``accuracy`` or ``scaling-1``. The number can be omitted if there is only
+            one such figure
         path : file to which the figure is also written: .png, .pdf or .svg
 
         Raises

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.solution import History
 
-#: units of quantities of elastic bodies in the plane; other quantities have none
+#: units of the quantities of plane elastic bodies; other quantities have no unit
 UNITS = {
     "energy": "J/m",
     "dissipation": "J/m",
@@ -66,8 +66,8 @@ _LEGEND = {
     "their bounds",
     "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
     "active": "at bound: variables at one of their bounds",
-    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
-    "slip",
+    "two_sided": "of two: variables at a bound that have two bounds; with friction, "
+    "rows that slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }

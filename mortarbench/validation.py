@@ -289,7 +289,7 @@ class Conformance:
         return {n: r.message for n, r in self.results.items() if r.grade is Grade.FAIL}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `checks` is what ``test-solver --json`` prints."""
+        """Return plain data; ``test-solver --json`` prints the entry `checks`."""
         checks = [
             dict(solver=self.solver, check=name, **r._asdict())
             for name, r in self.results.items()

@@ -313,7 +313,7 @@ class Laboratory:
     def failure_on(
         self, mutant: Mutant, tests: Sequence[str], limit: float
     ) -> str | None:
-        """Run tests on a mutant; restore the module afterwards."""
+        """Run tests on a mutant, see `failure`, and restore the module afterwards."""
         path = self.folder / mutant.module
         original = path.read_bytes()
         try:
@@ -381,7 +381,12 @@ def _run_tests(tests: Sequence[str], output: Path) -> None:
 
 
 def _wait(child: int, limit: float) -> int | None:
-    """Return the exit code of a fork, or None after killing its session at `limit`."""
+    """Wait for a fork; return its exit code, or None if it exceeded the limit.
+
+    In the latter case, all processes of its session are killed.
+
+    limit : s
+    """
     end = monotonic() + limit
     while monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -472,7 +477,7 @@ def report(
     # Run the tests on each unchanged copy, to measure the usual time and fill caches.
     for failure in pool.map(lambda one: one.failure(tests), laboratories):
         if failure is not None:
-            print(f"{module}: its tests fail unchanged: {failure}")
+            print(f"{module}: the tests of the unchanged module fail: {failure}")
             return 2
     limit = GRACE + SLOWER * (monotonic() - start)
     every = mutants_of(module, (ROOT / module).read_bytes())

@@ -27,7 +27,7 @@ from mortarbench.harness.plugin import SourceFile
 FOLDER = "files"
 LIST = "copies.json"
 MAX_FILE_MIB = (
-    64  #: largest file that is copied, so that results stay small enough to send
+    64  #: size of the largest file that is copied; results must be small enough to send
 )
 MAX_FOLDER_MIB = 256  #: largest total size of the copies in a result folder
 
@@ -62,9 +62,9 @@ def is_copy(name: str) -> bool:
 class _Entry(NamedTuple):
     """Entry of ``copies.json``."""
 
-    path: str  #: path in the names of cases
-    sha256: str
-    size: int  #: size of the content, bytes
+    path: str  #: path as in the names of cases
+    sha256: str  #: first digits of the SHA-256
+    size: int  #: size of the file in bytes
 
 
 class Copies:
@@ -162,7 +162,7 @@ def check_copy(copy: Path, digest: str, remedy: str) -> None:
     if actual != digest:
         raise InputError(
             f"{copy}: its content has the digest {actual}, not {digest}: it was "
-            f"damaged or exchanged; {remedy}"
+            f"damaged or replaced; {remedy}"
         )
 
 
@@ -354,8 +354,8 @@ def _entries(folder: Path) -> list[_Entry]:
         entries = [_Entry("", "", -1)]
     if not all(map(_is_sound, entries)):
         raise InputError(
-            f"{path}: not the list of copied files that a run writes; restore it, or "
-            "delete it: copies are found without it by cases that were measured"
+            f"{path}: not a list of copied files as a run writes it; restore or delete "
+            "it; measured cases find their copies without the list"
         )
     return entries
 

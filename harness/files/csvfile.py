@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-#: first characters of formulas; East Asian spreadsheets also use full-width ones
+#: first characters of formulas; the full-width ones occur in East Asian spreadsheets
 _FORMULA = frozenset("=+-@＝＋－＠")
 #: Unicode categories of characters that programs may skip at the start of a cell
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})

@@ -27,7 +27,7 @@ VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
 MIB = 2**20  #: bytes in a mebibyte
 
-_PIECE_BYTES = 2**20  #: number of bytes that are expanded at a time
+_PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
 
 
@@ -115,7 +115,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             with gzip.GzipFile(fileobj=file) as pieces:
                 while piece := pieces.read(
                     _PIECE_BYTES
-                ):  # a first pass counts, without memory
+                ):  # the first pass only counts bytes, and stores none
                     if (size := size + len(piece)) > most:
                         raise InputError(
                             f"{path}: its expanded content would take more than "
@@ -125,7 +125,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
                 return whole.read(size)
-        except (OSError, EOFError, zlib.error):  # not gzip, damaged, truncated
+        except (OSError, EOFError, zlib.error):  # not gzip, truncated, or damaged
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None

@@ -23,9 +23,9 @@ _UNFINISHED = ".mortarbench-*.tmp"  #: name of a file that is not yet complete
 _OTHERS = ("*.tmp", "*.new", ".*.new")
 _OLD = ("suite.tmp", "environment.tmp")  #: the same in result folders of older versions
 
-#: Codes of an OSError for a full disk, an exhausted quota or a file size limit.
+#: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: data written to test whether a disk is full
+_PROBE_BYTES = 2**16  #: number of bytes that are written to test if a disk is full
 _MIB = 2**20
 
 
@@ -41,7 +41,8 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     try:
         with new.open("x+b") as file:
             yield file
-            _sync(file)  # before the rename, or a crash could leave an empty file
+            # otherwise a crash after the rename could leave an empty file
+            _sync(file)
             move_file(new, path)
     finally:
         new.unlink(missing_ok=True)
@@ -148,7 +149,7 @@ def _full(path: Path, code: int) -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the directory entries of a folder to the disk."""
+    """Flush the directory entries of a folder to the disk, with fsync."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)

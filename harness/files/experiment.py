@@ -37,7 +37,7 @@ class Experiment:
 
 
 def save_experiment(experiment: Experiment, folder: Path) -> None:
-    """Write the files of an experiment; see `harness.files.experiment`."""
+    """Write the files that the docstring of this module lists."""
     folder.mkdir(parents=True, exist_ok=True)
     states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
     for name, rows in experiment.tables.items():

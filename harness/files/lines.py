@@ -145,7 +145,7 @@ class Lines:
             )
         self._times = _times(
             held
-        )  # same content: the file was touched, linked or deleted
+        )  # the content is unchanged: the file was only touched, linked or deleted
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the whole lines of the open file in chunks."""

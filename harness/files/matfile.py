@@ -56,7 +56,7 @@ _CLASSES = frozenset(
     (_TEXT, _SPARSE, *range(6, 16))
 )  #: classes that are read: texts, sparse matrices and all numeric arrays
 _COMPLEX = 0x800  #: flag of complex variables
-_COPIES = 8  #: number of copies of the content that a parser may store
+_COPIES = 8  #: memory limit of a parser, in multiples of the size of the content
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -194,7 +194,7 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # data of up to four bytes are part of the tag
+        if kind >> 16:  # the tag itself contains data of up to four bytes
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:

@@ -24,7 +24,7 @@ from mortarbench.harness.files.datafile import check_size, opened
 from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
-ALIGNMENT = 64  #: bytes of a cache line, so that alignment does not affect times
+ALIGNMENT = 64  #: size of a cache line in bytes; misaligned arrays would affect times
 _LOCAL_HEADER = 30  #: bytes before the name and the extra field of a zip member
 _PADDING = b"\xfe\xca"  #: ID of an extra field that readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member
@@ -112,7 +112,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
         if name == member.filename or name in members:
             raise ValueError(f"{shortened(name)!r} is not an array, or occurs twice")
         if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
-            raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
+            raise ValueError(f"{shortened(name)!r}: encrypted or unknown compression")
         members[name] = member
     return members
 
@@ -170,7 +170,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if dtype.hasobject:
         raise _PickledError
     if dtype.kind not in _KINDS or not dtype.itemsize:
-        raise ValueError("no plain array of numbers or text")
+        raise ValueError("not a plain array of numbers or text")
     return shape, fortran, dtype
 
 
@@ -179,7 +179,7 @@ def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
 
     there : number of bytes in the file after the header
     """
-    count = prod(shape)  # in Python's integers, which do not overflow
+    count = prod(shape)  # Python's integers do not overflow, unlike those of NumPy
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
         raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
     return count

@@ -59,7 +59,8 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         If a matrix is too large for a dense format, or the file cannot be written.
 
     """
-    import pyarrow as pa  # loads slowly, and workers do not need it
+    # imported here, because they load slowly and workers do not need them
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     n = qp.q.size
@@ -170,7 +171,7 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
-    """Return the matrix with n columns whose rows are concatenated in `flat`."""
+    """Check and return the matrix with n columns whose rows `flat` concatenates."""
     if n == 0 or flat.size % n:
         raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
     if not np.isfinite(flat).all():

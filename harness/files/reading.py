@@ -44,13 +44,14 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
     expected : description of the file, for messages
     """
     try:
-        regular = stat.S_ISREG(path.stat().st_mode)  # opening a device may have effects
+        # Checked before opening, since opening a device may have side effects.
+        regular = stat.S_ISREG(path.stat().st_mode)
         flags = (
             os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
         )  # does not block if a pipe has replaced the file
         fd = os.open(path, flags) if regular else -1
     except (OSError, ValueError) as e:  # ValueError: a NUL character in the name
-        why = e.strerror if isinstance(e, OSError) else "no name of a file"
+        why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{path}: {why}; expected {expected}") from None
     if not regular or not stat.S_ISREG(os.fstat(fd).st_mode):
         if fd >= 0:
@@ -61,7 +62,7 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         try:
             if os.fstat(fd).st_size == 0 and os.pread(fd, 1, 0):
                 raise InputError(
-                    f"{path}: declares no size, like files of the kernel; "
+                    f"{path}: declares no size, as files in /proc do; "
                     f"expected {expected}"
                 )
             yield file

@@ -156,7 +156,7 @@ def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # an npz file that another program wrote
+        except ValueError:  # written by another program, which does not align arrays
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -266,7 +266,8 @@ def save(folder: Path, arrays: Arrays) -> str:
         return digest
     archive = BytesIO()
     np.savez(archive, **arrays)  # type: ignore[arg-type]
-    replace_file(path, archive.getbuffer())  # before the journal line that refers to it
+    # on the disk before the journal line that refers to the file is written
+    replace_file(path, archive.getbuffer())
     return digest
 
 

@@ -31,7 +31,7 @@ class StoredCase:
 
     qp: Path  #: file that contains the QP, see `harness.files.qpfile`
     digest: str  #: digest of the content of that file
-    meta: Mapping[str, Any]  #: meta data that the case worker reported
+    meta: Mapping[str, Any]  #: meta data that `make` returned, see `find_or_build`
 
 
 def find_or_build(
@@ -48,7 +48,7 @@ def find_or_build(
     make : writes the QP to a file, flushes the file and returns the meta data. If
         `make` raises an exception, nothing is stored and the exception propagates
     """
-    folder.mkdir(exist_ok=True)  # without parents: fails if the folder was moved
+    folder.mkdir(exist_ok=True)  # fails if the result folder around it was moved
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
     with _locked(folder / f"{key}.lock"):
         stored = _look_up(folder, key)
@@ -108,7 +108,7 @@ def _check(index: Mapping[str, Any]) -> str:
 
 @contextmanager
 def _locked(lock: Path) -> Iterator[None]:
-    """Hold an exclusive lock on a file; it is released when its process ends."""
+    """Hold an exclusive file lock, which the kernel releases if this process ends."""
     fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)

@@ -79,7 +79,7 @@ class CaseWorker:
     _build_seconds: float = 0.0  # duration of the last build
     _build_peak_mib: float | None = None  # peak memory during that build
     _warm: bool = False  # True once a dual case has been built
-    #: bounds and objection by case name and digest of the point
+    #: error bounds and objection (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict
     )
@@ -99,7 +99,7 @@ class CaseWorker:
                 self._build(CaseId(**{**first, "family": family}))
                 self._warm = True
             case = self._case(name, request["keep"])
-        except (Exception, SystemExit) as e:  # the family's code
+        except (Exception, SystemExit) as e:  # raised by code of the family
             return {
                 "unbuilt": unbuilt(name, e),
                 "trace": traceback.format_exc(),
@@ -121,7 +121,7 @@ class CaseWorker:
         if request["fields"] is not None and case.fields is not None:
             try:
                 fields = field_arrays(case.fields(s))
-            except Exception as e:  # the family's code; it must not lose the record
+            except Exception as e:  # raised by code of the family; the record is kept
                 notes.append(note_of("fields", e))
             else:
                 write_arrays(Path(request["fields"]), fields)
@@ -160,7 +160,8 @@ class CaseWorker:
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
-        while len(self._cases) >= keep:  # before the build: two may not fit in memory
+        # drop cases before the build, since two of them may not fit in memory
+        while len(self._cases) >= keep:
             del self._cases[next(iter(self._cases))]
         if case is None:
             case = self._build(name)

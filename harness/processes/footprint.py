@@ -19,11 +19,11 @@ SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Memory meter of one tree of processes, with the shared files that it created."""
+    """Meter of the memory of a process tree and of the shared files that it created."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
-        # inodes by name, of new files in SHARED that a process of the tree had open
+        # inode numbers by name of the new files in SHARED that the tree had open
         self._created: dict[str, int] = {}
 
     def mib(self, tree: Iterable[int], limit: float) -> float:
@@ -36,7 +36,7 @@ class Footprint:
         """
         tree = list(tree)
         self.notice(tree)
-        sizes: dict[int, int] = {}  # by inode: hard links count once
+        sizes: dict[int, int] = {}  # bytes by inode, so that hard links count once
         for created in self._remaining():
             for path in (created, *created.rglob("*")):
                 with suppress(OSError):
@@ -82,7 +82,7 @@ class Footprint:
         for name, inode in self._created.items():
             with suppress(OSError):
                 status = (SHARED / name).lstat()
-                # another program may have created a file of the same name since
+                # another program may since have created a file of the same name
                 if status.st_ino == inode and status.st_uid == os.getuid():
                     remaining.append(SHARED / name)
         return remaining

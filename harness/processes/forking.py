@@ -40,13 +40,13 @@ def is_safe() -> bool:
 
 
 class Fork:
-    """Sub-reaper above a forked worker, with the methods of `Popen` that we use."""
+    """Handle of the sub-reaper above a forked worker, similar to `subprocess.Popen`."""
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
         # The kernel may reuse the ID of a reaped process, but not the pidfd.
         self._process_fd = os.pidfd_open(pid)
-        self.stdin = stdin  #: closing it, or the parent's death, kills the tree
+        self.stdin = stdin  #: pipe to the sub-reaper, which kills the tree if it closes
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the process has ended.
@@ -54,11 +54,11 @@ class Fork:
         Raises
         ------
         subprocess.TimeoutExpired
-            If it is still running after `timeout` seconds.
+            If the process is still running after `timeout` seconds.
 
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with suppress(ChildProcessError):  # reaped already, together with its tree
+        with suppress(ChildProcessError):  # raised if the process was reaped already
             while os.waitid(os.P_PIDFD, self._process_fd, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
@@ -66,7 +66,7 @@ class Fork:
         os.close(self._process_fd)
 
     def kill(self) -> None:
-        """Send SIGKILL."""
+        """Send SIGKILL to the sub-reaper."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._process_fd, signal.SIGKILL)
 

@@ -52,8 +52,10 @@ HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
 #: factor, and also by one of the times below: ratios of tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
-MIN_GAIN_SECONDS = 1e-3  #: smallest gain between the solves of one measurement
-MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: smallest gain between two measurements
+#: smallest suspicious difference between the times of solves in one measurement
+MIN_GAIN_SECONDS = 1e-3
+#: smallest suspicious difference between the first solves of two measurements
+MIN_GAIN_BETWEEN_SECONDS = 5e-3
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
@@ -178,7 +180,7 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-    ):  # rank 0 measures its memory only; the parent measures all ranks
+    ):  # rank 0 measures only its own memory, the parent that of all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)

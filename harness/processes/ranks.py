@@ -153,7 +153,7 @@ class _RankExits:
                     os.close(fd)
                 else:
                     self._take_records()
-                if fd == mpi:  # ranks that end from now on do so because of it
+                if fd == mpi:  # the end of mpiexec causes all later ends of ranks
                     self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
@@ -208,7 +208,7 @@ def this_rank() -> Ranks:
 
     The speed of communication is measured at this point, before any solve is timed.
     """
-    from mpi4py import MPI  # only runs with ranks need it
+    from mpi4py import MPI  # imported here, because only runs on ranks need it
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
@@ -387,7 +387,8 @@ class ParallelSolver:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
-        if self._emission_error is not None:  # `prepare` raises the other failures
+        # if the emission failed with another error, `prepare` raises it
+        if self._emission_error is not None:
             is_input_error = isinstance(self._emission_error, InputError)
             return str(self._emission_error) if is_input_error else None
         if self._emitted is not None:

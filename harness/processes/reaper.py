@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 #: list of the System V segments of shared memory, see proc(5)
 SEGMENTS = "/proc/sysvipc/shm"
-END_SECONDS = 5.0  #: longest wait for processes that were sent SIGKILL
+END_SECONDS = 5.0  #: longest time to wait for the end of processes sent SIGKILL
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
@@ -54,7 +54,7 @@ _NOT_STARTED = 127  #: exit code of shells for a command that is not found
 
 
 def descendants(root: int) -> list[int]:
-    """List the living processes below `root`, zombies excluded."""
+    """List the process IDs of all descendants of `root` that are not zombies."""
     processes: list[int] = []
     unseen = [root]
     while unseen:
@@ -225,7 +225,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
     kill_descendants(reaper)
-    # In a container whose init reaps nothing, zombies would fill the process table.
+    # If the init process of a container reaps nothing, zombies would accumulate.
     _reap()
     # Remove only segments whose creator has ended: a living process with the same ID is
     # a different one, to which the segment may belong.
@@ -249,7 +249,7 @@ def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
 def _write(record: int, **what: int) -> None:
     """Write a line of JSON by a single write(2), so that lines of ranks do not mix."""
     line = ", ".join(f'"{name}": {value}' for name, value in what.items())
-    with suppress(OSError):  # the reader has ended
+    with suppress(OSError):  # raised if the reader has ended
         os.write(record, f"{{{line}}}\n".encode())
 
 

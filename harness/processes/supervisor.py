@@ -65,7 +65,7 @@ MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is igno
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
-_LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log that are searched for that line
+_LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log in which its last line is sought
 _MIN_FD = 3  #: smallest descriptor of a pipe; smaller ones are standard streams
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
@@ -105,7 +105,7 @@ class Reply:
     """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None if there is an answer, or a fault
+    verdict: Verdict | None = None  #: None if there is an answer, or `fault` is True
     fault: bool = False  #: True if the harness or the machine failed, not the solver
     message: str = ""  #: description of the failure, and notes
     peak_mib: float | None = None  #: largest memory that the parent observed
@@ -149,7 +149,7 @@ class WorkerProcess:
         self._is_stopped = self._was_busy = False
         # time on the parent's clock and CPU time of the worker at its last answer
         self._idle_since: tuple[float, float] | None = None
-        self._facts: dict[str, Any] = {}  # fields reported after the warm-up
+        self._facts: dict[str, Any] = {}  # number of threads, CPU; see `_facts`
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
@@ -232,7 +232,10 @@ class WorkerProcess:
 
     @_LOCK
     def close(self) -> None:
-        """Close the pipe of requests, and kill the worker after `CLOSE_SECONDS`."""
+        """Close the pipe of requests; kill the worker if it does not exit in time.
+
+        The time limit is `CLOSE_SECONDS`.
+        """
         try:
             self._resume()
             self._close("_requests")
@@ -392,7 +395,7 @@ class WorkerProcess:
             os.close(their_replies)
         self._reaper_fd = os.pidfd_open(self._process.pid)
         self._await("ready", START_SECONDS, memory_limit)
-        for worker in self._tree()[:1]:  # the child comes before its own children
+        for worker in self._tree()[:1]:  # the tree lists a parent before its children
             self._worker_fd = os.pidfd_open(worker)
             # If the process ID is still in the tree after pidfd_open, the pidfd refers
             # to the worker, not to an unrelated process that reuses its ID.

@@ -194,7 +194,7 @@ class _SolverHost:
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
             "first_seconds": timed.first_seconds,
-            # fields that the parent copies into the record
+            # fields that the parent copies to the record unchanged
             "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
@@ -284,7 +284,7 @@ def _aligned(count: int) -> Vector:
 
 
 def _one_thread() -> int:
-    """Set all thread pools to one thread; return the largest size of a pool then."""
+    """Limit all thread pools to one thread; return the largest pool size afterwards."""
     libraries = ThreadpoolController()
     libraries.limit(limits=1)
     return max((pool["num_threads"] for pool in libraries.info()), default=1)

@@ -41,7 +41,7 @@ from mortarbench.harness.results.work_unit import (
     WorkUnit,
 )
 
-if TYPE_CHECKING:  # it needs the package distributed
+if TYPE_CHECKING:  # this module imports the optional package distributed
     from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
@@ -210,12 +210,12 @@ class _Cluster:
     nodes: Nodes
     address: str
     warn: Callable[[str], None]
-    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
-    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # by their futures
+    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # finished futures
+    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # blocks by future
     _queue: deque[_ActiveBlock] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Execute all of `blocks`."""
+        """Execute all blocks, and yield each outcome as soon as it is available."""
         try:
             while self._top_up(blocks):
                 try:
@@ -317,7 +317,7 @@ class _Cluster:
                 self._queue.append(active)
             else:
                 case = active.block.turns[0][0].case
-                reason = f"{case} was given up: every Dask worker that took it was lost"
+                reason = f"{case} was given up: all Dask workers that took it were lost"
                 yield BuildFailure(block=active.block, reason=reason)
 
 

@@ -44,7 +44,7 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Plug-in with an executor in every Dask worker, including those that join later.
+    """Plug-in with an executor in every Dask worker, including workers joining later.
 
     commands : commands of the parent; its Python interpreter is replaced by that of the
         node
@@ -74,7 +74,7 @@ class ExecutorPlugin(WorkerPlugin):
         self._busy = Lock()
 
     def teardown(self, worker: Worker | None = None) -> None:
-        """End the processes of the executor, if necessary after the current measurement.
+        """End the executor's processes, if necessary after the current measurement.
 
         Dask cannot stop a block that is being executed. In this case the thread that
         executes the block holds the lock, and calls this method again after the current
@@ -249,7 +249,7 @@ def claim_cpu(stack: ExitStack) -> int:
             return cpu
     raise InputError(
         f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
-        "measure there already; start fewer"
+        "use them already; start fewer workers"
     )
 
 
@@ -268,8 +268,8 @@ def _lock_folder() -> Iterator[int]:
     with suppress(FileExistsError):
         path.mkdir(mode=0o700)
     wrong = InputError(
-        f"{platform.node()}: {path} is not a folder of this user's alone; remove it, "
-        "or set TMPDIR to another folder, the same for all Dask workers there"
+        f"{platform.node()}: {path} is not a folder that only this user can access; "
+        "remove it, or set TMPDIR to the same other folder for all Dask workers there"
     )
     try:
         fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)

@@ -37,8 +37,8 @@ from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-_MAX_STORED_OPTIMA = 1000  #: number of small QPs whose optima are cached
-MAX_STEP_TOL = 1e-2  #: loosest tolerance of a step, far from the fixed point
+_MAX_STORED_OPTIMA = 1000  #: largest number of small QPs whose optima are cached
+MAX_STEP_TOL = 1e-2  #: largest tolerance of a step, used far from the fixed point
 
 
 @dataclass(eq=False)
@@ -203,7 +203,7 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
-            # as in a single process, growing cases are built by new processes
+            # each case of a series of growing sizes is emitted by new processes
             if block.warm_up is not None:
                 self._worker(record.solver).close()
                 request["first"] = dict(block.warm_up)

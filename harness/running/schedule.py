@@ -31,7 +31,7 @@ Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 @dataclass(eq=False, kw_only=True)
 class Schedule:
-    """Sequence of the blocks of a suite that remain to be measured."""
+    """Remaining blocks of measurements of a suite, in the order of execution."""
 
     suite: Suite
     #: options by solver label, including those with default values
@@ -57,7 +57,7 @@ class Schedule:
         return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
 
     def add(self, record: Record) -> None:
-        """Add a measurement that is in the journal."""
+        """Take a measurement in the journal into account."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
         if record.verdict is Verdict.DECLINED:
@@ -135,7 +135,7 @@ class Schedule:
         return s.repeats if s.precision is None else max(s.repeats, s.max_repeats)
 
     def _is_enough(self, group: Group, tol: float) -> bool:
-        """Return True if the precision is reached or the budget is spent."""
+        """Return True if the requested precision is reached or the budget is spent."""
         assert self.suite.precision is not None
         records = [
             r

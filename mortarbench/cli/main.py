@@ -58,7 +58,7 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """Exit after a help text."""
+        """Exit after a help text has been printed."""
         # flush here, where `main` handles a closed pipe, not at interpreter exit
         print(end="", flush=True)
         super().exit(status, message)
@@ -277,7 +277,7 @@ _COMMANDS = {
         "run",
         "measure a suite and write a report on the results",
         [
-            _Option("suite", "SUITE.toml", "a file, or a name of `list suites`"),
+            _Option("suite", "SUITE.toml", "a file, or a name from `list suites`"),
             _Option(
                 "--out",
                 "DIR",
@@ -297,8 +297,8 @@ _COMMANDS = {
                 _SEVERAL,
             ),
             _option(
-                "set an option of every solver that has it; each of several "
-                "values is measured"
+                "set an option of every solver that has it; of several values, as in "
+                "max_iter=50,100, each is measured"
             ),
             _PLUGIN,
             _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
@@ -326,7 +326,9 @@ _COMMANDS = {
         "run one solver on one case, once, and verify its answer",
         [
             _CASE,
-            _Option("--solver", "NAME", "a name of `list solvers`", {"required": True}),
+            _Option(
+                "--solver", "NAME", "a name from `list solvers`", {"required": True}
+            ),
             _Option(
                 "--tol",
                 "T",

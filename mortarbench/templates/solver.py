@@ -50,7 +50,7 @@ class Solver:
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP and return a function that solves it. Both are timed."""
+        """Convert the QP, and return a function that solves the QP. Both are timed."""
         P, A, G = (
             M if isinstance(M, np.ndarray) else M.toarray() for M in (qp.P, qp.A, qp.G)
         )
@@ -71,7 +71,9 @@ class Solver:
                 z=z_rows,
                 z_box=z_box,
                 iterations=k,
-                message="" if status is Status.SOLVED else f"{k} iterations, no end",
+                message=""
+                if status is Status.SOLVED
+                else f"not converged after {k} iterations",
             )
 
         def solve() -> Solution:

@@ -37,7 +37,7 @@ FORMULA = re.compile(
 #: asterisk of a formula, as in u*, that Markdown has interpreted as start of emphasis
 SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
 HELP = "<!-- help of every command -->"  #: placeholder in commands.md for help texts
-#: environment variables for notebooks and help texts: one thread per library, 80 columns
+#: environment variables of notebooks and help texts: one thread, 80 columns
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
 
 
