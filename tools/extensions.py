@@ -30,7 +30,7 @@ MODULES = {
     # residuals must have the same digits on every machine
     "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
-    # as must stiffness matrices and the elimination order of their factorisation
+    # the same holds for stiffness matrices and the order in which they are eliminated
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],

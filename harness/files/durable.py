@@ -135,7 +135,7 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
 def _full(path: Path, code: int) -> str:
     """Return the error message for a full file system.
 
-    code : the errno, one of `FULL`
+    code : error number, one of `FULL`
     """
     there = next(p for p in (path, *path.absolute().parents) if p.exists())
     root = there.absolute()

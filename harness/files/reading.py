@@ -66,8 +66,8 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
                     f"expected {expected}"
                 )
             yield file
-        # The block may also write other files. Their errors have a file name, except
-        # those of a full disk; errors of reading have none.
+        # Errors that state a file name or a full disk were caused by other files, which
+        # the block may write.
         except OSError as e:
             if e.errno in (None, *FULL) or e.filename is not None:
                 raise

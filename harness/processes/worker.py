@@ -22,8 +22,8 @@ kinds of requests:
   ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads its QP again, so that a solver that modifies its arrays does not
-affect later measurements.
+Every measurement loads the QP again, so that a solver that modifies the arrays of a QP
+does not affect later measurements.
 """
 
 from __future__ import annotations
