@@ -1,7 +1,8 @@
 """Fixtures for races: functions timed alternately in one process.
 
-Through alternation, a drift of the machine affects all of them equally. At the end
-medians, quartiles and ratios to the first function are printed.
+Because the functions alternate, a drift of the machine's speed affects all of them
+equally. After the tests, medians, quartiles and ratios to the first function are
+printed.
 """
 
 from statistics import median, quantiles
@@ -20,17 +21,20 @@ def pytest_configure(config):
 
 @pytest.fixture
 def note(request):
-    """Return ``note(text)``, which adds a line to the summary."""
+    """Return a function ``note(text)`` that adds a line to the summary."""
     return request.config.stash[NOTES].append
 
 
 @pytest.fixture
 def race(request):
-    """Return ``race(first=f, second=g, rounds=9)``, which returns medians, s."""
+    """Return a function ``race(first=f, second=g, rounds=9)``.
+
+    The function returns the median times by name, in s.
+    """
 
     def run(*, rounds=9, **contestants):
         for function in contestants.values():
-            function()  # warm-up: imports and caches are not compared
+            function()  # warm-up, so that imports and caches are not timed
         seconds = {name: [] for name in contestants}
         for _ in range(rounds):
             for name, function in contestants.items():

@@ -2,14 +2,17 @@
 
     python -m benchmarks.discs products|ratios|time|conic
 
-* products: products with P (sweeps of nsgs) at tol 1e-8, over 88 to 1468 discs.
-* ratios: products of `smalbe` over those of the best other method. As such steps
-  amplify small changes, each problem is solved with ten norms in the first step, and
-  with ten loads, that differ by up to 3 %.
-* conic: processor times of `smalbe` and of conic solvers to a verified point.
-* time: errors, bound, peak memory and processor time of `smalbe` up to 512² cells, and
-  the latter over that of its products alone, measured alternately (set
-  OMP_NUM_THREADS=1, as the times of threads add up).
+* products: numbers of products with P (for nsgs, of sweeps) at tol 1e-8, for 88 to 1468
+  discs.
+* ratios: number of products of `smalbe` relative to that of the best other method. The
+  numbers are sensitive to small changes of the data. Each problem is therefore solved
+  for ten values of the estimate of ‖P‖ in the first step, and for ten loads, which
+  deviate by up to 3 %.
+* conic: processor times of `smalbe` and of conic solvers until a point is verified.
+* time: errors, error bound, peak memory and processor time of `smalbe` for up to 512²
+  cells, and the ratio of this time to that of the products alone, where the two are
+  measured alternately. Set OMP_NUM_THREADS=1, because processor times of threads are
+  added.
 """
 
 from __future__ import annotations
@@ -39,9 +42,9 @@ from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.compiled import Product
 
 TOL = 1e-8
-CELLS = (12, 24, 36, 48)  #: per side: 88, 376, 820 and 1468 discs
-PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm, or of the load
-LARGE = (256, 512)  #: cells per side, P an operator
+CELLS = (12, 24, 36, 48)  #: cells per side, for 88, 376, 820 and 1468 discs
+PERTURBED = np.linspace(0.97, 1.03, 10)  #: factors of the norm ‖P‖, or of the load
+LARGE = (256, 512)  #: cells per side of problems in which P is an operator
 ROUNDS = 5  #: number of alternating rounds in the measurement of times
 CONIC = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
 METHODS: dict[str, Solver] = {
@@ -55,7 +58,11 @@ METHODS: dict[str, Solver] = {
 
 
 def mindlin(cells: int, nu: float, Q: float) -> Case:
-    """Build the tangential problem of Cattaneo and Mindlin."""
+    """Build the tangential contact problem of Cattaneo and Mindlin.
+
+    nu : Poisson's ratio
+    Q : tangential force, relative to the limit μP of sliding
+    """
     return mb.build(f"half-space/n={cells}/law=mindlin/nu={nu}/Q={Q}/dual")
 
 
@@ -65,7 +72,7 @@ def with_dense(qp: QP) -> QP:
 
 
 def count(name: str, qp: QP) -> int:
-    """Solve and verify by residuals; return the products with P, or the sweeps."""
+    """Solve a QP and verify the residuals; return the number of products or sweeps."""
     s = METHODS[name].prepare(qp, TOL)()
     residuals = kkt_residuals(qp, s)
     assert verdict(s.status, residuals, TOL) is Verdict.VERIFIED, (name, residuals)
@@ -73,7 +80,7 @@ def count(name: str, qp: QP) -> int:
 
 
 def products() -> None:
-    """Print the products of all methods, ν = 0.3, Q/μP = 0.3 and 0.9."""
+    """Print the numbers of products of all methods for ν = 0.3, Q/μP = 0.3 and 0.9."""
     for name in METHODS:
         pairs = [
             [count(name, with_dense(mindlin(n, 0.3, Q).qp)) for Q in (0.3, 0.9)]
@@ -84,7 +91,7 @@ def products() -> None:
 
 @contextmanager
 def perturbed_norm(factor: float) -> Iterator[None]:
-    """Multiply by `factor` the estimates of ‖P‖ for a first step."""
+    """Multiply the estimates of ‖P‖ in the first step of all methods by `factor`."""
 
     def norm(name: str, estimate: Any, *args: Any, **keys: Any) -> Any:
         result = estimate(*args, **keys)
@@ -103,7 +110,7 @@ def perturbed_norm(factor: float) -> Iterator[None]:
 
 
 def ratios() -> None:
-    """Print ratios of products over all Q/μP and ν, with norms and loads perturbed."""
+    """Print ratios of products for all Q/μP and ν, with perturbed norms and loads."""
     names = [name for name in METHODS if name != "nsgs"]
     for kind in ("norms", "loads"):
         spent = []
@@ -126,15 +133,18 @@ def ratios() -> None:
 
 
 def _ratio(logs: NDArray[np.float64]) -> str:
-    """Compare the first column of logarithms with the least of the others."""
+    """Return the mean and largest ratio of the first column to the least of the others.
+
+    logs : logarithms; the last axis contains the columns
+    """
     ratio = logs[..., 0] - logs[..., 1:].min(axis=-1)
     return f"{np.exp(ratio.mean()):.2f}, at most {np.exp(ratio.max()):.2f}"
 
 
 def time() -> None:
-    """Print errors, memory and times of `smalbe` up to 512² cells.
+    """Print errors, memory and times of `smalbe` for up to 512² cells.
 
-    The ratio is that of the time of a solve to the time of its products alone.
+    The last column is the ratio of the time of a solve to that of its products alone.
     """
     header = "cells, discs", "ν", "Q/μP", "error of c/a", "of Q", "bound", "peak memory"
     print(*header, "products", "solve", "ratio", sep=" | ")
@@ -165,9 +175,10 @@ def time() -> None:
 
 
 def conic() -> None:
-    """Print processor times to a point that is verified at 1e-8, ν = 0.3, Q/μP = 0.5.
+    """Print processor times for a point that is verified at 1e-8, ν = 0.3, Q/μP = 0.5.
 
-    Each solver runs at 1e-6, 1e-8, … until its point is verified; the last run counts.
+    Each solver runs at tolerances 1e-6, 1e-8, … until its point is verified. The time
+    is that of the last run.
     """
     for n, name in product(CELLS, ("smalbe", *CONIC)):
         qp, result = with_dense(mindlin(n, 0.3, 0.5).qp), "not verified"

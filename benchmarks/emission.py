@@ -3,10 +3,10 @@
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/emission.py [CASE]
     .venv/bin/python benchmarks/emission.py whole [CASE]
 
-Each rank assembles its share. After each stage, the script prints the peaks of resident
-memory without imports (largest and mean over the ranks) and the seconds of the slowest
-rank. `whole` builds the case in one process, including the data for certificates and
-pictures. The script asserts nothing, since machines differ.
+Each rank assembles its share of the QP. After each stage, the script prints the peak of
+resident memory in excess of that of imports (largest and mean over the ranks) and the
+time of the slowest rank. With `whole`, the case is built in one process, including the
+data for certificates and pictures. No results are asserted, since machines differ.
 """
 
 import sys
@@ -21,11 +21,11 @@ TOL = 1e-6
 
 
 def whole(name: str = CASE) -> None:
-    """Build the case in this process."""
+    """Build a case in this process; print its time and peak memory."""
     import mortarbench as mb
     from mortarbench.problems.models import beam_ring
 
-    del beam_ring  # imported before the memory is measured
+    del beam_ring  # imported only so that the import is not part of the measured memory
     before, start = memory_mib("VmHWM"), time.perf_counter()
     qp = mb.build(name).qp
     seconds, peak = time.perf_counter() - start, memory_mib("VmHWM") - before
@@ -34,7 +34,7 @@ def whole(name: str = CASE) -> None:
 
 
 def distributed(name: str = CASE) -> None:
-    """Assemble, prepare and solve on all ranks."""
+    """Assemble, prepare and solve a case on all ranks; print times and peak memory."""
     from mpi4py import MPI
 
     from mortarbench.harness.distributed.vectors import Ranks

@@ -4,20 +4,25 @@
     python benchmarks/feti_scaling.py --family cube-wall [--cells H/h] [n ...]
 
 The problem is the beam on its half ring in one load step, Nh = Nr/2, or the cube of n³
-hexahedra beside a wall. `feti` decomposes it into subdomains; `whole` is the dual of
-undivided bodies. Both are timed from the mesh to an answer with a certified error below
-1e-6, which requires different tolerances. Each runs in a separate process, so that its
-peak memory is measured. `cpu` is processor time, for comparisons on a busy machine.
+hexahedra beside a wall. With `feti`, the bodies are decomposed into subdomains; `whole`
+is the dual QP of undivided bodies. Both are timed from the mesh to an answer with a
+certified error below 1e-6, which requires different tolerances. Each measurement runs
+in a separate process, so that the peak memory of this measurement is known. `cpu` is
+processor time, for comparisons on a busy machine.
 
-For `feti` the quantities of the theory are measured without the search for the active
-set:
+For `feti`, the following quantities of the theory are measured in addition. They do not
+depend on the search for the active set.
 
-    kappa      condition number of PFP on supports and gluing, no contact, by Lanczos
-    face       CG steps with the active rows as equations, to a reduction of 1e-6
-    kappa_dirichlet   the same with the Dirichlet preconditioner
-    face none  steps without a preconditioner
+    kappa            condition number of PFP without contact, by Lanczos; P projects
+                     onto the kernel of the equality rows, and F is the dual operator
+                     of supports and gluing
+    kappa_dirichlet  condition number with the Dirichlet preconditioner
+    face             CG steps, with this preconditioner, to reduce the residual by 1e-6
+                     if the active contact rows are equations
+    face none        CG steps for the same problem without a preconditioner
 
-The script prints a table, and the exponents p of c·n^p with 95 % intervals.
+The script prints a table, and for each quantity the exponent p of a fit c·n^p with its
+95 % interval, where n is the number of displacements.
 """
 
 import argparse
@@ -48,7 +53,7 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for a certified error below 1e-6
 REDUCTION = 1e-6
-#: keys of a size, and sizes of about 10⁴ to 10⁶ components
+#: keys of a case as a function of its size, and sizes of about 10⁴ to 10⁶ displacements
 FAMILIES = {
     "beam-ring": (
         lambda Nr: {"Nr": Nr, "Nh": Nr // 2, "radial": Nr, "steps": 1},
@@ -66,8 +71,13 @@ def problem_of(family, size):
 
 
 def one(way, family, size, cells):
-    """Measure one size in this process."""
-    # loads compiled modules, which is not measured
+    """Measure one size in this process.
+
+    way : ``feti`` or ``whole``
+    size : Nr or n
+    cells : H/h, number of elements along an edge of a subdomain
+    """
+    # loads compiled modules before the clock starts
     assert problem_of(family, 2).bodies.assembled
     cpu_start, marks = process_time(), [perf_counter()]
 
@@ -122,7 +132,12 @@ def one(way, family, size, cells):
 
 
 def final_face(pieces, unbounded, qp, s):
-    """Return κ without contact, and CG steps on the face of the solution."""
+    """Return the quantities of the theory, see the docstring of the module.
+
+    pieces : decomposed bodies
+    unbounded : local QP without contact
+    qp, s : dual QP and its solution
+    """
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
     plain, dirichlet = spectra_over_ranks(
@@ -145,7 +160,7 @@ def final_face(pieces, unbounded, qp, s):
 
 
 def exponent(n, values):
-    """Fit values = c·n^p; return p and the half width of its 95 % interval."""
+    """Fit values = c·n^p; return p and the half-width of its 95 % interval."""
     fit = linregress(np.log(n), np.log(values))
     return fit.slope, t.ppf(0.975, len(n) - 2) * fit.stderr
 

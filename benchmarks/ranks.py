@@ -2,13 +2,15 @@
 
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/ranks.py [CASE] [REPEATS]
 
-Products are limited by memory bandwidth, which the CPUs of a machine share: two copies
-of a job on two CPUs do not achieve twice the work of one either. So the speed-up of a
-solve on all ranks is shown beside the joint throughput of as many copies, one on each
-rank. Rounds of the three ways (alone, copies, ranks) are interleaved in one job, on one
-QP. Printed are medians with minimum and maximum, and the times of each rank for the
-parts of a solve. Measurements during which other processes used the CPUs are dropped;
-the number of the others is printed (Linux). Nothing is asserted: machines differ.
+The speed of products is limited by memory bandwidth, which the CPUs of a machine share.
+Therefore two copies of a job on two CPUs do not achieve twice the throughput of one
+copy either. The speed-up of a solve on all ranks is shown beside the joint throughput
+of copies, one on each rank. The same QP is solved in three ways: `alone` on one rank,
+as `copies`, and by all `ranks` together. Their rounds are interleaved. The script
+prints medians with minimum and maximum, and the times of each rank for the phases of a
+solve. Measurements during which other processes used the CPUs are dropped; the number
+of remaining ones is printed. The script requires Linux. No results are asserted, since
+machines differ.
 """
 
 import os
@@ -24,7 +26,8 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 CASE = "beam-ring/Nr=224/Nh=128/steps=1/feti=32/dual"
 TOL = 1e-6
-MAX_DISTURBANCE = 0.04  #: CPUs that other processes may use during a measurement
+#: largest CPU time of other processes during a measurement, relative to its wall time
+MAX_DISTURBANCE = 0.04
 
 
 def together(comm: MPI.Comm) -> None:
@@ -38,11 +41,15 @@ def busy():
     """Return the CPU seconds of all processes since the machine was started."""
     with open("/proc/stat") as stat:
         spent = [int(ticks) for ticks in stat.readline().split()[1:9]]
-    return (sum(spent) - sum(spent[3:5])) / os.sysconf("SC_CLK_TCK")  # without idle
+    # columns 3 and 4 are the times in which a CPU was idle or waited for input
+    return (sum(spent) - sum(spent[3:5])) / os.sysconf("SC_CLK_TCK")
 
 
 def undisturbed(world, act):
-    """Call `act` on every rank; return None if other processes used the CPUs."""
+    """Call `act` on every rank and return its result.
+
+    Return None if other processes used more CPU time than `MAX_DISTURBANCE` allows.
+    """
     together(world)
     others, start = busy() - time.process_time(), time.perf_counter()
     before = time.process_time()
@@ -55,7 +62,11 @@ def undisturbed(world, act):
 
 
 def timed(qp, comm):
-    """Prepare and solve on the ranks of `comm`; return seconds of both and of parts."""
+    """Prepare and solve on the ranks of `comm`.
+
+    Return the times in s of preparing, of solving and of the phases of the solve, and
+    counts of operations.
+    """
     ranks = Ranks(comm)
     share = qp.P.build().share(qp, ranks)
     comm.Barrier()
@@ -74,10 +85,11 @@ def timed(qp, comm):
 
 
 def main(name: str = CASE, repeats: str = "5") -> None:
-    """Print the table."""
+    """Measure, and print the table."""
     world, alone = MPI.COMM_WORLD, MPI.COMM_SELF
     cpus = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})  # as for ranks of a run
+    # each rank has its own CPU, as in a run
+    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})
     qp = mb.build(name).qp
     ways = {
         "alone": lambda: timed(qp, alone) if world.rank == 0 else {},

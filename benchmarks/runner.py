@@ -1,12 +1,12 @@
-"""Overhead of the runner, and the ratios of times that its clock can resolve.
+"""Overhead of the runner, and the ratios of times that it can resolve.
 
-    .venv/bin/python benchmarks/runner.py overhead [N]   ms per tiny measurement
-    .venv/bin/python benchmarks/runner.py growth [N]     memory, descriptors over N
-    .venv/bin/python benchmarks/runner.py null [TRIALS]  A/A: intervals of a ratio of 1
+    .venv/bin/python benchmarks/runner.py overhead [N]   overhead of N measurements
+    .venv/bin/python benchmarks/runner.py growth [N]     memory, open files after N
+    .venv/bin/python benchmarks/runner.py null [TRIALS]  intervals of a true ratio of 1
     .venv/bin/python benchmarks/runner.py neighbours [N] times beside careless solvers
 
-Overhead is the time from one record to the next, minus the time of the worker in the
-solver and the time of fsync.
+The overhead is the time from one record to the next, minus the times of the solver and
+of fsync. In an A/A comparison (``null``), a solver is compared with itself.
 """
 
 import os
@@ -31,11 +31,13 @@ ACCIDENTS = PLUGIN.with_name("accidents.py")
 
 
 class Watch:
-    """Progress that records the times of records and the size of this process."""
+    """Progress callbacks that store the time of each record and the memory in use."""
 
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
-        self.solving = []  # s; with several inner loops one more solve is made
+        # total time of solves per record, in s, including the first one, which is
+        # performed separately if there are several inner loops
+        self.solving = []
         self._fsync, self._fsync_seconds = os.fsync, 0.0
         os.fsync = self._timed_fsync
 
@@ -63,7 +65,7 @@ class Watch:
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
 
     def overheads(self):
-        """Return the seconds between records, less those of solver and fsync."""
+        """Return the times between records, minus those of solver and fsync, in s."""
         seconds = []
         for i in range(1, len(self.at)):
             gap = self.at[i] - self.at[i - 1]
@@ -73,7 +75,7 @@ class Watch:
 
 
 def measure(out, *solvers, repeats, plugin=PLUGIN):
-    """Run solvers of a plug-in on its tiny QP; return the `Watch`."""
+    """Run solvers of a plug-in on the tiny QP of this plug-in; return the `Watch`."""
     start = [sys.executable, "-P", str(plugin)]
     plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
@@ -97,7 +99,7 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
 
 
 def overhead(n=500):
-    """Print the overhead of tiny measurements."""
+    """Print the median overhead of a tiny measurement, with quartiles."""
     with tempfile.TemporaryDirectory() as out:
         watch = measure(Path(out), "honest", repeats=n // 2)
     low, middle, high = quantiles(watch.overheads()[4:], n=4)
@@ -108,7 +110,7 @@ def overhead(n=500):
 
 
 def growth(n=10_000):
-    """Print memory and descriptors of the run after a tenth, a half and at the end."""
+    """Print memory and number of open files after a tenth, half and all of a run."""
     with tempfile.TemporaryDirectory() as out:
         watch = measure(Path(out), "honest", repeats=n // 2)
         lines = len(read_journal(Path(out)))
@@ -118,7 +120,7 @@ def growth(n=10_000):
 
 
 def null(trials=40, blocks=10):
-    """Print how often the 95 % interval of A/A contains 1, and its median width."""
+    """Print how often the 95 % interval of an A/A ratio contains 1, and its width."""
     hits, widths = 0, []
     for _ in range(trials):
         with tempfile.TemporaryDirectory() as out:
@@ -136,7 +138,10 @@ def null(trials=40, blocks=10):
 
 
 def beside(n=20):
-    """Print times of a solver beside honest and careless neighbours, alternately."""
+    """Print times of a solver in runs with honest or careless solvers, alternately.
+
+    Careless solvers leave processes or threads running.
+    """
     calm, careless = ("honest",), ("daemon", "executeddaemon", "burns", "pools")
     os.environ["WATCHED"] = "benchmark"
     times = {calm: [], careless: []}

@@ -1,10 +1,10 @@
-"""Parameters of the cost model on this machine, and its form on ranks and clusters.
+"""Parameters of the cost model on this machine, and its predictions for ranks.
 
 `python -m benchmarks.scaling_model` prints the tables of docs/scaling-model.md that
-depend on the machine, in Markdown. `cube-wall/n=32/feti=4` has 512 congruent subdomains
-of 107 811 dofs. All times are the smallest of many calls, because other programs on the
-machine only lengthen them. More ranks than CPUs share these; messages then wait for
-their receivers, so that only the times of local products are printed.
+depend on the machine, in Markdown. The case is `cube-wall/n=32/feti=4`, with 512
+congruent subdomains and 107 811 dofs in total. Each time is the smallest of many calls,
+because other programs can only lengthen a call. If there are more ranks than CPUs,
+messages wait for their receivers, and only the times of local products are printed.
 """
 
 import json
@@ -33,7 +33,8 @@ from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.solvers.smalbe.rows import equality_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-SIDE, CELLS, TOL = 8, 4, 1e-6  #: subdomains per side, H/h, tolerance of a solve
+#: subdomains per side of the cube, elements per side of a subdomain (H/h), tolerance
+SIDE, CELLS, TOL = 8, 4, 1e-6
 RANKS, CLUSTERS = (1, 2, 4), (1, 2, 4)
 CALLS = 60
 LOCAL, DISTINCT = "local products, s", "local products of distinct blocks, s"
@@ -44,16 +45,16 @@ APPLICATIONS, REDUCED = "applications", "reductions per application"
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Measurements of one number of ranks and one cluster, beside the model."""
+    """Measurements for one number of ranks and one cluster size, with predictions."""
 
     ranks: int
-    cluster: int
-    measured: dict[str, float]
-    machine: dict[str, float]  #: fields of `Machine`
+    cluster: int  #: subdomains per side of a cluster
+    measured: dict[str, float]  #: measurements by name of the quantity
+    machine: dict[str, float]  #: measured speeds, the fields of `Machine`
 
     @property
     def run(self) -> Distribution:
-        """The distribution that was measured."""
+        """Distribution of the subdomains in the measurement."""
         return Distribution(
             cores=self.ranks, per_core=SIDE**3 / self.ranks, cells=CELLS,
             cluster=self.cluster, congruent=True,
@@ -61,12 +62,12 @@ class Row:
 
     @property
     def model(self) -> Prediction:
-        """Prediction with the speeds that the same ranks had just before."""
+        """Prediction with the machine speeds measured on the same ranks just before."""
         return predict(self.run, Machine(**self.machine))
 
 
 def smallest(work: Callable[[], object]) -> float:
-    """Return the smallest time of many calls on the slowest rank, s."""
+    """Return the smallest time of many calls, on the slowest rank, in s."""
     times = []
     for _ in range(CALLS):
         start = perf_counter()
@@ -77,10 +78,11 @@ def smallest(work: Callable[[], object]) -> float:
 
 
 def speeds() -> Machine:
-    """Return the speeds of a core and of messages between ranks.
+    """Measure the speeds of a core and of messages between ranks.
 
-    One triangle of 64 MiB passes through memory; the block of a subdomain multiplies
-    the vectors of 64 congruent ones.
+    Memory bandwidth is measured by the product of a packed triangular matrix of 64 MiB
+    with a vector, and the floating-point rate by the product of the matrix of a
+    subdomain with 64 vectors, as many as congruent subdomains.
     """
     n, m = 4096, Distribution(cores=1, cells=CELLS).block
     packed, x = np.ones(n * (n + 1) // 2), np.ones(n)
@@ -96,7 +98,7 @@ def speeds() -> Machine:
 
 
 def distinct() -> float:
-    """Return the time of local products if no two subdomains share a block, s."""
+    """Return the time of local products in s if no two subdomains share a block."""
     n = Distribution(cores=1, cells=CELLS).block
     count = SIDE**3 // MPI.COMM_WORLD.size
     triangles = [np.ones(n * (n + 1) // 2) for _ in range(count)]
@@ -105,7 +107,10 @@ def distinct() -> float:
 
 
 def measured(cluster: int) -> dict[str, float]:
-    """Return counts and times of a product and a projection, and counts of a solve."""
+    """Return counts and times of a product and a projection, and counts of a solve.
+
+    cluster : subdomains per side of a cluster
+    """
     world = MPI.COMM_WORLD
     joined = "" if cluster == 1 else f"/cluster={cluster}"
     qp = mb.build(f"cube-wall/n={SIDE * CELLS}/feti={CELLS}{joined}/dual").qp
@@ -128,17 +133,19 @@ def measured(cluster: int) -> dict[str, float]:
         SENT: world.allreduce(product["bytes"], MPI.MAX),
         MESSAGES: world.allreduce(product["messages"], MPI.MAX),
         APPLICATIONS: counts["P_products"] + counts["preconditioner_applies"],
-        # every application sends as many messages as a product; a single rank none
+        # An application sends as many messages as a product, so the number of messages
+        # yields that of applications. A single rank sends no messages.
         REDUCED: ranks.counts["reductions"] * product["messages"]
         / max(ranks.counts["messages"], 1),
     }  # fmt: skip
 
 
 def on_ranks() -> None:
-    """Print the measurements of this number of ranks as JSON."""
+    """Print the measurements on these ranks as JSON, one line per cluster size."""
     world = MPI.COMM_WORLD
     cpus = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})  # as for ranks of a run
+    # each rank has its own CPU, as in a run
+    os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})
     machine, different = speeds(), distinct()
     for cluster in CLUSTERS:
         results = {DISTINCT: different, **measured(cluster)}
@@ -152,17 +159,22 @@ Column = tuple[str, Callable[[Row], str]]
 
 
 def digits(x: float) -> str:
-    """Return three significant digits, or all digits before the point."""
+    """Format a number with three significant digits, or without decimals if ≥ 100."""
     return f"{x:.0f}" if x >= 100 else f"{x:.3g}"
 
 
 def number(head: str, name: str, unit: float = 1.0) -> Column:
-    """Return a column of measurements, in units of `unit`; "–" for those left out."""
+    """Return a column of measurements, divided by `unit`; "–" if not meaningful."""
     return head, lambda r: digits(r.measured[name] / unit) if shows(r, name) else "–"
 
 
 def model(name: str, of: Callable[[Row], float], unit: float = 1.0) -> Column:
-    """Return a column of predictions with their deviations from measurements."""
+    """Return a column of predictions with their deviations from measurements.
+
+    name : measured quantity
+    of : returns the prediction
+    unit : divisor of the predictions
+    """
 
     def cell(r: Row) -> str:
         value, prediction = r.measured[name], of(r)

@@ -1,10 +1,11 @@
-"""Time and peak memory of one load step, mesh to solved dual, against size.
+"""Time and peak memory of one load step, from mesh to recovery, against size.
 
     make size        or   .venv/bin/python benchmarks/size.py [FORM] [Nr ...]
 
-Nh = Nr/2. Each size runs in a separate process, so that its peak memory is measured.
-The script prints a table and the exponents p of c·n^p, fitted to logarithms by least
-squares, with 95 % intervals.
+The case is beam-ring with Nh = Nr/2. Each size runs in a separate process, so that the
+peak memory of this size is known. The script prints a table and, for each quantity, the
+exponent p of a fit c·n^p with its 95 % interval. Logarithms are fitted by least
+squares, and n is the number of displacements.
 """
 
 import json
@@ -30,8 +31,8 @@ WAYS = {
 
 
 def one(form, Nr):
-    """Measure one size in this process."""
-    model(1, 1, 2, "strain")  # loads compiled modules, which is not measured
+    """Measure one size in this process; return sizes, times in s and peak memory."""
+    model(1, 1, 2, "strain")  # loads compiled modules before the clock starts
     factorise, transform = WAYS[form]
     marks = [perf_counter()]
 
@@ -64,7 +65,7 @@ def one(form, Nr):
 
 
 def exponent(n, values):
-    """Fit values = c·n^p; return p and the half width of its 95 % interval."""
+    """Fit values = c·n^p; return p and the half-width of its 95 % interval."""
     fit = linregress(np.log(n), np.log(values))
     return fit.slope, t.ppf(0.975, len(n) - 2) * fit.stderr
 

@@ -1,24 +1,24 @@
-"""Costs of SMALBE besides its products: tables of docs/performance-smalbe.md.
+"""Costs of SMALBE relative to its products: tables of docs/performance-smalbe.md.
 
     python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
-* dense: preparing and solving duals, in units of products with F. A solve is compared
-  with a bound: 1.5 times the time of its products (by `smalbe` or `dsymv` of BLAS,
-  whichever is faster) plus 100 µs.
-* sparse: time of a solve per product, without a preconditioner, in units of one product
-  and five passes w += v over vectors.
+* dense: times to prepare and solve dense duals, beside the time of a product with F.
+  The time of a solve is compared with the bound 1.5·T + 100 µs, where T is the time of
+  its products, by `smalbe` or by `dsymv` of BLAS, whichever is faster.
+* sparse: time of a solve without a preconditioner, divided by its number of products,
+  in units of one product plus five vector operations w += v.
 * incomplete: sparse problems with and without incomplete factors.
-* subdomains: duals of bodies in subdomains, with blocks ready, that is, after a solve
-  with the same operator; time in units of products and applications of the
-  preconditioner.
-* kept: the same solves with and without recycling of CG directions.
-* race: preparing and solving a case by several solvers; answers are verified.
+* subdomains: duals of bodies in subdomains, after an earlier solve with the same
+  operator has assembled the blocks; the unit is the time of all products and all
+  applications of the preconditioner.
+* kept: solves with and without recycling of CG directions.
+* race: times to prepare and solve a case with several solvers; answers are verified.
 
-Everything compared runs alternately in one process and is measured in processor time of
-that process (set OMP_NUM_THREADS=1, as the times of threads add up). Printed are the
-median of the runs and the median of their fastest tenth, on which other programs have
-less influence.
+Runs that are compared alternate in one process. Times are processor times of that
+process; set OMP_NUM_THREADS=1, because the times of threads are added. The script
+prints the median of the runs and the median of their fastest tenth, on which other
+programs have less influence.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from mortarbench.solvers.smalbe.compiled import Product
 DUALS = {
     "dual": [(12, 6, 5), (12, 7, 5), (24, 12, 10), (30, 15, 10), (60, 30, 5)],
     "dual-bounds": [(12, 6, 5), (12, 7, 5), (24, 12, 10), (30, 15, 10), (60, 30, 5)],
-}  #: Nr, Nh and step of beam-ring
+}  #: values of Nr, Nh and step of beam-ring, by form
 LARGE = {
     "journal-bearing": {"n": 300},
     "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
@@ -68,13 +68,18 @@ SUBDOMAINS = (
     "beam-ring/Nr=56/Nh=28/feti=16/dual",
 )  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
-REPEATS = 20  #: repeats of a product, which is too short to be timed alone
+REPEATS = 20  #: number of products timed together, since a single one is too short
 
-Times = dict[str, tuple[float, float]]  #: median, and median of the fastest tenth
+#: median time by name, and median of the fastest tenth, in s
+Times = dict[str, tuple[float, float]]
 
 
 def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
-    """Return the times of calls that run alternately and return their seconds."""
+    """Run calls alternately, and return their times by name.
+
+    rounds : number of runs of each call
+    calls : functions that return their own time in s
+    """
     spent: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
@@ -89,7 +94,10 @@ def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
 
 
 def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
-    """Return a call that runs `call` and returns its mean seconds over `repeats`."""
+    """Return a function that runs `call` and returns its mean time in s.
+
+    repeats : number of runs over which the mean is taken
+    """
 
     def run() -> float:
         start = process_time()
@@ -101,14 +109,14 @@ def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
 
 
 def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
-    """Return a QP of the paper's beam on its ring."""
+    """Return a QP of the paper's benchmark, a beam on a half ring."""
     family = PROBLEMS["beam-ring"]
     params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
     return family.build(form, params, reference_solution).qp
 
 
 def dense(tol: float = 1e-6) -> None:
-    """Print times of preparing and solving duals."""
+    """Print times to prepare and solve dense duals, and of their products."""
     print("form m | products of the solve, of preparing | a product | prepare | solve")
     for form, sizes in DUALS.items():
         for size in sizes:
@@ -141,13 +149,17 @@ def _dense(form: str, qp: QP, tol: float) -> None:
 
 
 def _products_of_preparing(qp: QP, tol: float) -> int:
-    """Count the products of `prepare`: a solve stopped at its start shows them."""
+    """Return the number of products in `prepare`.
+
+    The number is obtained from the counts of a solve that is stopped at once.
+    """
     s = replace(SOLVERS["smalbe"], max_steps=1).prepare(qp, tol)()
-    return s.counts["P_products"] - s.iterations - 2  # its point, and the residuals
+    # subtract the products of the steps, of the starting point and of the residuals
+    return s.counts["P_products"] - s.iterations - 2
 
 
 def sparse(tol: float = 1e-6) -> None:
-    """Print times of large sparse problems per product, without a factor."""
+    """Print times per product of large sparse problems, without incomplete factors."""
     solver = replace(SOLVERS["smalbe"], preconditioner="model")
     for name, params in LARGE.items():
         family = PROBLEMS[name]
@@ -192,7 +204,7 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
 
 
 def incomplete(tol: float = 1e-6) -> None:
-    """Solve sparse problems with bounds, preconditioned by factors and not."""
+    """Print times of sparse QPs with bounds, with and without incomplete factors."""
     print("case | products, factors, ms | without: products, ms | ratio of times")
     for name, several in INCOMPLETE.items():
         for params in several:
@@ -200,7 +212,11 @@ def incomplete(tol: float = 1e-6) -> None:
 
 
 def sparse_qp(name: str, params: dict[str, object]) -> QP:
-    """Return a primal QP; with "half" without bounds on the second half."""
+    """Return a primal QP.
+
+    params : keys of the family; with a further key "half", the second half of the
+        variables have no lower bounds
+    """
     given = {key: value for key, value in params.items() if key != "half"}
     family = PROBLEMS[name]
     qp = family.build("primal", family.complete(given), reference_solution).qp
@@ -235,7 +251,7 @@ def _incomplete(name: str, qp: QP, tol: float) -> None:
 
 
 def subdomains(tol: float = 1e-6) -> None:
-    """Print times of duals of bodies in subdomains, with blocks ready."""
+    """Print times of duals of bodies in subdomains, whose blocks are assembled."""
     print(
         "case, m | products, applications of the preconditioner | one of each | "
         "prepare, solve | together in units of these | KKT residual"
@@ -272,7 +288,7 @@ def _subdomains(case: str, qp: QP, tol: float) -> None:
 
 
 def kept() -> None:
-    """Print times of duals with and without recycling of CG directions."""
+    """Print times of duals with and without recycling of CG search directions."""
     for form, *size in KEPT:
         for tol in (1e-6, 1e-8):
             _kept(form, beam_ring(form, *size), tol)
@@ -303,7 +319,14 @@ def _kept(form: str, qp: QP, tol: float) -> None:
 
 
 def positive(text: str) -> float:
-    """Return a positive number from its text."""
+    """Convert the text of a tolerance to a positive number.
+
+    Raises
+    ------
+    InputError
+        If the text is not a positive number.
+
+    """
     try:
         value = float(text)
     except ValueError:
@@ -315,6 +338,10 @@ def positive(text: str) -> float:
 
 def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
     """Print times of several solvers on a case, at each tolerance.
+
+    case : name of the case
+    solvers, tolerances : lists separated by commas
+    rounds : number of alternating rounds
 
     Raises
     ------

@@ -1,10 +1,11 @@
-"""Time and peak memory of reading a journal and writing its report, against size.
+"""Time and peak memory of reading a journal and writing the report, against size.
 
     make synthetic   or   .venv/bin/python benchmarks/synthetic_results.py [CASES ...]
 
-20 solvers, 5 repeats, all formats. Each size runs in a separate process, so that its
-peak memory is measured. With chromium and playwright (make browser) the first paint of
-the page and the time until all of its plots are drawn are measured as well.
+The synthetic journal has 20 solvers and 5 repeats; the report is written in all
+formats. Each measurement runs in a separate process, so that the peak memory of this
+measurement is known. If chromium and playwright are installed (make browser), the times
+until the first paint of the page and until all plots are drawn are measured as well.
 """
 
 import os
@@ -26,7 +27,7 @@ TIMES = """() => new Promise((done) =>
 
 
 def read(folder):
-    """Measure the reading of the journal of a folder, in this process."""
+    """Read the journal in a folder, and print records, CPU time and peak memory."""
     from mortarbench.harness.results.journal import read_journal
 
     start = process_time()
@@ -36,7 +37,7 @@ def read(folder):
 
 
 def measure(folder):
-    """Measure the writing of the report on a folder, in this process."""
+    """Write the report on a folder, and print CPU time, peak memory and page size."""
     from mortarbench.reports import write_report
 
     start = process_time()
@@ -47,7 +48,10 @@ def measure(folder):
 
 
 def paint(folder):
-    """Return ms to first paint and to the end of loading, or None."""
+    """Return the times to first paint and to the end of loading, in ms.
+
+    Return None if chromium or playwright is not installed.
+    """
     try:
         from playwright.sync_api import sync_playwright
     except ModuleNotFoundError:

@@ -1,7 +1,7 @@
-"""Stiffness assembly against a library, and in the plane against triplets.
+"""Time of stiffness assembly, compared with scikit-fem and assembly by triplets.
 
-Meshes of quadrilaterals and hexahedra are distorted smoothly, so that no two cells are
-congruent.
+The comparison with triplets is made in the plane. Meshes of quadrilaterals and
+hexahedra are distorted smoothly, so that no two cells are congruent.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""Contact linearisation at the paper's size and in space, and the cost of search."""
+"""Times of contact linearisation, in the plane and in space, and of contact search."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ from mortarbench.problems.models.beam_ring import model
 def test_ten_linearisations(benchmark, method):
     bodies = model(30, 15, 30, "strain")
     points, (pair,) = bodies.mesh.points, bodies.pairs
-    # a beam that sags by up to 0.1 m, as in the paper's ten steps
+    # the beam sags by up to 0.1 m, as in the paper's ten steps
     sag = np.column_stack([np.zeros(len(points)), -0.025 * points[:, 0] ** 2]).ravel()
 
     def linearise():
@@ -36,7 +36,10 @@ def test_ten_linearisations(benchmark, method):
 
 @pytest.mark.parametrize("segments", [100, 1000, 10_000])
 def test_search(benchmark, segments):
-    """Nodes on a half ring, as many as segments on a bent beam; flanks are far off."""
+    """Project the nodes of a half ring onto as many segments of a bent beam.
+
+    The nodes on the flanks of the ring are far from the beam.
+    """
     theta = np.pi * np.arange(segments) / (segments - 1)
     ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
     x = 2 * np.arange(segments + 1) / segments
@@ -49,7 +52,7 @@ def test_search(benchmark, segments):
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])
 def test_cost_per_segment(race, note, method):
-    """Exponents of cost against segments, between successive decades."""
+    """Report the exponents of time against the number of segments, per decade."""
 
     def sides(segments):
         theta = np.pi * np.arange(segments + 1) / segments
@@ -70,7 +73,10 @@ def test_cost_per_segment(race, note, method):
 
 @pytest.mark.parametrize("cells", [15, 24])
 def test_linearisation_in_space_against_a_factor(race, note, cells):
-    """Two stacked cubes whose meshes do not match; the lower one has fewer cells."""
+    """Linearise contact of two stacked cubes with non-matching meshes.
+
+    The lower cube has fewer cells. Times are compared with a sparse factorisation.
+    """
     lower = prefixed(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (cells - 1,) * 3), "lower_")
     upper = prefixed(box((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (cells,) * 3), "upper_")
     mesh, _ = join((lower, upper))

@@ -1,4 +1,7 @@
-"""F and d of ten load steps: by condensation, and by solves for each step."""
+"""Times of dualising ten load steps, by condensation and by solves for each step.
+
+Dualisation computes the matrix F and the vector d of the dual QP.
+"""
 
 import numpy as np
 import pytest

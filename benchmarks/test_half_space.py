@@ -1,4 +1,4 @@
-"""Half-spaces: time of a product, and of a solve relative to its products."""
+"""Half-spaces: time of a product, and time of a solve relative to its products."""
 
 from time import process_time
 
@@ -29,7 +29,10 @@ def test_product(benchmark, law, n):
 @pytest.mark.parametrize("nu", [0.0, 0.3])
 @pytest.mark.parametrize("n", [256, 512])
 def test_the_time_of_a_solve_is_that_of_its_products(note, n, nu):
-    """And the stick radius, with ν = 0, is exact to 0.3 % and 0.1 %."""
+    """Report the ratio of the times; for ν = 0, check the stick radius.
+
+    Its error is below 0.3 % for n = 256 and below 0.1 % for n = 512.
+    """
     case = built(n=n, law="mindlin", nu=nu)
     x = np.random.default_rng(1).standard_normal(case.qp.q.size)
     case.qp.P @ x  # builds the operator

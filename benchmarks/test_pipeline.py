@@ -1,4 +1,4 @@
-"""Times of the stages of an analysis, at the size of the paper's Table 1 and below."""
+"""Times of the stages of an analysis, on the mesh of Table 1 and on a coarser one."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""SMALBE: products with F against PERMON's, time against every generic solver."""
+"""SMALBE compared with PERMON by products with F, and with all solvers by time."""
 
 from dataclasses import replace
 from functools import partial
@@ -17,7 +17,8 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.compiled import Product
 from tests.support.generated_bodies import generated_case
 
-#: products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8, by Nr, Nh, step
+#: Numbers of products with F of PERMON 3.18 with its best settings, for tolerances 1e-6
+#: and 1e-8, by Nr, Nh and step.
 PERMON = {
     (4, 3, 1): (92, 112), (4, 3, 10): (109, 146),
     (12, 6, 5): (119, 169), (12, 6, 10): (144, 206),
@@ -57,7 +58,7 @@ def products(s):
 
 @pytest.mark.parametrize("name", [n for n in SOLVERS if n.startswith("smalbe")])
 def test_products_with_F(note, name):
-    """All products count: norm, homogenisation, start, checks, factorised columns."""
+    """Report all products, including those for ‖F‖, the starting point and checks."""
     for (Nr, Nh, step), best in PERMON.items():
         cells = []
         for form in ("dual", "dual-bounds"):
@@ -74,7 +75,10 @@ def test_products_with_F(note, name):
 
 @pytest.mark.parametrize("tol", TOLERANCES)
 def test_products_on_generated_bodies(note, tol):
-    """Products on 300 bodies relative to the better of PERMON's and ESPRESO's rules."""
+    """Report products for 300 bodies, relative to the better of two preset rules.
+
+    The presets follow the rules of PERMON and of ESPRESO.
+    """
     ratios = []
     for seed in range(300):
         qp = generated_case(seed).qp
@@ -94,7 +98,7 @@ def test_products_on_generated_bodies(note, tol):
 
 @pytest.mark.parametrize("preconditioner", ["diagonal", "lumped", "dirichlet"])
 def test_products_with_other_preconditioners(note, preconditioner):
-    """Preconditioners other than the inverse of the model, with their applies."""
+    """Report products and applications for other preconditioners than the default."""
     solver = replace(SOLVERS["smalbe"], preconditioner=preconditioner)
     for Nr, Nh, step in PERMON:
         cells = []
@@ -126,7 +130,7 @@ def test_products_of_a_load_path(note, form, Nr, Nh):
 )
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
-    """Prepare and solve at 1e-6, by all solvers whose answers are verified."""
+    """Compare the times of all solvers whose answers are verified at 1e-6."""
     qp, tol = dual(Nr, Nh, 10, form), 1e-6
     least = {
         name: min(seconds(solver, qp, tol) for _ in range(3))
@@ -159,7 +163,7 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
 def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
     race, note, form, Nr, Nh
 ):
-    """Times of preparing and solving, against 1.5 times the products of the solve."""
+    """Compare the time of a solve with 1.5 times that of its products plus 100 µs."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
     ready = []
@@ -191,15 +195,22 @@ def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
 
 
 def _prepare_products(solver, qp, tol):
-    """Count the products of `prepare`: a solve stopped at its start shows them."""
+    """Return the number of products in `prepare`.
+
+    The number is obtained from the counts of a solve that is stopped at once.
+    """
     stopped = replace(solver, max_steps=1)
     s = stopped.prepare(qp, tol)()
-    return s.counts["P_products"] - s.iterations - 2  # its point, and the residuals
+    # subtract the products of the steps, of the starting point and of the residuals
+    return s.counts["P_products"] - s.iterations - 2
 
 
 @pytest.mark.parametrize("case", SUBDOMAINS)
 def test_bodies_in_subdomains(race, note, case):
-    """Prepare and solve with blocks ready, against products and applications of M."""
+    """Compare a solve with its products and applications of the preconditioner M.
+
+    An earlier solve has assembled the blocks of the operator.
+    """
     qp, tol, solver = mb.build(case).qp, 1e-6, SOLVERS["smalbe"]
     s, v = solver.prepare(qp, tol)(), np.ones(qp.q.size)
     P, M = Product(qp.P, v.size), qp.P.build().preconditioner("dirichlet", "stiffness")
@@ -227,7 +238,10 @@ ZOO = {
 
 @pytest.mark.parametrize("name", ZOO)
 def test_large_sparse_problems(race, note, name):
-    """Prepare and solve at 1e-6; a step against one product and five vector passes."""
+    """Compare solvers at 1e-6, and the time per product of `smalbe` with its parts.
+
+    These parts are one product and five vector operations.
+    """
     family = PROBLEMS[name]
     form = family.forms[0]
     qp = family.build(form, family.complete(ZOO[name]), reference_solution).qp
@@ -266,7 +280,7 @@ def test_large_sparse_problems(race, note, name):
     ids=lambda value: value if isinstance(value, str) else repr(value),
 )
 def test_sparse_problems_with_bounds(note, name, params):
-    """Processor time of prepare and solve at 1e-6, by default and without a factor."""
+    """Compare processor times at 1e-6 with and without incomplete factors."""
     qp, tol = sparse_qp(name, params), 1e-6
     plain = replace(SOLVERS["smalbe"], preconditioner="model")
     solvers = {"smalbe": SOLVERS["smalbe"], "plain": plain}
@@ -285,7 +299,7 @@ def test_sparse_problems_with_bounds(note, name, params):
 
 @pytest.mark.parametrize(("Nr", "Nh"), [(6, 3), (12, 6), (12, 7), (24, 12)])
 def test_the_smallest_duals_with_bounds_alone(note, Nr, Nh):
-    """Processor times at 1e-6, and that of preparing relative to that of solving."""
+    """Report processor times at 1e-6, and the ratio of preparing to solving."""
     qp, tol, solver = dual(Nr, Nh, 5, "dual-bounds"), 1e-6, SOLVERS["smalbe"]
     ready = []
     spent = products(solver.prepare(qp, tol)())

@@ -8,8 +8,8 @@
 
 Plug-ins import `QP`, `Solution`, `Status`, `Case` and `Family` from here.
 
-Functions print no output unless requested. Invalid input raises `InputError` with a
-one-line message. The command line calls these functions.
+Functions print no output unless requested. If their input is invalid, they raise an
+`InputError` with a one-line message. The command line calls the same functions.
 """
 
 from importlib import import_module
@@ -20,7 +20,7 @@ from lazy_loader import attach_stub
 
 from mortarbench import problems, solvers
 
-# imported at first use, because a help text needs neither numpy nor scipy
+# Names are imported at first use, because help texts need neither numpy nor scipy.
 _export, __dir__, __all__ = attach_stub(__name__, __file__)
 
 
@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _Listed(ModuleType):
-    """Package that lists its contents when called: `solvers()`, `problems()`."""
+    """Package that can be called to list its contents: `solvers()`, `problems()`."""
 
     def __call__(self, **options: Any) -> Any:
         """Return the `Listing` of the same name in `mortarbench.listing`."""

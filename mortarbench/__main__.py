@@ -8,7 +8,7 @@ import sys
 
 def main() -> None:
     """Run the command line with one thread in every library."""
-    # before any other import: libraries read these variables once, when they load
+    # set before all other imports, since libraries read these variables when they load
     from mortarbench.harness.limits import ONE_THREAD
 
     os.environ.update(ONE_THREAD)

@@ -1,4 +1,4 @@
-"""Answers to single cases: computed and judged (`solve`), or only judged (`verify`)."""
+"""Answers to single cases: computed and verified (`solve`), or verified (`verify`)."""
 
 from __future__ import annotations
 
@@ -60,11 +60,12 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.crossval.discretisation import Discretisation
 
-#: Certified relative error above which a verified answer gets a remark.
+#: Certified relative error in the energy norm above which a verified answer has a
+#: remark.
 MAX_CERTIFIED_ERROR = 0.01
-#: Largest sum of contact forces, relative to the sum of loads, that counts as no
-#: contact. Interior-point methods leave forces of about 1e-8; closed contacts have far
-#: larger ones.
+#: Largest sum of contact forces, relative to the sum of loads, at which bodies count as
+#: not in contact. Interior-point methods leave forces of about 1e-8, far smaller than
+#: those of closed contacts.
 MAX_OPEN_FORCE = 1e-6
 
 
@@ -73,12 +74,13 @@ class Answer:
     """Answer of a solver to a case, with our verdict."""
 
     case: Case
-    record: Record  #: the measurement, as in a line of a journal
-    solution: Solution | None  #: point and claim; None if the process ended early
-    spec: SolverSpec
+    record: Record  #: measurement, as in a line of a journal
+    #: point and claim of the solver; None if its process ended without an answer
+    solution: Solution | None
+    spec: SolverSpec  #: name and options of the solver
     solver: str | Solver  #: name or object, as passed to `solve`
     defaults: Mapping[str, Any]  #: default options of the solver
-    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, a line each
+    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, one line each
 
     @property
     def verdict(self) -> Verdict:
@@ -93,7 +95,7 @@ class Answer:
 
     @property
     def energy_bound(self) -> float | None:
-        """Certified bound on the relative error in the energy norm; None if unknown."""
+        """Certified bound of the relative error in the energy norm; None if unknown."""
         return self.record.energy_bound
 
     @property
@@ -103,7 +105,7 @@ class Answer:
 
     @property
     def history(self) -> History:
-        """Iterations as the solver reports them: columns with one row per iteration."""
+        """History that the solver reports: columns with one row per iteration."""
         return {} if self.solution is None else self.solution.history
 
     @property
@@ -113,7 +115,11 @@ class Answer:
 
     @property
     def normality(self) -> Normality | None:
-        """Further measures over discs and cones; None without such sets or a point."""
+        """Further error measures over discs and cones.
+
+        None if the QP has no such sets, the case is not built in this process, or there
+        is no point.
+        """
         if "family_case" not in vars(self.case) or not self.has_point:
             return None
         assert self.solution is not None
@@ -122,9 +128,9 @@ class Answer:
             return normality(qp, self.solution, allowed(self.record.tol))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return record, history of the iterations and remarks as plain data.
+        """Return the record, the history and the remarks as plain data.
 
-        For a QP over discs or cones, the values of `normality` are added.
+        For a QP over discs or cones, the values of `normality` are included.
         """
         history = finite(plain(self.history))
         further = self.normality
@@ -138,9 +144,9 @@ class Answer:
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
         """Estimate the discretisation error, which adds to the error of the solver.
 
-        The reference solver solves the case on finer meshes.
+        For this purpose, the reference solver solves the case on finer meshes.
 
-        budget : seconds; a mesh on which the solve would exceed them is skipped
+        budget : time budget in s; meshes whose solve would exceed it are skipped
         """
         from mortarbench.harness.crossval.discretisation import discretisation_errors
 
@@ -168,14 +174,14 @@ class Answer:
     ) -> Figure:
         """Draw the deformed bodies with their stresses, and each contact enlarged.
 
-        For half-planes and half-spaces, which are unbounded, draw the tractions between
-        them.
+        For half-planes and half-spaces, which have no finite mesh, the contact
+        tractions are drawn instead.
 
         Parameters
         ----------
         path : file to which the picture is also written: .png, .pdf or .svg
-        scale : factor of the displacements; None: 1 if they are visible, else a round
-            factor that the title states
+        scale : magnification of the displacements. If None, the factor is 1 if the
+            displacements are visible, and otherwise a round factor stated in the title
 
         Raises
         ------
@@ -211,7 +217,7 @@ class Answer:
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
 
-        For a .pvd, the same solver also solves the earlier load steps.
+        For a .pvd file, the same solver also solves the earlier load steps.
 
         Raises
         ------
@@ -266,10 +272,11 @@ class Answer:
 
 
 def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str, ...]:
-    """Return reasons to doubt a verified answer, a line each.
+    """Return reasons to doubt a verified answer, one line each.
 
-    The QP is solved, but the certified bound may be weak or the model inadequate: no
-    contact, contact at a single node, or displacements too large for linear kinematics.
+    The QP is solved, but the certified bound may be weak or the model inadequate: the
+    bodies are not in contact, only a single node is, or displacements are too large for
+    linear kinematics.
     """
     if record.verdict is not Verdict.VERIFIED or solution is None:
         return ()
@@ -286,8 +293,8 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
             f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
             "a smaller tolerance may give a smaller bound"
         )
-    # a remark must not fail a solve: recovery may be code of a plug-in, and on ranks
-    # there is no case in this process
+    # A failed remark must not make the solve fail: the recovery of displacements may be
+    # code of a plug-in, and if ranks solved the QP, this process has no built case.
     with suppress(Exception), one_thread():
         if _is_open(case, record, solution):
             reasons.append(
@@ -307,7 +314,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:
-    """Return True if all contact forces are zero up to rounding."""
+    """Return True if the sum of contact forces is at most `MAX_OPEN_FORCE` · loads."""
     if not record.quantities.get("contact_rows"):
         return False
     if record.quantities.get("active") == 0:
@@ -321,7 +328,7 @@ def _is_open(case: Case, record: Record, solution: Solution) -> bool:
 
 
 def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
-    """Yield a remark if a body moves by more than its size, with linear kinematics."""
+    """Yield a remark if kinematics is linear but a body moves by more than its size."""
     if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
         return
     mechanics = case.family_case.mechanics
@@ -329,7 +336,7 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
         return
     grid, u = mechanics.grid, case.family_case.recover(solution)
     if u.size != grid.points.size:
-        return  # the height of a membrane is not a displacement of its mesh
+        return  # u is scalar, such as the height of a membrane
     lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
     worst, text = 1.0, ""
     for body in np.unique(grid.bodies):
@@ -361,26 +368,27 @@ def solve(
 ) -> Answer:
     """Run one solver on one case in a separate process, and verify its answer.
 
-    A solver object is copied into that process by cloudpickle. Its class may be defined
-    in a notebook, a script or a module. Its attributes must be picklable: no open
-    files, locks or handles of C libraries.
+    A solver object is copied into that process by cloudpickle. The class of the object
+    may be defined in a notebook, a script or a module. Its attributes must be
+    picklable, which excludes open files, locks and handles of C libraries.
 
     Parameters
     ----------
     case : a case of `build`, its name, or a QP
-    solver : a name of `solvers`, or an object with the methods `declines` and `prepare`
+    solver : a name listed by `solvers`, or an object with the methods `declines` and
+        `prepare`
     tol : requested relative KKT accuracy
     options : options of the solver that differ from its defaults. A solver with an
-        option ``history`` records its iterations unless ``history = False``
+        option ``history`` records its iterations unless ``history = False`` is passed
     plugins : Python files with more solvers or families
-    ranks : number of MPI processes that solve the case together
-    more : further options of the solver
+    ranks : number of MPI processes that jointly solve the case
+    more : further options of the solver, as keyword arguments
 
     Raises
     ------
     InputError
         If there is no such case, solver or option, the case cannot be built, the
-        solver cannot be copied, or `ranks` needs an MPI that is not installed.
+        solver cannot be copied, or `ranks` exceeds 1 and MPI is not installed.
 
     Examples
     --------
@@ -413,8 +421,9 @@ def solver_session(
     """Start a process for a solver; yield a function that solves a case to a tolerance.
 
     solver, options, ranks : see `solve`
-    forks : the process may be a fork of this one, if that is safe; see
-        `harness.processes.forking`
+    registries : registries with the solver, and with which the process is started
+    forks : True if the process may be a fork of this process, provided that a fork is
+        safe; see `harness.processes.forking`
 
     Raises
     ------
@@ -432,7 +441,7 @@ def solver_session(
     configured = resolve(spec, solvers)
     defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
     if options_of(configured).get("history") is False and "history" not in requested:
-        # recording takes time, but a single solve is not used for comparisons of times
+        # Recording takes time, but times of single solves are not compared.
         defaults = {**defaults, "history": True}
         spec = replace(spec, options={**requested, "history": True})
         configured = resolve(spec, solvers)
@@ -451,7 +460,7 @@ def solver_session(
         if ranks > 1 and is_shared(case.id):
             ours = registries.hold_only_builtins()
             source = Source.RANKS if ours else Source.SHARES
-        # a family may print; standard output is for the answer
+        # Code of a family may print, and standard output is reserved for the answer.
         with one_thread(), redirect_stdout(stderr):
             record, solution = measure_once(
                 worker,
@@ -484,7 +493,7 @@ def solver_session(
 
 
 class Multipliers(NamedTuple):
-    """Multipliers with the signs of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
+    """Multipliers with the signs of P x + q + Aᵀy + Gᵀz + z_box = 0, as in `QP`."""
 
     y: Vector  #: (m,) multipliers of A x = b
     z: Vector  #: (p,) multipliers of G x ≤ h
@@ -495,16 +504,17 @@ class Multipliers(NamedTuple):
 class Verification:
     """Verdict of `verify` on a point."""
 
-    verdict: Verdict  #: `verified`, or if refuted `inaccurate` or `wrong`
+    verdict: Verdict  #: `verified` or, if the point is refuted, `inaccurate` or `wrong`
     residuals: Residuals  #: relative KKT residuals
-    #: multipliers passed to `verify`, completed by computed ones
+    #: multipliers passed to `verify`; those left out are computed
     multipliers: Multipliers
     objective: float  #: ½xᵀPx + qᵀx
-    optimum_error: float | None  #: error against the proven optimum if it decided
+    #: error relative to a proven optimum, if that decided the verdict, else None
+    optimum_error: float | None
     normality: (
         Normality | None
-    )  #: further measures over discs and cones, if there are any
-    tol: float  #: verified: every residual ≤ 10·tol, or decided by a proven optimum
+    )  #: further error measures over discs and cones; None if the QP has no such sets
+    tol: float  #: tolerance; a point is verified if every residual is at most 10·tol
 
     def __repr__(self) -> str:
         if self.optimum_error is not None:
@@ -526,21 +536,23 @@ def verify(
     """Verify a point by its KKT residuals, in the same way as answers of solvers.
 
     Multipliers that are left out are computed by nonnegative least squares on the
-    active rows and bounds, see `harness.verify.multipliers`. Residuals that remain show
-    that the point is not optimal to that accuracy.
+    active rows and bounds, see `harness.verify.multipliers`. If the residuals are large
+    even with these multipliers, the point is not optimal.
 
     Parameters
     ----------
     qp : a QP, a case of `build`, or its name
     x : (n,) point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
-    tol : relative KKT accuracy; a point is verified if every residual is within 10·tol
-        or, for a small QP with a proven optimum, if the error of the objective is
+    tol : relative KKT accuracy; a point is verified if every residual is at most 10·tol
+        or, for a small QP with a proven optimum, if its error relative to the optimum
+        is at most 10·tol
 
     Raises
     ------
     InputError
-        If a vector does not fit the QP, or too many multipliers would be computed.
+        If the size of a vector does not match the QP, or the QP is too large for the
+        computation of the multipliers that were left out.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Checks of arguments, before any work is done or any library is imported."""
+"""Checks of arguments, made before slow computations and imports begin."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 
 EXPORTS = (".npz", ".mat", ".parquet", ".qps", ".hdf5")  #: suffixes of exported QPs
-PICTURES = (".png", ".pdf", ".svg")
+PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
-GATES = ("worse", "slower")  #: conditions on which a comparison may fail
-MAX_SCALE = 1e9  #: largest factor of displacements in pictures
-GRIDS = (".vtu", ".pvd")  #: formats for ParaView: one state, or a series of load steps
+GATES = ("worse", "slower")  #: conditions under which a comparison fails, see `report`
+MAX_SCALE = 1e9  #: largest magnification of displacements in pictures
+GRIDS = (".vtu", ".pvd")  #: suffixes for ParaView: one state, or all load steps
 
 
 def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    """Return the path of a file that can be written.
+    """Check that `path` can name an output file, and return the path.
 
     Raises
     ------
     InputError
-        If the suffix is not in `suffixes`, `path` is a folder, or its folder is
-        missing.
+        If the suffix is not in `suffixes`, `path` is a folder, or the folder that would
+        contain the file is missing.
 
     """
     path = checked.path("path", path)
@@ -45,7 +45,7 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def check_result_folder(folder: Path) -> Path:
-    """Return the path of an existing folder.
+    """Check that a folder exists, and return its path.
 
     Raises
     ------
@@ -60,7 +60,9 @@ def check_result_folder(folder: Path) -> Path:
 
 
 def tolerance(tol: float, where: str = "tol") -> float:
-    """Check a relative tolerance, and return it as a float.
+    """Check a relative tolerance, and return the tolerance as a float.
+
+    where : name of the argument, for the message
 
     Raises
     ------
@@ -74,13 +76,16 @@ def tolerance(tol: float, where: str = "tol") -> float:
 
 
 def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, Any]:
-    """Return the options of a solver, from a mapping and from keyword arguments.
+    """Merge the options of a solver from a mapping and from keyword arguments.
+
+    options : mapping from names to values, or None
+    more : keyword arguments
 
     Raises
     ------
     InputError
-        If `options` is neither None nor a mapping from names to values, or a name is
-        in both.
+        If `options` is neither None nor a mapping from names to values, or a name is in
+        both `options` and `more`.
 
     """
     options = {} if options is None else options
@@ -96,15 +101,17 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
 
 
 def check_scale(scale: float, where: str = "scale") -> float:
-    """Check the magnification of displacements in pictures, and return it.
+    """Check the magnification of displacements in pictures, and return its value.
+
+    where : name of the argument, for the message
 
     Raises
     ------
     InputError
-        If the absolute value of `scale` is not at most 1e9.
+        If `scale` is NaN or its absolute value exceeds `MAX_SCALE`.
 
     """
-    if not abs(scale) <= MAX_SCALE:  # `not ≤` is true for NaN as well
+    if not abs(scale) <= MAX_SCALE:  # unlike `>`, this also rejects NaN
         raise InputError(
             f"{where} = {scale:g}; expected a number, at most {MAX_SCALE:g}"
         )
@@ -112,7 +119,9 @@ def check_scale(scale: float, where: str = "scale") -> float:
 
 
 def budget(seconds: float, where: str = "budget") -> float:
-    """Check a time budget in seconds, and return it.
+    """Check a time budget in seconds, and return its value.
+
+    where : name of the argument, for the message
 
     Raises
     ------
@@ -120,7 +129,7 @@ def budget(seconds: float, where: str = "budget") -> float:
         If `seconds` is not a number ≥ 0.
 
     """
-    if not checked.is_number(seconds) or not seconds >= 0:  # true for NaN as well
+    if not checked.is_number(seconds) or not seconds >= 0:  # `not ≥` also rejects NaN
         raise InputError(
             f"{where} = {shown(seconds)}; expected a number of seconds ≥ 0"
         )
@@ -130,12 +139,16 @@ def budget(seconds: float, where: str = "budget") -> float:
 def check_names(
     kind: str, names: Sequence[str], allowed: Sequence[str], where: str
 ) -> None:
-    """Raise unless all names, such as those of formats, are allowed.
+    """Check that all names, such as those of formats, are allowed.
+
+    kind : noun for such a name, in the message
+    where : name of the argument, for the message
 
     Raises
     ------
     InputError
-        If a name is not allowed; the message lists the nearest name or all of them.
+        If a name is not allowed; the message suggests the most similar allowed name or
+        lists all of them.
 
     """
     for name in names:

@@ -1,4 +1,4 @@
-"""Cases, defined by a name or a bare QP, with the recovery of physical results."""
+"""Cases: QPs, named or passed as objects, with the recovery of physical results."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 
 class Case(plugin.Case):
-    """One QP of one problem, built at first use."""
+    """QP of a problem with the recovery of physical results, built at first use."""
 
     def __init__(self, *, id: CaseId, registries: Registries) -> None:  # noqa: A002
         self.id = id  #: family, parameters and form
-        self.registries = registries  #: families and reference solve for building it
+        self.registries = registries  #: families and reference solver for the build
 
     @cached_property
     def family_case(self) -> plugin.Case:
@@ -42,7 +42,7 @@ class Case(plugin.Case):
         Raises
         ------
         InputError
-            If it cannot be built.
+            If the case cannot be built.
 
         """
         origin = self.registries.origins.get(self.id.family.name)
@@ -59,14 +59,14 @@ class Case(plugin.Case):
 
     @property
     def name(self) -> str:
-        """Canonical name FAMILY/key=value/…/FORM, without keys implied by others."""
+        """Canonical name FAMILY/key=value/…/FORM, without keys that can be omitted."""
         return self.id.name
 
     @cached_property
     def qp(self) -> QP:
-        """Non-dimensional QP: energy in SI units = scale·objective + constant.
+        """Non-dimensional QP; its energy in SI units is scale · objective + constant.
 
-        Its matrices have types that other libraries accept: ``scipy.sparse``
+        The matrices have types that other libraries accept: ``scipy.sparse``
         ``csc_matrix`` with 32-bit indices, or dense arrays. P of a decomposed problem
         is an operator, whose matrix is ``P @ numpy.eye(n)``.
         """
@@ -74,36 +74,36 @@ class Case(plugin.Case):
 
     @property
     def scale(self) -> float:
-        """Factor from the objective of the QP to an energy in SI units."""
+        """Factor that converts the objective of the QP to an energy in SI units."""
         return self.family_case.scale
 
     @property
     def constant(self) -> float:
-        """Energy in SI units at which the objective of the QP is zero."""
+        """Energy in SI units for which the objective of the QP is zero."""
         return self.family_case.constant
 
     @property
     def matrices(self) -> Mapping[str, Any]:
-        """Matrices of a dual form in the notation of the paper."""
+        """Matrices of a dual form by their names in the paper."""
         return self.family_case.matrices
 
     @property
     def dualise_seconds(self) -> float | None:
-        """Time to assemble a dual form, with factorisation; None for primal forms."""
+        """Time to factorise and assemble a dual form, in s; None for primal forms."""
         return self.family_case.dualise_seconds
 
     @property
     def mechanics(self) -> Mechanics | None:
-        """Mechanical problem for certificates, or None."""
+        """Mechanical problem from which error bounds are certified; None if unknown."""
         return self.family_case.mechanics
 
     @property
     def unsettled(self) -> float:
-        """Relative distance of the QP from the fixed point that it approximates."""
+        """Relative distance of the QP from the fixed point of its sequence; else 0."""
         return self.family_case.unsettled
 
     def recover(self, solution: Solution) -> Vector:
-        """Return the physical unknown of a point (displacements, …) in SI units."""
+        """Recover the physical unknown, such as displacements, in SI units."""
         return self.family_case.recover(solution)
 
     @property
@@ -113,22 +113,22 @@ class Case(plugin.Case):
 
     @property
     def form(self) -> str:
-        """Formulation of the problem as a QP: primal, dual, …."""
+        """Formulation of the problem as a QP, such as ``primal`` or ``dual``."""
         return self.id.form
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Possible mistakes in the input, a line each, such as unusual moduli."""
+        """Possible mistakes in the input, such as unusual moduli, one line each."""
         return self.family_case.remarks
 
     @TURN
     def quantities(self, solution: Solution) -> dict[str, Any]:
-        """Return physical results of a point in SI units: energy, tip, pressures, …."""
+        """Return physical results of a point in SI units, such as its energy."""
         return dict(plain(self.family_case.quantities(solution)))
 
     @TURN
     def fields(self, solution: Solution) -> Fields:
-        """Return the deformed bodies of a point with stresses and contact forces, SI.
+        """Return the deformed bodies with stresses and contact forces, in SI units.
 
         Raises
         ------
@@ -141,7 +141,7 @@ class Case(plugin.Case):
         return self.family_case.fields(solution)
 
     def save(self, path: str | Path) -> Path:
-        """Write the QP to a file for other programs, see `export`.
+        """Write the QP to a file for other programs; see `export`.
 
         Raises
         ------
@@ -207,7 +207,7 @@ def _exported(M: Matrix) -> Matrix:
 
 
 class BareQP(plugin.Family):
-    """Family of a single problem: a QP without physical results."""
+    """Family of a single problem: a QP that was passed as an object."""
 
     name = "qp"
     defaults: Mapping[str, plugin.Value] = MappingProxyType({})
@@ -227,15 +227,18 @@ class BareQP(plugin.Family):
 
 
 def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
-    """Return an unbuilt case for a name or a QP; a case is returned unchanged.
+    """Return the case of a name or a QP, not built yet.
+
+    A case is returned unchanged, unless `plugins` contains files that it has not
+    loaded.
 
     plugins : Python files with more families or solvers
 
     Raises
     ------
     InputError
-        If `problem` is of another type, there is no such case, or a plug-in cannot be
-        loaded.
+        If the type of `problem` is none of these, there is no such case, or a plug-in
+        cannot be loaded.
 
     """
     match problem:
@@ -249,7 +252,7 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
                 extended.__dict__["family_case"] = problem.family_case
             return extended
         case QP():
-            # our code expects sparse arrays; `*` of sparse matrices differs
+            # Our code expects sparse arrays; `*` of sparse matrices is their product.
             family = BareQP(problem.with_matrices(csc_array))
             name = CaseId(family=family, name="qp", params={}, form="qp")
             return Case(id=name, registries=load_registries(plugins))
@@ -267,8 +270,8 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
     """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
 
     FCLIB files contain problems over friction cones (`Cones`). For a case
-    ``fclib:PATH``, the problem of the original file is written with all arrays
-    unchanged, instead of the convex problem of the case.
+    ``fclib:PATH``, the file contains the problem of the original file with all arrays
+    unchanged, not the convex problem of the case.
 
     Parameters
     ----------
@@ -279,8 +282,8 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
     Raises
     ------
     InputError
-        If there is no such case, it cannot be built, the suffix is unknown, the format
-        cannot store the QP, or the file cannot be written.
+        If there is no such case, the case cannot be built, the suffix is unknown, the
+        format cannot store the QP, or the file cannot be written.
 
     Examples
     --------
@@ -301,7 +304,7 @@ def build(name: str, *, plugins: Plugins = ()) -> Case:
     Raises
     ------
     InputError
-        If there is no such case, or it cannot be built.
+        If there is no such case, or the case cannot be built.
 
     Examples
     --------
@@ -321,8 +324,8 @@ def build_case(case: CaseId, registries: Registries) -> Case:
     Raises
     ------
     InputError
-        If the family refuses the parameters, the code of a plug-in fails, or the memory
-        is too small.
+        If the family rejects the parameters, the code of a plug-in fails, or the memory
+        is insufficient.
 
     """
     new_case = Case(id=case, registries=registries)

@@ -21,13 +21,13 @@ from mortarbench.text import first_comment, first_sentence, listing
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: data of our solvers for `list solvers`, which need not import them;
-#: written by `make docs`, and compared with the solvers by a test
+#: Data of our solvers, so that `list solvers` need not import the solvers. `make docs`
+#: writes the file, and a test compares its content with the solvers.
 CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
 class Listing(tuple[Mapping[str, Any], ...]):
-    """Rows of plain data, which a notebook shows as a table."""
+    """Rows of plain data, displayed as a table in notebooks."""
 
     __slots__ = ()
 
@@ -56,9 +56,10 @@ class Listing(tuple[Mapping[str, Any], ...]):
 
 
 def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
-    """List the solvers: name, description, options with their defaults.
+    """List the solvers: name, description, and options with their defaults.
 
     plugins : Python files with more solvers
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -86,9 +87,10 @@ def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> L
 
 
 def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
-    """List the families: name, description, keys with their defaults, forms.
+    """List the families: name, description, keys with their defaults, and forms.
 
     plugins : Python files with more families
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -115,7 +117,9 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
 
 
 def suites(*, registries: Registries | None = None) -> Listing:
-    """List the suites of the package: name, description, path.
+    """List the suites of the package: name, description and path.
+
+    registries : replaces our registries
 
     Examples
     --------
@@ -146,7 +150,12 @@ def describe(solver: Solver) -> dict[str, Any]:
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row for a solver; its description names the library if it is missing."""
+    """Return the row of a solver in the list.
+
+    The description states if the library of the solver is missing.
+
+    entry : entry of the solver in the catalogue, see `describe`
+    """
     line = entry["sentence"]
     if entry["about"] is not None:
         facts = About(**entry["about"])
@@ -163,6 +172,6 @@ def catalogue() -> dict[str, Any]:
 
 
 def about(solver: Solver) -> About | None:
-    """Return the `About` of a solver, or None if it has none."""
+    """Return the `About` of a solver, or None if the solver does not define one."""
     facts = getattr(solver, "about", None)
     return facts if isinstance(facts, About) else None

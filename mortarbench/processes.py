@@ -1,4 +1,4 @@
-"""Entry points of the processes of a run: workers of solvers, ranks, case workers."""
+"""Main functions of the processes of a run: workers, ranks and the case worker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from mortarbench.registries import Registries
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run as the worker that `Registries.worker_command` starts."""
+    """Run a worker, started by the command of `Registries.worker_command`.
+
+    arguments : JSON object, and file descriptors of requests and replies
+    """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     stand_for_harness()
@@ -55,13 +58,19 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
 
 
 def ranks(registries: Registries, arguments: Sequence[str]) -> int:
-    """Start the ranks of the worker that `Registries.worker_command` starts."""
+    """Start a worker on several ranks, by the command of `Registries.worker_command`.
+
+    arguments : see `worker`
+    """
     count = json.loads(arguments[0])["ranks"]
     return launch(count, [*registries.start, "worker", *arguments])
 
 
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run as the case worker that `Registries.commands` starts."""
+    """Run the case worker, started by the command of `Registries.commands`.
+
+    arguments : JSON object, and file descriptors of requests and replies
+    """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     stand_for_harness()

@@ -1,8 +1,8 @@
-"""Displays of the progress of a run: a bar, lines, or calls of a function.
+"""Displays of the progress of a run.
 
-A run reports to a `Progress` (see `harness.running.progress`). The classes here show
-it: a bar on a terminal, a bar in a notebook, a line per measurement elsewhere, or
-events for a function of the user.
+A run reports its progress to a `Progress` (see `harness.running.progress`). The classes
+of this module show a bar on a terminal or in a notebook, print one line per measurement
+elsewhere, or call a function of the user.
 """
 
 from __future__ import annotations
@@ -20,31 +20,31 @@ from mortarbench.harness.errors import shown as repeated
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
-_REASON_LENGTH = 120  #: characters of a reason to decline that are shown
-_BAR_WIDTH = 60  #: minimum number of columns of a terminal for a bar and numbers
-_UPDATE_SECONDS = 0.2  #: seconds between two updates of a bar in a notebook
+_REASON_LENGTH = 120  #: length to which the reason for declining a QP is shortened
+_BAR_WIDTH = 60  #: smallest width of a terminal, in columns, at which a bar is shown
+_UPDATE_SECONDS = 0.2  #: shortest time between two updates of a bar in a notebook
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """State of a run at one moment, passed to the function `progress` of `run`."""
 
-    done: int  #: measurements so far, including those of earlier runs
-    total: int
+    done: int  #: number of measurements so far, including those of earlier runs
+    total: int  #: number of measurements of the run
     now: str = ""  #: current activity
-    warning: str = ""  #: message if something went wrong, else empty
-    record: Record | None = None  #: measurement that was just completed, if any
+    warning: str = ""  #: warning that caused this event, else empty
+    record: Record | None = None  #: measurement that was just completed, or None
 
 
 Callback = Callable[[Event], object]
 
 
 class _Display:
-    """Counters of a run; subclasses show them."""
+    """Counters of a run; subclasses display them."""
 
     def __init__(self) -> None:
         self.done = self.total = 0
-        self.measured = 0  # by this run; `done` includes earlier runs
+        self.measured = 0  # number of measurements of this run, unlike `done`
         self.began = monotonic()
         self.now = ""
 
@@ -64,7 +64,7 @@ class _Display:
         self.changed()
 
     def count(self, record: Record | None) -> None:
-        """Count a unit as done, and as measured if there is a record."""
+        """Count a cell as done, and as measured if there is a record."""
         self.done += 1
         self.measured += record is not None
 
@@ -74,7 +74,7 @@ class _Display:
         return remaining(self.measured, self.total - self.done, seconds)
 
     def changed(self) -> None:
-        """Show the new state."""
+        """Update the display after a change of the counters."""
 
 
 class _Silent(_Display):
@@ -112,7 +112,7 @@ class _Warnings(_Display):
         self._stream = stream
 
     def warn(self, text: str) -> None:
-        # the run must continue if the reader of its output has been closed
+        # The run must continue after the reader of its output has closed the pipe.
         with suppress(BrokenPipeError):
             print(text, file=self._stream, flush=True)
 
@@ -145,7 +145,7 @@ def is_notable(record: Record) -> bool:
 
 
 class _Bar(_Display):
-    """Bar of `rich`, with a line above it for each answer that is not verified."""
+    """Progress bar of `rich`; answers that are not verified are printed above it."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class _Bar(_Display):
 
 
 class _Notebook(_Display):
-    """Bar in a notebook, with a line above it for each answer that is not verified."""
+    """Progress bar in a notebook, below a line for each answer that is not verified."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -216,10 +216,10 @@ class _Html:
 
 
 def remaining(measured: int, to_do: int, seconds: float) -> str:
-    """Return the time left at the present rate, "H:MM:SS left"; empty if unknown.
+    """Return the remaining time at the present rate, as "H:MM:SS left"; "" if unknown.
 
-    measured : number of measurements that took the `seconds`; measurements of earlier
-        runs do not count
+    measured : number of measurements of this run, which took `seconds`
+    to_do : number of remaining measurements
     """
     if measured <= 0 or to_do <= 0:
         return ""
@@ -229,14 +229,14 @@ def remaining(measured: int, to_do: int, seconds: float) -> str:
 
 
 def in_notebook() -> bool:
-    """Return True if this Python is the kernel of a notebook."""
+    """Return True if this process is the kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return shell is not None and "IPKernelApp" in getattr(shell, "config", {})
 
 
 @contextmanager
 def display_on(stream: TextIO) -> Iterator[Progress]:
-    """Show a run on a stream: a bar on a terminal, else a line per measurement."""
+    """Show progress on a stream: a bar on a terminal, else one line per measurement."""
     if not stream.isatty():
         yield _Lines(stream)
         return
@@ -253,9 +253,10 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
     from rich.text import Text
 
     class TimeLeft(ProgressColumn):
-        """Remaining time over all measurements.
+        """Remaining time, estimated from all measurements of the run.
 
-        The column of rich uses the last half minute, which may contain no measurement.
+        The corresponding column of rich uses only the last half minute, in which there
+        may be no measurement.
         """
 
         def render(self, task: Task) -> Text:
@@ -276,13 +277,13 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
 
 @contextmanager
 def warnings_on(stream: TextIO) -> Iterator[Progress]:
-    """Show only the warnings of a run, on a stream."""
+    """Print only the warnings of a run to a stream."""
     yield _Warnings(stream)
 
 
 @contextmanager
 def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
-    """Show a run according to the argument `progress` of `mortarbench.run`."""
+    """Provide the display for the argument `progress` of `mortarbench.run`."""
     if progress is None and in_notebook():
         yield _Notebook()
     elif progress is True:

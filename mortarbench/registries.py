@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.results.work_unit import Commands
     from mortarbench.harness.solution import Solution
 
-#: Lock by which only one thread at a time loads plug-ins, builds, solves or validates,
-#: which changes thread counts, standard output and modules of the whole process.
+#: Lock that lets only one thread at a time load plug-ins, build, solve or validate.
+#: These actions change thread counts, standard output and modules of the whole process.
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
@@ -45,7 +45,7 @@ Plugins = Sequence[str | Path | PluginFile]
 
 
 class Reporter(Protocol):
-    """Function that writes the report on a result folder and returns its files."""
+    """Function that writes the report on a result folder and returns the files."""
 
     def __call__(
         self,
@@ -55,14 +55,16 @@ class Reporter(Protocol):
         factor: float = ...,
         pool_forms: bool = ...,
     ) -> list[Path]:
-        """Write the report, with verdicts at factor·tol.
+        """Write the report.
 
-        pool_forms : compare solvers over the cases of all forms together
+        factor : a point is verified if every residual is at most factor·tol
+        pool_forms : compare solvers over the cases of all forms together, instead of
+            within each form
         """
 
 
 def _plugin_files(files: Plugins) -> list[PluginFile]:
-    """Return a list of plug-ins; a single string or path is refused as a mistake."""
+    """Check that `files` is a list of Python files, and return the list of plug-ins."""
     if isinstance(files, str | Path) or not isinstance(files, Iterable):
         raise InputError(
             f"plugins = {shown(files)}; expected a list of Python files, such as "
@@ -83,10 +85,10 @@ def suites_folder() -> Path:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Limit every library to one thread, as the processes of a run do.
+    """Limit every library to one thread, as in the processes of a run.
 
-    With several threads the order of sums differs, and with it the last digits of the
-    QP of a case. Another thread that enters this context waits until this one leaves.
+    With several threads, sums are evaluated in a different order, and the last digits
+    of a QP differ. Only one thread at a time can enter this context; others wait.
     """
     from scipy import linalg  # threadpoolctl limits only libraries that are loaded
     from sksparse import cholmod
@@ -100,8 +102,9 @@ def one_thread() -> Iterator[None]:
 def defer_parts_of_numpy() -> None:
     """Defer the execution of numpy's modules f2py and testing to their first use.
 
-    mortarbench does not use them, but `scipy._lib.array_api_compat.numpy` accesses
-    every name of numpy. Importing them takes a quarter of a worker's start-up time.
+    mortarbench does not use these modules, but `scipy._lib.array_api_compat.numpy`
+    accesses every name of numpy and thus imports them, which takes a quarter of a
+    worker's start-up time.
     """
     import numpy
 
@@ -112,11 +115,11 @@ def defer_parts_of_numpy() -> None:
         spec.loader = LazyLoader(spec.loader)
         module = sys.modules[spec.name] = module_from_spec(spec)
         spec.loader.exec_module(module)
-        setattr(numpy, part, module)  # otherwise numpy.__getattr__ imports it again
+        setattr(numpy, part, module)  # so that numpy.__getattr__ does not import it
 
 
 def reference(qp: QP) -> Solution:
-    """Solve to nearly rounding accuracy, without using a solver under test."""
+    """Solve a QP almost to rounding accuracy, by a solver that is not under test."""
     from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)
@@ -129,7 +132,7 @@ def report_folder(
     factor: float | None = None,
     pool_forms: bool = False,
 ) -> list[Path]:
-    """Write our report on a result folder."""
+    """Write our report on a result folder, and return the files; see `Reporter`."""
     from mortarbench.harness.record import VERIFIED_FACTOR
     from mortarbench.reports import write_report
 
@@ -151,7 +154,7 @@ def _validation_page(
 
 
 class _FamiliesWithCopies(Mapping[str, Family]):
-    """Families that read files from the copies in a result folder."""
+    """Families that read missing files from the copies in a result folder."""
 
     def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
         self._families = families
@@ -182,24 +185,24 @@ class Registries:
     validation_page: ValidationPage = _validation_page
     #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
-    #: the operators among them that do not come from plug-in files
+    #: operators that are not from plug-in files
     own_operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
-    suites: Path = field(default_factory=suites_folder)
+    suites: Path = field(default_factory=suites_folder)  #: folder of the suites
     #: plug-in files, which the processes of a run load as well
     files: tuple[PluginFile, ...] = ()
-    #: plug-in of each family that comes from a plug-in
+    #: origin of each family that is from a plug-in, by name of the family
     origins: Mapping[str, str] = field(default_factory=dict)
-    #: command line without the name of the process. -P prevents the import of a file in
-    #: the working directory in place of a library
+    #: Start of the command lines of processes. Because of -P, Python does not import
+    #: files in the working directory in place of libraries.
     start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
 
     def extended(self, plugin: Plugin) -> Registries:
-        """Return registries with the solvers, problems and operators of a plug-in.
+        """Return registries extended by the contents of a plug-in.
 
         Raises
         ------
         InputError
-            If one of its names exists already.
+            If a name in the plug-in exists already.
 
         """
         return replace(
@@ -212,12 +215,12 @@ class Registries:
 
     @TURN
     def with_files(self, files: Plugins) -> Registries:
-        """Return registries with the plug-ins in `files`.
+        """Return registries extended by the plug-ins in `files`.
 
         Raises
         ------
         InputError
-            If one cannot be loaded, or one of its names exists already.
+            If a plug-in cannot be loaded, or a name in it exists already.
 
         """
         extended = self
@@ -252,10 +255,12 @@ class Registries:
         )
 
     def worker_command(self, spec: SolverSpec, copy: Path | None = None) -> list[str]:
-        """Return the command that starts the worker of a solver, without its two pipes.
+        """Return the command that starts the worker of a solver.
 
-        copy : file of the configured solver, if it is an object; see
-            `harness.processes.solver_file`
+        The file descriptors of the worker's two pipes must be appended.
+
+        copy : file that contains the configured solver if it was passed as an object,
+            see `harness.processes.solver_file`; else None
 
         Raises
         ------
@@ -282,9 +287,10 @@ class Registries:
             ) from None
 
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
-        """Return the families, which read files from the copies in a result folder.
+        """Return the families, which then read missing files from a result folder.
 
-        folder : result folder, checked by `refuse_links`; None if there are no copies
+        folder : result folder with copies, checked by `refuse_links`; None if there are
+            no copies
         """
         return _FamiliesWithCopies(self.families, folder)
 
@@ -309,8 +315,9 @@ class Registries:
     def environment(self) -> dict[str, Any]:
         """Return the environment of the processes of a run; see `capture`.
 
-        A new process captures it unless this process is also limited to one thread,
-        because programs such as a notebook load other libraries and use threads.
+        If this process is limited to one thread, as those of a run are, it captures its
+        own environment. Otherwise, for example in a notebook with other libraries, a
+        new process captures the environment.
         """
         from mortarbench.harness.environment.environment import capture, capture_in
         from mortarbench.solvers.common.libraries import PACKAGES
@@ -318,19 +325,20 @@ class Registries:
         if ONE_THREAD.items() <= os.environ.items():
             here = capture(self.files, PACKAGES)
             if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
-                return here  # else the limits were set after libraries had been loaded
+                return here
+            # otherwise the limits were set after the libraries had been loaded
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
         return [str(file.resolved()) for file in self.files]
 
     def suite_path(self, text: str | Path) -> Path:
-        """Return the path of a suite, for a path or for the name of one of `suites`.
+        """Return the path of a suite that is given by a path or a name in `suites`.
 
         Raises
         ------
         InputError
-            If neither exists.
+            If there is no such file and no suite of this name.
 
         """
         path = checked.path("suite", text)
@@ -340,19 +348,19 @@ class Registries:
         if str(text) in suites:
             return suites[str(text)]
         if path.exists():
-            return path  # not a file: reading it raises the appropriate error
+            return path  # not a regular file; the reader raises the appropriate error
         if len(path.parts) > 1 or path.suffix:
             raise InputError(f"{text}: no such file; expected a suite in TOML")
         raise unknown("suite", str(text), suites)
 
 
 def installed(registries: Registries) -> Registries:
-    """Return registries with the plug-ins of installed packages (entry points).
+    """Return registries extended by the plug-ins of installed packages (entry points).
 
     Raises
     ------
     InputError
-        If one fails to import, or one of its names exists already.
+        If a plug-in cannot be imported, or a name in it exists already.
 
     """
     return registries.extended(entry_point_plugins())
@@ -362,14 +370,15 @@ def installed(registries: Registries) -> Registries:
 def load_registries(
     plugins: Plugins = (), registries: Registries | None = None
 ) -> Registries:
-    """Return our registries with those of installed plug-ins and of plug-in files.
+    """Return our registries extended by installed plug-ins and by plug-in files.
 
+    plugins : plug-in files
     registries : if not None, this value is returned instead
 
     Raises
     ------
     InputError
-        If a plug-in cannot be loaded, or one of its names exists already.
+        If a plug-in cannot be loaded, or a name in it exists already.
 
     """
     if registries is None:

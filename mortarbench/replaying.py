@@ -1,4 +1,4 @@
-"""Replay of a stored measurement, and comparison of old and new result."""
+"""Repetition of a stored measurement, and comparison of the old and the new result."""
 
 from __future__ import annotations
 
@@ -37,28 +37,31 @@ from mortarbench.text import align
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
-_VALUE_LENGTH = 48  #: characters of an environment value that are shown
+_VALUE_LENGTH = 48  #: length to which a value of the environment is shortened
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Replay:
-    """Stored measurement (`then`) and its repetition (`now`)."""
+    """Stored measurement and its repetition."""
 
-    then: Record
-    now: Record
-    same_qp: bool | None  #: None if the old record has no digest of its QP
-    same_options: bool  #: compared after filling in all defaults
-    same_counts: bool  #: iterations and all counts
-    distance: float | None  #: ‖x_now − x_then‖∞ / ‖x_then‖∞; None if a point is missing
+    then: Record  #: stored measurement
+    now: Record  #: its repetition
+    #: True if the QPs are equal; None if the old record has no digest of its QP
+    same_qp: bool | None
+    same_options: bool  #: True if all options are equal, including default values
+    same_counts: bool  #: True if the iterations and all counts are equal
+    #: ‖x_now − x_then‖∞ / ‖x_then‖∞ of the two points x; None if a point is missing
+    distance: float | None
     ratios: Mapping[str, tuple[float, float, float] | None]
-    """Ratios of times: the new one, the smallest and the largest stored repeat, each
-    relative to the median of the stored repeats. None if a time was not measured."""
-    stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, s
-    environment: list[tuple[str, Any, Any]]  #: differences: dotted key, then, now
+    """Ratios of the new time, and of the smallest and the largest time of the stored
+    repeats, to the median of the stored repeats. None if a time was not measured."""
+    stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, in s
+    #: differences of the environments: dotted key, old value, new value
+    environment: list[tuple[str, Any, Any]]
 
     @property
     def reproduced(self) -> bool:
-        """True if the verdict is the same and no difference of the QPs is known."""
+        """True if the verdicts are equal and the QPs are not known to differ."""
         return self.same_qp is not False and self.then.verdict is self.now.verdict
 
     def __repr__(self) -> str:
@@ -68,7 +71,7 @@ class Replay:
         return f"<pre>{escape(repr(self))}</pre>"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
+        """Return the comparison as plain data for JSON."""
         lines = {"then": self.then.to_dict(), "now": self.now.to_dict()}
         data: dict[str, Any] = finite(
             {**asdict(self), **lines, "reproduced": self.reproduced}
@@ -93,14 +96,15 @@ def replay(
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    run_id : `run_id` of a line of the journal, or its first digits
+    run_id : `run_id` in a line of the journal, or the first digits of it
     plugins : Python files with more solvers or families
     registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        If there is no such measurement, or its case or solver is unknown.
+        If there is no such measurement, its case or solver is unknown, or the case
+        cannot be built.
     FaultError
         If something other than the solver prevents the measurement.
 
@@ -142,7 +146,11 @@ def compare(
     result: Result,
     environment: Mapping[str, Any],
 ) -> Replay:
-    """Compare a new measurement and its point with those stored in `folder`."""
+    """Compare a new measurement and its point with those stored in `folder`.
+
+    run : stored measurement, with the other repeats of the same measurement
+    environment : environment of the new measurement
+    """
     then, now = run.record, result.record
     stored = {
         name: tuple(s for r in run.repeats if (s := getattr(r, name)) is not None)
@@ -166,7 +174,7 @@ def compare(
 
 
 def render(c: Replay) -> str:
-    """Return a comparison as a table: old value, new value, and whether they agree."""
+    """Return a comparison as text: a table of old and new values, and a conclusion."""
     rows = [["", "then", "now", ""], *_verdicts(c), *_numbers(c), *_times(c)]
     lines = [f"{c.now.run_id}  {c.now.solver} on {c.now.case}, tolerance {c.now.tol:g}"]
     lines += ["", align(rows), ""]
@@ -179,7 +187,7 @@ def render(c: Replay) -> str:
     if c.reproduced:
         lines.append("Reproduced: the same verdict.")
     elif c.same_qp is False:
-        lines.append("Not reproduced: the case now has another QP.")
+        lines.append("Not reproduced: the case now has a different QP.")
     else:
         lines.append(f"Not reproduced: {c.then.verdict} then, {c.now.verdict} now.")
     return "\n".join(lines)
@@ -245,7 +253,11 @@ def _times(c: Replay) -> Iterable[list[str]]:
 
 
 def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> str:
-    """Return a ratio of times with its reference, the median of the stored repeats."""
+    """Return a ratio as text that states its denominator, the stored median.
+
+    ratio : see `Replay.ratios`
+    stored : times of the stored repeats, in s
+    """
     now, least, greatest = ratio
     if len(stored) == 1:
         return f"{now:.2f} of the only stored repeat"
@@ -260,7 +272,7 @@ def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
         return None
     try:
         solution = load_solution(folder, then.vectors, Status.SOLVED)
-    except InputError:  # vectors may be deleted; the journal alone is valid
+    except InputError:  # users may delete vectors; a journal is valid without them
         return None
     if digest_of(point_arrays(solution)) != then.vectors:  # the file was changed
         return None
@@ -280,9 +292,10 @@ def _ratio(
 
 
 def _pools_by_library(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the environment with its thread pools in a mapping from library names.
+    """Return the environment with its list of thread pools as a mapping.
 
-    Differences are then reported by library, not by the position in a list.
+    The keys are names of libraries, so that differences are reported by library rather
+    than by position in the list.
     """
     threads = environment.get("threads")
     if not isinstance(threads, Mapping):

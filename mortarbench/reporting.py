@@ -1,4 +1,4 @@
-"""Reports on a result folder, and on the changes between several."""
+"""Reports on a result folder, and on the changes between result folders."""
 
 from __future__ import annotations
 
@@ -24,21 +24,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Files of a report, with its main statements."""
+    """Files and main statements of a report."""
 
     files: tuple[Path, ...]
     said: tuple[str, ...] = ()  #: main statements, one line each
     #: changes from the first folder to each of the others, as plain data
+    #: as printed by ``report --json``
     changes: tuple[dict[str, Any], ...] = ()
     failed_on: tuple[str, ...] = ()  #: conditions of `fail_on` that are met
 
     @property
     def page(self) -> Path | None:
-        """HTML page, or None if it was not requested."""
+        """HTML page, or None if the format was not requested."""
         return next((file for file in self.files if file.suffix == ".html"), None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain data, as ``report --json`` prints it."""
+        """Return the report as plain data, the output of ``report --json``."""
         return {
             "said": [*self.said],
             "changes": [*self.changes],
@@ -66,28 +67,29 @@ def report(
     pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
-    """Write the report on a result folder, or on the changes from it to other folders.
+    """Write a report on a result folder, or on the changes from it to other folders.
 
     Parameters
     ----------
-    folder : result folder; its report is written to DIR/report
-    others : if given, the changes from `folder` to each of these folders are reported
-        instead, in the folder ``report`` of each of them
+    folder : result folder; its report is written to the subfolder ``report``
+    others : further result folders. If there are any, the changes from `folder` to each
+        of them are reported instead, in the subfolder ``report`` of the latter
     formats : any of html, md, tex, csv, parquet
-    factor : verified means that every residual is within factor·tol
-    fail_on : conditions listed in `Report.failed_on` if they are met: ``worse``, a
-        verdict became worse; ``slower``, the interval of a ratio of times lies above
-        1, see docs/statistics-growth.md
-    pool_forms : compare solvers over the cases of all forms together in means, ranks
-        and profiles, not within each form; a declined form counts as unsolved
+    factor : a point is verified if every residual is at most factor·tol
+    fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
+        verdict became worse; ``slower``, the confidence interval of a ratio of times
+        lies above 1, see docs/statistics-growth.md
+    pool_forms : True if means, ranks and profiles compare solvers over the cases of all
+        forms together, where a declined form counts as unsolved; False if within each
+        form
     registries : replaces our registries, whose report function is used
 
     Raises
     ------
     InputError
         If a folder contains no measurements, a format or the factor is invalid,
-        `pool_forms` is requested for a comparison, or a condition of `fail_on` cannot
-        be decided.
+        `pool_forms` is requested for a comparison, or it cannot be decided if a
+        condition in `fail_on` is met.
 
     Examples
     --------
@@ -112,7 +114,7 @@ def report(
         write = registries.report
         with report_full_disk(first):
             files = write(first, formats, factor=factor, pool_forms=pool_forms)
-        if write is not report_folder:  # a report function of a plug-in has no `answer`
+        if write is not report_folder:  # `answer` summarises only our own report
             return Report(files=tuple(files))
         from mortarbench.reports import answer
 
@@ -142,7 +144,7 @@ def report(
 
 
 def _undecided(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list[str]:
-    """Return the reasons why a condition of `fail_on` cannot be decided."""
+    """Return the reasons why conditions in `fail_on` cannot be decided, if any."""
     lines = []
     for change in changes if fail_on else ():
         between = f"{change['before']} and {change['after']}"
@@ -203,7 +205,7 @@ def _slower(one: Slower) -> dict[str, Any]:
 
 
 def _interval(ratio: Ratio | Any) -> dict[str, float | None]:
-    """Return a ratio with the ends of its interval; None if it has no interval."""
+    """Return a ratio with the ends of its interval, which are None if undefined."""
     bounded = 0 < ratio.low <= ratio.high < float("inf")
     return {
         "value": ratio.value,

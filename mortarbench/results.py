@@ -1,4 +1,4 @@
-"""Runs of suites, and the results in their folders."""
+"""Runs of suites, and the measurements in result folders."""
 
 from __future__ import annotations
 
@@ -56,17 +56,19 @@ class Results:
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    #: solver labels in the order of the suite; from `load`, the labels in all records
+    #: labels of the requested solvers, in the order of the suite; after `load`, those
+    #: of all records
     solvers: tuple[str, ...] = ()
-    cases: frozenset[str] = frozenset()  #: names of the requested cases; empty: all
-    #: requested measurements that are missing; repeating the call measures them
+    #: names of the requested cases; if empty, all cases in the records
+    cases: frozenset[str] = frozenset()
+    #: requested measurements that are missing; a second call of `run` retries them
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
     def df(self) -> DataFrame:
         """Table with one row per measurement and one column per field of the journal.
 
-        An empty mapping becomes None, because Parquet has no type for it.
+        Empty mappings are replaced by None, because Parquet cannot store them.
         """
         from pandas import DataFrame
 
@@ -84,7 +86,7 @@ class Results:
     def failed(self) -> tuple[Record, ...]:
         """Requested measurements that ended without an answer.
 
-        Measurements that reached a limit are included, declined ones are not.
+        They include measurements that reached a limit, but not declined ones.
         """
         excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(
@@ -103,7 +105,7 @@ class Results:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return counts and failures as plain data, as ``run --json`` prints them."""
+        """Return counts and failures as plain data, the output of ``run --json``."""
         counts: dict[str, Counter[str]] = {}
         for r in self._requested:
             counts.setdefault(r.solver, Counter())[r.verdict.value] += 1
@@ -118,7 +120,7 @@ class Results:
 
     @property
     def shortfall(self) -> list[str]:
-        """Reasons why requested measurements are missing, one line each."""
+        """Reasons why requested measurements are missing, one line for each reason."""
         lines = []
         if count := len(self.missing.unbuilt):
             cases = "case" if count == 1 else "cases"
@@ -139,7 +141,8 @@ class Results:
         Parameters
         ----------
         kind : name of the figure in the folder ``figures`` of the report, such as
-            ``accuracy`` or ``scaling-1``; ``scaling`` if there is only one such figure
+            ``accuracy`` or ``scaling-1``. The number can be omitted if there is only
+            one such figure
         path : file to which the figure is also written: .png, .pdf or .svg
 
         Raises
@@ -203,7 +206,7 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    warn : called with a message for each damaged or incomplete line of the journal
+    warn : called with a message for each damaged or incomplete line in the journal
 
     Raises
     ------
@@ -236,23 +239,23 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
 def merge(
     *folders: str | Path, out: str | Path, tell: Callable[[str], None] = ignore
 ) -> Results:
-    """Merge result folders into a new one, or into one of an earlier merge.
+    """Merge result folders into a new folder or the result of an earlier merge.
 
-    Duplicate measurements are stored once. Records keep their environment, and reports
-    distinguish environments.
+    Duplicate measurements are stored once. The records of each environment remain
+    distinguishable in reports.
 
     Parameters
     ----------
     folders : result folders
-    out : a new folder, or one of an earlier merge
+    out : new folder, or result of an earlier merge
     tell : called with messages about records that `out` already contains, and about
         missing solutions and environments
 
     Raises
     ------
     InputError
-        If a folder contains no measurements, or two suites differ in their limits,
-        their accuracy or the meaning of a label; `out` is then unchanged.
+        If a folder contains no measurements, or if the suites of two folders differ in
+        their limits, their accuracy or the meaning of a label; `out` is then unchanged.
 
     """
     if not folders:
@@ -265,7 +268,7 @@ def merge(
 
 
 def _refuse_objects(solvers: object) -> None:
-    """Refuse solver objects: a result folder stores names only."""
+    """Check that no solver is an object, because result folders store only names."""
     for one in solvers if isinstance(solvers, list | tuple) else [solvers]:
         if is_solver(one):
             raise InputError(
@@ -295,24 +298,28 @@ def run(
 
     Parameters
     ----------
-    suite : path of a TOML file, the name of one of `suites`, or a dict with the keys of
-        such a file; its relative paths refer to the working directory
-    out : result folder; default: ``out/NAME`` for the suite NAME
-    solvers : measure only these solvers; solvers that are not in the suite are added
-    cases : measure only these cases, given by names or patterns
-    repeats, time_limit, memory_limit : override the values of the suite; s, MiB
-    options : options for every solver that has them; each value of a list is measured
+    suite : path of a TOML file, a name listed by `suites`, or a dict with the keys of
+        such a file; relative paths in a dict refer to the working directory
+    out : result folder; by default ``out/NAME`` for the suite NAME
+    solvers : names of the only solvers to measure, which need not be in the suite
+    cases : names or patterns of the only cases to measure
+    repeats, time_limit, memory_limit : override the values of the suite; the limits are
+        in s and MiB
+    options : options to set in every solver that has them; if the value of an option is
+        a list, each value in the list is measured
     fresh : delete the contents of the folder first
-    dask : address of a scheduler, or ``local``
+    dask : address of a Dask scheduler, or ``local`` to start one; None to measure
+        without Dask
     plugins : Python files with more solvers or families
-    progress : True: a bar, or lines if stderr is not a terminal; a function: called
-        with every `Event`; False: nothing; None: a bar in a notebook, else nothing
+    progress : True for a bar, or for lines if stderr is not a terminal; a function to
+        be called with every `Event`; False for no display; None for a bar in a notebook
+        and no display elsewhere
     registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        If an argument is wrong, the folder is in use, or its disk is full.
+        If an argument is invalid, the folder is in use, or its disk is full.
 
     Examples
     --------
@@ -350,9 +357,9 @@ def run(
     else:
         text = read_text(registries.suite_path(suite), "a TOML file", MAX_TOML_MIB)
     folder = folder or Path("out") / name_in(text)
-    fresh = checked.flag("fresh", fresh)  # True deletes the copies of files as well
+    fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
-        # before copies of files are read, since a link could lead outside the folder
+        # Check this before copies are read: a link could lead out of the folder.
         refuse_links(folder)
     families = registries.families_with_copies(None if fresh else folder)
     known_solvers = registries.solvers

@@ -1,4 +1,4 @@
-"""Text output of commands: aligned tables from plain data."""
+"""Text output of commands, mainly tables with aligned columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.solution import History
 
-#: units of quantities of elastic bodies in the plane; other quantities have none
+#: units of the quantities of plane elastic bodies; other quantities have no unit
 UNITS = {
     "energy": "J/m",
     "dissipation": "J/m",
@@ -38,7 +38,8 @@ UNITS = {
     "stress_error": "(dimensionless)",
 }
 _CONTACTS = "contacts"  #: quantity with a table for each pair of sides
-_SHARE = "shear_without_contact"  #: shown beside `sliding_without_contact`
+#: quantity that is shown on the line of `sliding_without_contact`
+_SHARE = "shear_without_contact"
 _CONTACT_UNITS = {
     "largest_pressure": "Pa",
     "smallest_gap": "m",
@@ -65,22 +66,23 @@ _LEGEND = {
     "their bounds",
     "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
     "active": "at bound: variables at one of their bounds",
-    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
-    "slip",
+    "two_sided": "of two: variables at a bound that have two bounds; with friction, "
+    "rows that slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }
 _HIDDEN = (
     "seconds",
-)  #: columns of a history that are not shown: a single run gives no reliable times
+)  #: columns of a history that are not shown; times of a single run are unreliable
 CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED` in a record
-_MAX_ROWS = 15  #: rows of a table of convergence
+_MAX_ROWS = 15  #: largest number of rows in a table of iterations
 
 
 def first_sentence(thing: object) -> str:
-    """Return the first sentence of the docstring of an instance's class.
+    """Return the first sentence of the docstring of an object's class.
 
-    Empty if the class has none, or only the signature that `dataclass` generates.
+    The sentence is empty if the class has no docstring, or only the signature that
+    `dataclass` generates.
     """
     kind = type(thing)
     paragraph = (inspect.getdoc(kind) or "").partition("\n\n")[0]
@@ -91,13 +93,16 @@ def first_sentence(thing: object) -> str:
 
 
 def first_comment(path: Path) -> str:
-    """Return the comment in the first line of a suite, or an empty string."""
+    """Return the comment in the first line of a suite, or "" if there is no comment."""
     line = path.read_text("utf-8").partition("\n")[0]
     return line.removeprefix("#").strip() if line.startswith("#") else ""
 
 
 def listing(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return one line per row: name, description, keys or options, forms."""
+    """Return an aligned list with the name, description, keys and forms in each row.
+
+    A row without keys has the options of a solver instead.
+    """
     return align(
         [
             row["name"],
@@ -121,9 +126,9 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
 
 
 def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
-    """Return a table of the claims and verdicts of each solver, with a header row.
+    """Count the claims and verdicts of each solver; return a table with a header row.
 
-    The `solvers` come first, followed by the other solvers of the records.
+    The rows of `solvers` come first, followed by those of other solvers in `records`.
     """
     latest = {r.run_id: r for r in records}.values()
     header = [
@@ -156,7 +161,7 @@ def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
 
 
 def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return names and values that describe one measurement, in SI units.
+    """Return the results of one measurement as pairs of name and value, in SI units.
 
     defaults : default options of the solver; options with these values are omitted
     """
@@ -202,12 +207,19 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
 
 
 def _units(per: str) -> Mapping[str, str]:
-    """Return units of quantities; `per` is "/m" for plane bodies, and "" in space."""
+    """Return the units of quantities by name.
+
+    per : "/m" for plane bodies, whose forces are per metre of thickness; "" in space
+    """
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _quantity(r: Record, name: str, unit: str) -> str:
-    """Return the text of a quantity, with the share of shear for sliding nodes."""
+    """Return the value of a quantity as text.
+
+    The number of nodes that slide without contact is followed by the fraction of all
+    shear that they carry.
+    """
     text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
     if name != "sliding_without_contact" or not isinstance(share, float):
         return text
@@ -215,8 +227,9 @@ def _quantity(r: Record, name: str, unit: str) -> str:
 
 
 def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
-    """Return rows for each pair of sides that may touch.
+    """Return the rows of results for each contact pair.
 
+    pairs : results by name of the pair; there are no rows if it is not a mapping
     force : unit of forces
     """
     if not isinstance(pairs, Mapping):
@@ -234,7 +247,10 @@ def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
 
 
 def _bound(r: Record) -> str:
-    """Return the text of the certified error, which may exclude rigid motions."""
+    """Return the certified error bound as text, or "" if there is no bound.
+
+    The bound may be in a seminorm, which excludes rigid motions.
+    """
     if r.energy_bound is None:
         return ""
     beside = ", excluding rigid motions" if r.certificate.get("seminorm") else ""
@@ -245,10 +261,11 @@ def _bound(r: Record) -> str:
 
 
 def convergence(history: History) -> str:
-    """Return a table of the iterations that a solver reports; empty without a history.
+    """Return a table of the iterations that a solver reports; "" without a history.
 
-    There is a row for the end of each outer iteration, or, without outer iterations,
-    for at most 15 steps. A row counts the steps since the previous row: "c12 e3".
+    Each row shows the end of an outer iteration or, if the solver has no outer
+    iterations, a single iteration. If there are more than 15 rows, 15 evenly spaced
+    ones are shown. Steps are counted by type since the previous row, such as "c12 e3".
     """
     columns = {k: v for k, v in history.items() if v.size and k not in _HIDDEN}
     if not columns:
@@ -267,13 +284,13 @@ def convergence(history: History) -> str:
 
 
 def legend(history: History) -> str:
-    """Return the legend of `convergence`, a line per column of the history."""
+    """Return the legend of `convergence`, one line per column of the history."""
     lines = (text for k, text in _LEGEND.items() if k in history and history[k].size)
     return "\n".join(lines)
 
 
 def _milestones(history: History) -> list[int]:
-    """Return the rows to show: the last of each outer iteration, or of equal parts."""
+    """Return the indices of the iterations to show, see `convergence`."""
     import numpy as np
 
     length = next(iter(history.values())).size
@@ -300,7 +317,10 @@ def _entry(name: str, value: float) -> str:
 
 
 def align(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
-    """Return rows as text with columns padded; those in `right` are right-aligned."""
+    """Return a table as text with aligned columns.
+
+    right : indices of right-aligned columns; the others are left-aligned
+    """
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     right = set(right)
@@ -315,12 +335,12 @@ def align(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
 
 
 def _none_if_nan(value: float | None) -> float | None:
-    """Return None for NaN, which stands for a missing number."""
+    """Return None if a number is NaN, which represents a missing value."""
     return None if value is None or math.isnan(value) else value
 
 
 def _text(value: Any, unit: str = "", digits: int = 9) -> str:
-    """Return a number, or nested numbers, as text with a unit; empty for None."""
+    """Return a number or nested numbers as text with a unit; return "" for None."""
     match value:
         case None:
             return ""
@@ -337,6 +357,6 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text of a solver or plug-in in one line, without control characters."""
+    """Join the lines of a foreign text, and replace its unprintable characters."""
     line = " ".join(text.split())
     return "".join(c if c.isprintable() else "\ufffd" for c in line)

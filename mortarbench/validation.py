@@ -40,25 +40,24 @@ from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
 from mortarbench.text import align, printable
 
-COMPARED_WITH = "smalbe"  #: solver with which the others are compared
-TIME_LIMIT = 60.0  #: s per check of the conformance suite
-MEMORY_LIMIT = 4096.0  #: MiB per check
-_MAX_ENTRIES = (
-    12  #: maximum number of entries of a list on the terminal; the page has all of them
-)
+COMPARED_WITH = "smalbe"  #: solver with whose answers all others are compared
+TIME_LIMIT = 60.0  #: time limit for each check of the conformance suite, in s
+MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
+#: largest number of entries in a list on the terminal; the page lists all entries
+_MAX_ENTRIES = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Validation:
     """Result of a cross-validation."""
 
-    agreed: bool  #: no claim is refuted, and no two answers disagree
+    agreed: bool  #: True if no claim is refuted and no two answers disagree
     data: Mapping[str, Any]  #: contents of validation.json
     meshes: tuple[Discretisation, ...]  #: discretisation errors, from finer meshes
-    pages: tuple[Path, ...]
+    pages: tuple[Path, ...]  #: files of the page on the validation
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON, without the details of single problems."""
+        """Return plain data for JSON, without the details of each problem."""
         verdict = {k: v for k, v in self.data.items() if k != "problems"}
         return {**verdict, "discretisation": [asdict(d) for d in self.meshes]}
 
@@ -80,14 +79,14 @@ def validate(
 ) -> Validation:
     """Cross-validate the stored answers of a result folder on newly built cases.
 
-    Write validation.json and the page report/validation.html.
+    The results are written to validation.json and to the page report/validation.html.
 
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    budget : seconds for finer meshes, which yield discretisation errors
+    budget : time in s for solves on finer meshes, which yield discretisation errors
     plugins : Python files with more solvers or families
-    progress : called with a message at each stage
+    progress : called with messages about the progress
     registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
@@ -122,14 +121,14 @@ def validate(
     cases = []
     for r in records.values():
         if r.family in families:
-            # `validate_folder` has listed cases that cannot be assembled, for example
-            # those of another version, as not validated
+            # Cases that cannot be assembled, for example because they are from another
+            # version, are already listed as not validated by `validate_folder`.
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
                     cases.append(case)
     meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
-    if meshes:  # the first page could be read while the finer meshes were solved
+    if meshes:  # the first version of the page was written before these slow solves
         pages = registries.validation_page(path, data, meshes)
     return Validation(
         agreed=result.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
@@ -137,10 +136,10 @@ def validate(
 
 
 def _refines(case: CaseId) -> bool:
-    """Return True if a finer mesh exists, or a reason why none exists."""
+    """Return True if a family has a finer mesh, or states why it has none."""
     try:
         return case.family.refined(case.params) is not None
-    except InputError:  # the reason, which `discretisation_errors` repeats
+    except InputError:  # its message is the reason; `discretisation_errors` reports it
         return True
 
 
@@ -186,7 +185,7 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
 
 
 def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of solvers, a row for each solver and tolerance."""
+    """Return the table of certified errors, one row for each solver and tolerance."""
     columns = {
         "error_median": "error: median",
         "error_worst": "worst",
@@ -215,7 +214,7 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line per refuted claim; of many claims, only the worst per solver."""
+    """Return one line per refuted claim or, if there are many, the worst per solver."""
     if len(wrong) <= _MAX_ENTRIES:
         return list(map(_wrong, wrong))
     by_solver: dict[str, list[Mapping[str, Any]]] = {}
@@ -238,7 +237,7 @@ def _measured(d: Mapping[str, Any]) -> str:
 
 
 def _count_equal(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return one line for each distinct entry, with the number of its answers."""
+    """Return one line for each distinct pair of case and text, with its frequency."""
     counted = Counter((d["case"], d["text"]) for d in entries)
     return [
         f"{case} ({n} answer{'s' * (n != 1)}): {text}"
@@ -264,7 +263,7 @@ def _e(value: float | None) -> str:
 class Conformance:
     """Results of the conformance suite for one solver."""
 
-    solver: str  #: name, or class of an object
+    solver: str  #: name of the solver, or of its class if it is an object
     results: Mapping[str, Result]  #: results by the name of the check
 
     @property
@@ -274,7 +273,7 @@ class Conformance:
 
     @property
     def objection(self) -> str:
-        """Reason why the solver does not conform; empty if it does."""
+        """Reason why the solver does not conform, or "" if it conforms."""
         if self.failed:
             return f"fails {some(map(repr, self.failed))}"
         if not any(
@@ -286,11 +285,11 @@ class Conformance:
 
     @property
     def failed(self) -> Mapping[str, str]:
-        """Messages of the checks that fail, by name."""
+        """Messages of the failed checks, by name of the check."""
         return {n: r.message for n, r in self.results.items() if r.grade is Grade.FAIL}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `checks` is what ``test-solver --json`` prints."""
+        """Return plain data; ``test-solver --json`` prints the entry `checks`."""
         checks = [
             dict(solver=self.solver, check=name, **r._asdict())
             for name, r in self.results.items()
@@ -316,13 +315,14 @@ def test_solver(
 ) -> Conformance:
     """Run the conformance suite on a solver, in a separate process.
 
-    A check whose process is killed or hangs fails; the other checks are run.
+    If the process dies or hangs during a check, this check fails, and the remaining
+    checks are run in a new process.
 
     Parameters
     ----------
-    solver : a name of `solvers`, or an object as for `mortarbench.solve`
+    solver : a name listed by `solvers`, or an object as for `mortarbench.solve`
     plugins : Python files with more solvers
-    checks : names of checks; None: all
+    checks : names of the checks to run; None for all
     registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
@@ -360,7 +360,7 @@ def test_solver(
 
 
 def _run_check(worker: WorkerProcess, check: str) -> Result:
-    """Run one check; it fails if the process of the solver ends."""
+    """Run one check, which fails if the process of the solver ends during the check."""
     reply = worker.ask(
         {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
     )

@@ -1,4 +1,4 @@
-"""Write mortarbench/catalogue.json and the pages of solvers from our own solvers."""
+"""Write mortarbench/catalogue.json and the documentation pages on our solvers."""
 
 import json
 from pathlib import Path

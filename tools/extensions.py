@@ -1,7 +1,8 @@
-"""Build hook that compiles the .pyx modules beside their sources and adds them.
+"""Build hook that compiles the .pyx modules and adds the libraries to the package.
 
-Hatchling runs it when the package is built or installed, also by `pip install -e`;
-`make setup` runs that again when a .pyx file has changed.
+The libraries are placed beside their sources. Hatchling runs the hook whenever the
+package is built or installed, including by `pip install -e`. If a .pyx file has
+changed, `make setup` repeats this installation.
 """
 
 from __future__ import annotations
@@ -17,17 +18,19 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-SCALES = ROOT / "harness" / "verify"  #: scales.h and scales.pxd, which solvers include
-MAPS = ROOT / "harness" / "distributed"  #: sparse.pxd, which problems and solvers use
-FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
-#: modules with their flags; without contraction to fused multiply-adds, results have
-#: the same digits on every machine
+#: folder of scales.h and scales.pxd, which modules of solvers include
+SCALES = ROOT / "harness" / "verify"
+#: folder of sparse.pxd, which modules of problems and solvers include
+MAPS = ROOT / "harness" / "distributed"
+FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: for all modules
+#: Further flags by module. Without contraction to fused multiply-adds, results have the
+#: same digits on every machine.
 MODULES = {
     "mortarbench.harness.verify.products": [],
-    # residuals must not depend on the machine
+    # residuals must have the same digits on every machine
     "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
-    # neither must the stiffness and the order of its factor
+    # the same holds for stiffness matrices and the order in which they are eliminated
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
@@ -39,7 +42,7 @@ MODULES = {
 
 
 def compiled() -> list[Path]:
-    """Compile all modules; return the shared libraries beside their sources."""
+    """Compile all modules, and return the paths of the shared libraries."""
     from Cython.Build import cythonize
     from setuptools.command.build_ext import build_ext
 
@@ -86,7 +89,7 @@ class Extensions(BuildHookInterface):  # type: ignore[type-arg]
     """Build hook of hatchling."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile before the files are collected."""
+        """Compile the modules before hatchling collects the files of the package."""
         build_data["pure_python"], build_data["infer_tag"] = False, True
         build_data["artifacts"] += [
             str(library.relative_to(ROOT)) for library in compiled()

@@ -1,14 +1,14 @@
-"""Mutation testing: change single expressions of modules and run their tests.
+"""Mutation testing: change single expressions of modules and run the tests.
 
-A mutant is a copy of the project in which one expression or statement is changed: a
-sign, a comparison, a constant, a guard removed. The tests of the module run on it. If
-one of them fails, the mutant is killed; if all pass, it survives, and no test protects
-that line. `tests/mutants.toml` lists the modules, their tests, the number of mutants
-per module, and accepted survivors with a reason each. The exit code is 1 if any other
-mutant survives.
+A mutant is a copy of the project in which one expression or statement of a module is
+changed: for example, a sign, a comparison or a constant is changed, or a guard is
+removed. The tests of the module are run on the mutant. If a test fails, the mutant is
+killed; if all tests pass, it survives, which shows that no test detects this change.
+`tests/mutants.toml` lists the modules, their tests, the number of mutants per module,
+and accepted survivors with reasons. The exit code is 1 if any other mutant survives.
 
-The choice of mutants depends only on their text, so a change in one function does not
-affect the choice in others. The working tree is not modified.
+The selection of mutants depends only on their text, so that a change in one function
+does not affect the selection in other functions. The working tree is not modified.
 
 Usage: python tools/mutants.py [MODULE ...] [--most N]
 """
@@ -44,10 +44,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAN = ROOT / "tests" / "mutants.toml"
-#: a mutant counts as hanging after SLOWER times the usual time plus GRACE seconds
+#: A mutant counts as hanging if its tests take longer than SLOWER times their usual
+#: time plus GRACE seconds.
 SLOWER, GRACE = 5.0, 20.0
-MAX_LENGTH = 100  #: characters of code in a description
-#: imported once in each laboratory, not for each mutant
+MAX_LENGTH = 100  #: largest number of characters of code in a description
+#: libraries that each laboratory imports only once, not again for each mutant
 LIBRARIES = ("hypothesis", "pandas", "scipy.sparse.linalg", "scipy.stats")
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
@@ -72,7 +73,8 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-#: tried only if a side is a count: between floats the boundary seldom matters
+#: Tried only if one side is a count, since equality of floats is too rare for tests to
+#: detect the change.
 BOUNDARIES: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -84,7 +86,8 @@ FUNCTIONS = {
     "any": "all", "all": "any", "floor": "ceil", "ceil": "floor",
     "argmin": "argmax", "argmax": "argmin",
 }  # fmt: skip
-DROPPED = ("abs", "sqrt", "sorted")  #: calls that are replaced by their argument
+#: functions whose calls are replaced by the argument
+DROPPED = ("abs", "sqrt", "sorted")
 COUNTS = ("len", "size", "sum", "shape")  #: names whose values are counts
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
@@ -94,10 +97,10 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 class Mutant:
     """Module with one change."""
 
-    module: str  #: path from the root
+    module: str  #: path relative to the root of the project
     where: str  #: dotted name of the function or class; "" at module level
     change: str  #: ``old -> new``, numbered if the same change occurs several times
-    line: int
+    line: int  #: line number of the change
     source: bytes  #: changed source of the whole module
 
     @property
@@ -107,7 +110,7 @@ class Mutant:
 
     @property
     def rank(self) -> bytes:
-        """Pseudo-random number that depends on `key` only."""
+        """Pseudo-random bytes that depend only on `key`."""
         return hashlib.sha256("\0".join(self.key).encode()).digest()
 
 
@@ -115,7 +118,7 @@ class Mutant:
 class Plan:
     """Contents of `tests/mutants.toml`."""
 
-    most: int  #: mutants per module
+    most: int  #: largest number of mutants per module
     tests: dict[str, list[str]]  #: arguments of pytest by module
     accepted: dict[tuple[str, str, str], str]  #: reasons of accepted survivors, by key
 
@@ -124,7 +127,7 @@ class Plan:
 
 
 def mutants_of(module: str, source: bytes) -> list[Mutant]:
-    """Return all mutants of a module, in the order of its text."""
+    """Return all mutants of a module, in the order of the changes in the source."""
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -152,7 +155,11 @@ def _shown(code: str) -> str:
 def _changes(
     tree: ast.AST, where: str = ""
 ) -> Iterator[tuple[str, ast.expr | ast.stmt, str]]:
-    """Yield the changes of code that affects results: no texts, types or messages."""
+    """Yield changes of code that affects results, but not of types or messages.
+
+    Each change consists of the dotted name of its function or class, the node to
+    replace and the new source of this node.
+    """
     for child in _children(tree):
         name = where
         if isinstance(child, Function | ast.ClassDef):
@@ -187,7 +194,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _expressions(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield the changes of one expression, but not of its parts."""
+    """Yield the changes of one expression, without changes of its subexpressions."""
     match node:
         case ast.Compare(ops=[op]):
             yield _with(node, ops=[OPERATORS[type(op)]()])
@@ -258,7 +265,7 @@ def _is_text(node: ast.AST) -> bool:
 
 
 def _is_removable(node: ast.stmt, parent: ast.AST) -> bool:
-    """Return True for statements with an effect, and for guards."""
+    """Return True if a statement is a guard, or does more than bind a name."""
     match node:
         case ast.Expr(value=ast.Constant()):
             return False  # a docstring
@@ -276,9 +283,9 @@ def _is_removable(node: ast.stmt, parent: ast.AST) -> bool:
 
 
 class Laboratory:
-    """Copy of the project, a CPU, and a process that forks for each mutant.
+    """Copy of the project with a process on one CPU that forks for each mutant.
 
-    That process has imported the libraries, which takes longer than most tests, but no
+    The process has imported the libraries, which takes longer than most tests, but no
     module of the project.
     """
 
@@ -296,14 +303,17 @@ class Laboratory:
         self._process.join()
 
     def failure(self, tests: Sequence[str], limit: float = inf) -> str | None:
-        """Run tests; return None if all pass, else the first failure."""
+        """Run tests; return None if all pass, else a description of the first failure.
+
+        limit : time limit in s
+        """
         self._pipe.send((tests, limit))
         return cast(str | None, self._pipe.recv())
 
     def failure_on(
         self, mutant: Mutant, tests: Sequence[str], limit: float
     ) -> str | None:
-        """Run tests on a mutant; restore the module afterwards."""
+        """Run tests on a mutant, see `failure`, and restore the module afterwards."""
         path = self.folder / mutant.module
         original = path.read_bytes()
         try:
@@ -314,7 +324,8 @@ class Laboratory:
 
     def _write(self, path: Path, source: bytes) -> None:
         """Write a module and delete its bytecode."""
-        # Python recognises stale bytecode by size and time in seconds: not enough here
+        # Python compares only the size and the time in seconds of a source with those
+        # in the bytecode, and both may be equal for two mutants.
         path.write_bytes(source)
         for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
             compiled.unlink()
@@ -361,7 +372,7 @@ def _run_tests(tests: Sequence[str], output: Path) -> None:
     try:
         options = ["-x", "-q", "--no-header", "--tb=no", "--hypothesis-seed=0"]
         plugins = ["-p", "no:cacheprovider", "-p", "no:xdist"]
-        # LIBRARIES are imported before pytest can rewrite their assertions
+        # pytest would warn that it cannot rewrite assertions of the imported LIBRARIES
         warnings = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
         code = int(pytest.main([*options, *plugins, *warnings, *tests]))
     finally:
@@ -370,7 +381,12 @@ def _run_tests(tests: Sequence[str], output: Path) -> None:
 
 
 def _wait(child: int, limit: float) -> int | None:
-    """Return the exit code of a fork, or None after killing its session at `limit`."""
+    """Wait for a fork; return its exit code, or None if it exceeded the limit.
+
+    In the latter case, all processes of its session are killed.
+
+    limit : s
+    """
     end = monotonic() + limit
     while monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -383,7 +399,7 @@ def _wait(child: int, limit: float) -> int | None:
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy the files of the working tree that git does not ignore, and binaries."""
+    """Copy the compiled modules and all other files that git does not ignore."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     paths = [ROOT / name for name in os.fsdecode(listed.stdout).split("\0") if name]
@@ -412,7 +428,11 @@ def read_plan() -> Plan:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the mutants; return 1 if one survives unaccepted, 2 on wrong input."""
+    """Run the mutants of all requested modules; return the exit code.
+
+    The code is 0 if all are killed or accepted, 1 if another mutant survives, and 2 if
+    the input is invalid or tests of an unchanged module fail.
+    """
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("modules", nargs="*", help="as in tests/mutants.toml; all")
     parser.add_argument("--most", type=int, help="mutants per module")
@@ -448,13 +468,16 @@ def report(
     laboratories: Sequence[Laboratory],
     pool: ThreadPoolExecutor,
 ) -> int:
-    """Run the mutants of one module and print survivors; return the code of `main`."""
+    """Run the mutants of one module and print survivors; return a code as in `main`.
+
+    most : largest number of mutants
+    """
     start = monotonic()
     tests = plan.tests[module]
-    # run on each unchanged copy, to measure the usual time and to fill caches
+    # Run the tests on each unchanged copy, to measure the usual time and fill caches.
     for failure in pool.map(lambda one: one.failure(tests), laboratories):
         if failure is not None:
-            print(f"{module}: its tests fail unchanged: {failure}")
+            print(f"{module}: the tests of the unchanged module fail: {failure}")
             return 2
     limit = GRACE + SLOWER * (monotonic() - start)
     every = mutants_of(module, (ROOT / module).read_bytes())

@@ -2,12 +2,12 @@
 
     python tools/products.py [PATTERN]...     only cases that match a shell pattern
 
-A table is measured if its first column is headed ``case``. A cell of that column begins
-with a case name in backquotes; ``key=1..24`` stands for a sequence of cases
-(of several such keys the last one runs fastest). A measured
-column is headed by a solver in backquotes (with options, ``key=value``) or by ``best
-preset``, then by the tolerance, then by ``warm`` or ``tightened`` for a sequence in
-which the solver reuses earlier results. Other columns are left unchanged.
+A table is measured if the heading of its first column is ``case``. A cell of that
+column begins with a case name in backquotes, in which ``key=1..24`` denotes a sequence
+of cases. If there are several such keys, the last one varies fastest. The heading of a
+measured column consists of a solver in backquotes (possibly with options ``key=value``)
+or ``best preset``, of the tolerance and, for sequences in which the solver reuses
+earlier results, of ``warm`` or ``tightened``. Other columns are left unchanged.
 """
 
 from __future__ import annotations
@@ -27,15 +27,17 @@ from mortarbench.solvers import SOLVERS
 
 PAGE = Path(__file__).parents[1] / "docs" / "smalbe-products.md"
 PRESETS = ("smalbe-permon", "smalbe-espreso")
-THETA = 0.1  #: share of the distance to the fixed point, as in suites/fixed-point.toml
-LOOSEST = 1e-2  #: tolerance of a tightened step
+#: tolerance of a tightened step, relative to the distance from the fixed point, as in
+#: suites/fixed-point.toml
+THETA = 0.1
+LOOSEST = 1e-2  #: largest tolerance of a tightened step
 HEAD = re.compile(r"(?:`([^`]+)`|best preset) (1e-\d+)(?: (warm|tightened))?")
 CASE = re.compile(r"`([\w-]+/[^`]*)`")
 SEQUENCE = re.compile(r"(\w+)=(\d+)\.\.(\d+)")
 
 
 def main(patterns: list[str]) -> None:
-    """Write the measured cells into the page."""
+    """Measure the cells of the page, and write each result into the page."""
     lines = PAGE.read_text("utf-8").splitlines()
     for index, case, column, head in cells(lines):
         if not patterns or any(fnmatch(case, pattern) for pattern in patterns):
@@ -47,7 +49,7 @@ def main(patterns: list[str]) -> None:
 
 
 def cells(lines: list[str]) -> Iterator[tuple[int, str, int, str]]:
-    """Yield the measured cells of a page: line, case, column and heading."""
+    """Yield line index, case, column index and heading of each cell to measure."""
     heads: list[str] = []
     for index, line in enumerate(lines):
         row = [cell.strip() for cell in line.split("|")]
@@ -62,7 +64,7 @@ def cells(lines: list[str]) -> Iterator[tuple[int, str, int, str]]:
 
 
 def products(case: str, head: str) -> int:
-    """Return the number of products with P that verified answers take in all.
+    """Return the total number of products with P for a case or sequence.
 
     case : name of a case or of a sequence
     head : heading of a column
@@ -70,7 +72,7 @@ def products(case: str, head: str) -> int:
     Raises
     ------
     ValueError
-        When an answer is not verified.
+        If an answer is not verified.
 
     """
     match = HEAD.fullmatch(head)

@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# Make .venv ready: system packages, virtual environment, pinned Python packages.
-# Usage: tools/setup.sh PYTHON [browser|docs]   (called by make; does only what is missing)
-# browser: what the tests of the report's page need besides, chromium and its driver
-# docs: what builds the site
-# System packages are named before they are installed, and asked for on a terminal;
-# elsewhere they are installed where root, or sudo without a password, allows it.
+# Set up .venv: install system packages, the virtual environment and pinned Python packages.
+# Usage: tools/setup.sh PYTHON [browser|docs]   (called by make; installs only what is missing)
+# browser: also install chromium and its driver, for the tests of the report's HTML page
+# docs: also install the packages that build the documentation site
+# Missing system packages are listed before they are installed. On a terminal, the user is
+# asked for permission; elsewhere they are installed as root, or by sudo if no password is
+# needed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1
@@ -65,11 +66,12 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
     "$python" -m venv --clear .venv ||
     die "could not make .venv with $python"
 
-# The variables pin what wheels are built with, too (new pip reads the second). They are
-# lists, split at spaces, which an address has none of.
+# These variables also pin the packages with which wheels are built; recent versions of pip
+# read the second one. Each is a list separated by spaces, so the path is passed as a URI,
+# which contains no spaces.
 echo "setup: installing Python packages into .venv"
 constraints=$(.venv/bin/python -c 'import pathlib; print(pathlib.Path("constraints.txt").resolve().as_uri())')
 export PIP_CONSTRAINT=$constraints PIP_BUILD_CONSTRAINT=$constraints
 .venv/bin/python -m pip install -q --disable-pip-version-check -e ".[${extra:-fleet,mpi,dev}]"
-# what pip does for packages that it copies: no process has to compile ours
+# Compile the bytecode once, as pip does for packages that it copies, instead of at first use.
 .venv/bin/python -m compileall -q harness problems solvers reports mortarbench

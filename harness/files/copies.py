@@ -1,9 +1,10 @@
 """Copies of the files that cases are read from: ``FOLDER/files/DIGEST.SUFFIX``.
 
-A result folder is self-contained: it has a copy of each file that defines a QP, one per
-content, unless the files are too large. ``files/copies.json`` lists the paths in the
-names of cases, including files that were too large. These paths are only compared with
-the names of cases, and never opened.
+To make a result folder self-contained, each file that defines a QP is copied into it,
+unless the file is too large; files with equal content share one copy. The list
+``files/copies.json`` holds the paths that occur in the names of cases, including those
+of files that were too large to copy. These paths are compared with the names of cases
+and never opened.
 """
 
 from __future__ import annotations
@@ -26,21 +27,21 @@ from mortarbench.harness.plugin import SourceFile
 FOLDER = "files"
 LIST = "copies.json"
 MAX_FILE_MIB = (
-    64  #: largest file that is copied, so that results stay small enough to send
+    64  #: size of the largest file that is copied; results must be small enough to send
 )
-MAX_FOLDER_MIB = 256  #: sum of all copies in a result folder
+MAX_FOLDER_MIB = 256  #: largest total size of the copies in a result folder
 
-_DIGITS = 12  #: digits of the SHA-256 of a file, as in the parameters of cases
+_DIGITS = 12  #: hex digits of the SHA-256 that identify a file, as in case parameters
 _COPY = re.compile(rf"([0-9a-f]{{{_DIGITS}}})((?:\.[a-z0-9]{{1,8}}){{1,2}})")
 
 
 def content_digest(*paths: Path) -> str:
-    """Return the digest of files, 12 hexadecimal digits of SHA-256.
+    """Return 12 hexadecimal digits of the SHA-256 of the concatenated files.
 
     Raises
     ------
     InputError
-        When a file cannot be read, is not a regular file, or is larger than
+        If a file cannot be read, is not a regular file, or is larger than
         `harness.files.datafile` allows.
 
     """
@@ -54,34 +55,35 @@ def content_digest(*paths: Path) -> str:
 
 
 def is_copy(name: str) -> bool:
-    """Return True for the names of files that this module writes to ``files/``."""
+    """Return True if this module writes files of that name to ``files/``."""
     return name == LIST or _COPY.fullmatch(name) is not None
 
 
 class _Entry(NamedTuple):
-    """An entry of the list of files."""
+    """Entry of ``copies.json``."""
 
-    path: str  #: path in the names of cases
-    sha256: str
-    size: int  #: size of the content, bytes
+    path: str  #: path as in the names of cases
+    sha256: str  #: first digits of the SHA-256
+    size: int  #: size of the file in bytes
 
 
 class Copies:
-    """Files of cases, with the copies of a result folder as a fallback.
+    """Lookup of the files of cases, with the copies in a result folder as a fallback.
 
-    The folder is read only if a file is missing.
+    The folder is read only if an original file is missing or has changed.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / FOLDER
 
     def locate(self, source: SourceFile) -> Path:
-        """Return the path of the original if it has the digest, otherwise of the copy.
+        """Return the path of the original file if its digest matches, or of its copy.
 
         Raises
         ------
         InputError
-            If both are missing, or the copy has different content.
+            If neither the original with this digest nor a copy exists, or the content
+            of the copy has a different digest.
 
         """
         here = _digest_if_there(Path(source.path))
@@ -105,7 +107,8 @@ class Copies:
         Raises
         ------
         InputError
-            When the file is neither at its path nor listed, or has several contents.
+            If the file is neither at its path nor in the list of copies, or the list
+            has several versions of the file.
 
         """
         if os.path.lexists(path):
@@ -122,11 +125,11 @@ class Copies:
         return digests.pop()
 
     def paths(self) -> list[str]:
-        """Return the paths in the names of cases."""
+        """Return the listed paths of files, as they occur in the names of cases."""
         return sorted({entry.path for entry in _entries(self._folder)})
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
-        """Return the error for a file that is neither at its path nor copied."""
+        """Return the error to raise for a file without original and copy."""
         sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
@@ -139,12 +142,13 @@ class Copies:
 
 
 def check_copy(copy: Path, digest: str, remedy: str) -> None:
-    """Raise unless the content of a copy has the digest in its name.
+    """Check that the content of a copy has the digest in its name.
 
     Raises
     ------
     InputError
-        Otherwise; the message names the file, both digests, and the remedy.
+        If the digests differ, or the copy cannot be read or is too large; the message
+        names the file and the remedy.
 
     """
     with opened(copy, "the copy of a file") as file:
@@ -158,17 +162,17 @@ def check_copy(copy: Path, digest: str, remedy: str) -> None:
     if actual != digest:
         raise InputError(
             f"{copy}: its content has the digest {actual}, not {digest}: it was "
-            f"damaged or exchanged; {remedy}"
+            f"damaged or replaced; {remedy}"
         )
 
 
 def check_copies(folder: Path) -> None:
-    """Check all copies of a result folder, see `check_copy`.
+    """Check all copies in a result folder with `check_copy`.
 
     Raises
     ------
     InputError
-        If a copy has different content; the message names the first.
+        If a copy fails the check; the message names the first such copy.
 
     """
     for copy, digest, _ in copies_in(folder):
@@ -178,14 +182,14 @@ def check_copies(folder: Path) -> None:
 def keep_copies(
     folder: Path, sources: Iterable[SourceFile], tell: Callable[[str], None]
 ) -> None:
-    """Copy the files of cases into a result folder, each content once.
+    """Copy the files of cases into a result folder; equal files share one copy.
 
     tell : called with a message for each file that is too large
 
     Raises
     ------
     InputError
-        When a file has changed since its case was named, or cannot be read.
+        If a file has changed since its case was named, or cannot be read.
 
     """
     distinct = {(s.path, s.sha256): s for s in sources}.values()
@@ -200,7 +204,10 @@ def keep_copies(
 def merge_copies(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None]
 ) -> None:
-    """Merge the copies in several result folders into `out`, without duplicates."""
+    """Copy the copies in several result folders to `out`, without duplicates.
+
+    tell : called with a message for each file that is too large
+    """
     writer = _Writer(out, tell)
     for source in sources:
         paths: dict[str, str] = {}
@@ -213,7 +220,7 @@ def merge_copies(
 
 
 def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
-    """Return path, digest and suffix of each copy in a result folder."""
+    """Return the path, the digest and the suffix of each copy in a result folder."""
     copies = []
     for name in _names(folder / FOLDER):
         if match := _COPY.fullmatch(name):
@@ -222,18 +229,18 @@ def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
 
 
 def remove_copies(folder: Path) -> None:
-    """Delete the copies in a result folder, and no other files."""
+    """Delete the copies in a result folder and ``copies.json``, but no other files."""
     for name in filter(is_copy, _names(folder / FOLDER)):
         (folder / FOLDER / name).unlink(missing_ok=True)
 
 
 def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
-    """Raise if a case is read from a copy that is about to be deleted.
+    """Check that no case is read from a copy that is about to be deleted.
 
     Raises
     ------
     InputError
-        If there is such a case; the message names the copy.
+        If a case is read from such a copy; the message names the copy.
 
     """
     copies = (folder / FOLDER).resolve()
@@ -247,7 +254,7 @@ def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
 
 
 class _Writer:
-    """Writer of copies to a folder."""
+    """Writer of the copies and their list in one result folder."""
 
     def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
         self._folder = folder / FOLDER
@@ -257,13 +264,13 @@ class _Writer:
         self._size = sum(p.stat().st_size for p, *_ in copies_in(folder))
 
     def add(self, entry: _Entry) -> None:
-        """Add an entry to the list; the file need not be copied."""
+        """Add an entry to the list, without copying the file."""
         self._entries[entry] = None
 
     def keep(self, original: Path, digest: str, suffix: str, name: str | None) -> None:
-        """Copy a file, unless an intact copy exists or it is too large.
+        """Copy a file, unless an intact copy exists or the file is too large.
 
-        name : path in the names of cases, for the list; None if unknown
+        name : path to list, as in the names of cases; None if unknown
         """
         copy = self._folder / f"{digest}{suffix}"
         if os.path.lexists(copy) and _digest_if_there(copy) == digest:
@@ -305,7 +312,7 @@ class _Writer:
         return True
 
     def write_list(self) -> None:
-        """Write the list if it has changed."""
+        """Write the list of files if it has changed."""
         if list(self._entries) == self._before:
             return
         data = {"files": [entry._asdict() for entry in self._entries]}
@@ -334,7 +341,7 @@ def _entries(folder: Path) -> list[_Entry]:
     Raises
     ------
     InputError
-        When the list is malformed.
+        If the list is malformed.
 
     """
     path = folder / LIST
@@ -347,8 +354,8 @@ def _entries(folder: Path) -> list[_Entry]:
         entries = [_Entry("", "", -1)]
     if not all(map(_is_sound, entries)):
         raise InputError(
-            f"{path}: not the list of copied files that a run writes; restore it, or "
-            "delete it: copies are found without it by cases that were measured"
+            f"{path}: not a list of copied files as a run writes it; restore or delete "
+            "it; measured cases find their copies without the list"
         )
     return entries
 

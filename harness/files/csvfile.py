@@ -1,8 +1,9 @@
 """CSV tables that are safe to open in spreadsheets.
 
 Spreadsheets interpret a cell that begins with ``=``, ``+``, ``-`` or ``@`` as a
-formula. Control characters may end a cell or change its direction. Numbers are written
-unchanged; a text that would be a formula is prefixed with an apostrophe.
+formula, so text that begins in this way is prefixed with an apostrophe. Control
+characters, which may end a cell or reverse the direction of its text, are escaped.
+Numbers are written unchanged.
 """
 
 from __future__ import annotations
@@ -13,18 +14,20 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-#: first characters of formulas; East Asian spreadsheets also use full-width ones
+#: first characters of formulas; the full-width ones occur in East Asian spreadsheets
 _FORMULA = frozenset("=+-@＝＋－＠")
-_HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})  #: categories that programs skip
-_CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})
-#: direction controls; other characters of Cf join letters and symbols
+#: Unicode categories of characters that programs may skip at the start of a cell
+_HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})
+_CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})  #: Unicode categories that are escaped
+#: Direction controls, which are escaped. They are listed singly because the other
+#: characters of their category, Cf, join letters and symbols and are harmless.
 _DIRECTIONS = frozenset(
     "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 )
 
 
 def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a table as CSV, floats with all digits and None as an empty cell."""
+    """Return a table as CSV, with floats in full precision and empty cells for None."""
     text = StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(map(_cell, heads))
@@ -38,9 +41,10 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Prefix a text that a spreadsheet would evaluate with an apostrophe.
+    """Prefix a text with an apostrophe if a spreadsheet would evaluate it.
 
-    Characters that programs may skip before the sign are skipped here too.
+    Hidden characters and spaces before the first sign are ignored, since spreadsheets
+    may skip them.
     """
     for char in text:
         if char in _FORMULA:
@@ -52,7 +56,7 @@ def inert(text: str) -> str:
 
 @lru_cache(1 << 16)
 def visible(text: str) -> str:
-    r"""Escape controls, direction overrides and lone surrogates, as ``\n``."""
+    r"""Escape control characters, direction controls and lone surrogates (``\n``)."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(

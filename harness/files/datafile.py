@@ -1,9 +1,10 @@
-"""Reading of data files from untrusted sources, within a limit of memory.
+"""Reading of data files from untrusted sources, within a memory limit.
 
 A small file can declare huge data: an archive that expands a thousandfold, or a matrix
-with a billion columns and no entries. Readers therefore determine the memory that they
-need from headers, and refuse files beyond the limit before reading. The limit is the
-environment variable ``MORTARBENCH_MOST_MIB``, in MiB, default 2048.
+with a billion columns and no entries. Readers therefore compute the required memory
+from the headers, and refuse a file above the limit before they read its data. The
+environment variable ``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is
+2048.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
-MIB = 2**20  #: number of bytes
+MIB = 2**20  #: bytes in a mebibyte
 
-_PIECE_BYTES = 2**20  #: number of bytes that are expanded at a time
-_PARSER_BYTES = 256 * MIB  #: memory that is allowed for the code of a parser itself
+_PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
+_PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
 
 
 def max_bytes() -> int:
-    """Return the limit of the memory for a data file.
+    """Return the memory limit for a data file, in bytes.
 
     Raises
     ------
     InputError
-        When the environment variable is not a positive integer.
+        If the environment variable is not a positive integer.
 
     """
     text = os.environ.get(VARIABLE, str(DEFAULT_MIB))
@@ -52,14 +53,15 @@ def max_bytes() -> int:
 
 
 def check_size(what: str, size: int) -> None:
-    """Raise if `size` bytes exceed the limit.
+    """Check that `size` bytes do not exceed the memory limit.
 
-    what : subject of the message
+    what : subject of the error message
 
     Raises
     ------
     InputError
-        If so; the message states the memory in MiB, and how to raise the limit.
+        If they exceed the limit; the message states the required memory in MiB, and
+        how to raise the limit.
 
     """
     if size > (most := max_bytes()):
@@ -75,12 +77,12 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
     """Open a regular file for reading; pipes and devices are refused.
 
     expected : description of the file, for messages, e.g. "an npz file"
-    limited : refuse a file that exceeds the limit
+    limited : refuse a file larger than the memory limit
 
     Raises
     ------
     InputError
-        When it cannot be opened, is not a regular file, or exceeds the limit.
+        If the file cannot be opened, is not a regular file, or exceeds the limit.
 
     """
     with reading.opened(path, expected) as file:
@@ -90,16 +92,17 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
 
 
 def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
-    """Read a whole file, and expand it with gzip if its name ends in .gz.
+    """Read a whole file, and decompress it with gzip if its name ends in .gz.
 
     expected : description of the file, for messages
-    copies : number of copies of the content that the parser may store, for the limit
+    copies : number of copies of the content that the caller's parser may hold at once;
+        together they must not exceed the memory limit
 
     Raises
     ------
     InputError
-        For the same reasons as `opened`, and when the content would exceed the limit or
-        cannot be expanded.
+        For the same reasons as in `opened`, and if the content would exceed the limit
+        or cannot be decompressed.
 
     """
     with opened(path, expected) as file:
@@ -112,7 +115,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             with gzip.GzipFile(fileobj=file) as pieces:
                 while piece := pieces.read(
                     _PIECE_BYTES
-                ):  # a first pass counts, without memory
+                ):  # the first pass only counts bytes, and stores none
                     if (size := size + len(piece)) > most:
                         raise InputError(
                             f"{path}: its expanded content would take more than "
@@ -122,7 +125,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
                 return whole.read(size)
-        except (OSError, EOFError, zlib.error):  # not gzip, damaged, truncated
+        except (OSError, EOFError, zlib.error):  # not gzip, truncated, or damaged
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None
@@ -130,11 +133,11 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Attribute all exceptions of a library that parses a file to this file.
+    """Convert all exceptions of a parser, raised in the block, to errors of this file.
 
     wrong : message of the error
-    room : bytes of memory that the library may use beside 256 MiB, as a limit of the
-        address space
+    room : bytes by which the address space may grow in the block, beyond the 256 MiB
+        that every parser is allowed
 
     Raises
     ------
@@ -160,7 +163,7 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
 
 @contextmanager
 def _at_most(size: int) -> Iterator[None]:
-    """Limit the address space of this process to `size` bytes more than in use."""
+    """Limit the growth of the address space of this process to `size` bytes."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * os.sysconf("SC_PAGE_SIZE") + size
@@ -173,12 +176,12 @@ def _at_most(size: int) -> Iterator[None]:
 
 
 def json_object(text: str | bytes) -> dict[str, Any]:
-    """Parse a JSON object.
+    """Parse the JSON object in the field ``meta`` of a data file.
 
     Raises
     ------
     ValueError
-        When `text` is not an object, or nested too deeply for Python's parser.
+        If `text` is not a JSON object, or is nested too deeply for Python's parser.
 
     """
     try:

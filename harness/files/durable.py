@@ -19,12 +19,13 @@ from typing import IO
 from mortarbench.harness.errors import InputError
 
 _UNFINISHED = ".mortarbench-*.tmp"  #: name of a file that is not yet complete
-_OTHERS = ("*.tmp", "*.new", ".*.new")  #: names in older versions, and in case folders
-_OLD = ("suite.tmp", "environment.tmp")  #: names in older versions
+#: the same in older versions and in case folders
+_OTHERS = ("*.tmp", "*.new", ".*.new")
+_OLD = ("suite.tmp", "environment.tmp")  #: the same in result folders of older versions
 
-#: Codes of an OSError for a full disk, an exhausted quota or a file size limit.
+#: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: data written to test whether a disk is full
+_PROBE_BYTES = 2**16  #: number of bytes that are written to test if a disk is full
 _MIB = 2**20
 
 
@@ -32,35 +33,36 @@ _MIB = 2**20
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a new file that replaces `path` at the end of the block.
 
-    The new file is flushed to the disk before it is renamed. After a crash, `path` is
-    either the old file or the complete new one. Processes that have opened or mapped
-    the old file keep it.
+    The new file is flushed to the disk before it is renamed, so that after a crash
+    `path` is either the old file or the complete new one. Processes that have opened or
+    mapped the old file continue to see the old content.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:
         with new.open("x+b") as file:
             yield file
-            _sync(file)  # before the rename, or a crash could leave an empty file
+            # otherwise a crash after the rename could leave an empty file
+            _sync(file)
             move_file(new, path)
     finally:
         new.unlink(missing_ok=True)
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
-    """Replace a file by `content`, see `replacing`; missing folders are created."""
+    """Write `content` to a file with `replacing`; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(content)
 
 
 def move_file(whole: Path, path: Path) -> None:
-    """Rename a synced file to `path`, in the same folder, and sync the folder."""
+    """Rename a file, already flushed, to `path` in the same folder; sync the folder."""
     os.replace(whole, path)
     sync_folder(path.parent)
 
 
 def _sync(file: IO[bytes]) -> None:
-    """Flush and fsync."""
+    """Flush a file to the disk."""
     file.flush()
     os.fsync(file.fileno())
 
@@ -68,10 +70,12 @@ def _sync(file: IO[bytes]) -> None:
 def remove_unfinished(
     folder: Path, own: Iterable[Path], shared: Iterable[Path] = ()
 ) -> None:
-    """Delete unfinished files of killed processes in an otherwise unused result folder.
+    """Delete unfinished files that killed processes left in a result folder.
 
-    own : its subfolders that contain no files of the user
-    shared : its subfolders that may contain files of the user
+    No process may be writing to the folder.
+
+    own : subfolders that contain only files of this package
+    shared : subfolders that may also contain files of the user
     """
     unfinished = [*folder.glob(_UNFINISHED), *(folder / name for name in _OLD)]
     unfinished += [path for one in shared for path in one.glob(_UNFINISHED)]
@@ -86,12 +90,13 @@ def remove_unfinished(
 def report_full_disk(folder: Path) -> Iterator[None]:
     """Convert an OSError for a full disk, raised in the block, to an InputError.
 
-    folder : folder that the block writes to
+    folder : folder to which the block writes
 
     Raises
     ------
     InputError
-        If the disk is full; the message names the file system and a remedy.
+        If the disk is full, a quota is exhausted or a file size limit is reached; the
+        message names the file system and a remedy.
 
     """
     try:
@@ -105,7 +110,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 def refuse_full_disk(folder: Path, failure: str) -> None:
     """Raise if a failure was caused by a full disk.
 
-    folder : folder that was written to
+    folder : folder to which the failed operation wrote
     failure : message of the failure
 
     Raises
@@ -128,7 +133,10 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
 
 
 def _full(path: Path, code: int) -> str:
-    """Return the message for a full file system."""
+    """Return the error message for a full file system.
+
+    code : error number, one of `FULL`
+    """
     there = next(p for p in (path, *path.absolute().parents) if p.exists())
     root = there.absolute()
     while not os.path.ismount(root):
@@ -141,7 +149,7 @@ def _full(path: Path, code: int) -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the directory entries of a folder to the disk."""
+    """Flush the directory entries of a folder to the disk, with fsync."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)

@@ -3,7 +3,7 @@
 ::
 
     FOLDER/setting.json     setting, names of the tables, digests of the states
-    FOLDER/NAME.csv         a table: a row for each measurement
+    FOLDER/NAME.csv         one table, with a row per measurement
     FOLDER/vectors/*.npz    deformed states
 """
 
@@ -28,15 +28,16 @@ Row = Mapping[str, Value]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Experiment:
-    """Tables of measurements, deformed states, and their setting."""
+    """Tables of measurements, deformed states, and the setting of an experiment."""
 
-    setting: Mapping[str, Any]  #: plain data for JSON
-    tables: Mapping[str, Sequence[Row]]  #: rows of a table have equal keys
-    states: Mapping[str, Fields]
+    setting: Mapping[str, Any]  #: plain data that JSON can represent
+    #: rows by name of the table; all rows of a table have the same keys
+    tables: Mapping[str, Sequence[Row]]
+    states: Mapping[str, Fields]  #: deformed states by name
 
 
 def save_experiment(experiment: Experiment, folder: Path) -> None:
-    """Write the files of an experiment; see `harness.files.experiment`."""
+    """Write the files that the docstring of this module lists."""
     folder.mkdir(parents=True, exist_ok=True)
     states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
     for name, rows in experiment.tables.items():
@@ -53,12 +54,12 @@ def save_experiment(experiment: Experiment, folder: Path) -> None:
 
 
 def load_experiment(folder: Path) -> Experiment:
-    """Read the files of `save_experiment`; numbers keep all digits.
+    """Read the files that `save_experiment` wrote; no digits of numbers are lost.
 
     Raises
     ------
     InputError
-        When a file is missing or damaged.
+        If a file is missing or damaged.
 
     """
     path = folder / "setting.json"
@@ -82,7 +83,7 @@ def _read_csv(path: Path) -> list[Row]:
 
 
 def _value(text: str) -> Value:
-    """Convert a text to an integer or a float, if possible."""
+    """Convert a text to an integer or a float if possible, or return it unchanged."""
     for kind in (int, float):
         try:
             return kind(text)

@@ -1,7 +1,8 @@
-"""Files that grow line by line, such as a journal, and are read within limits.
+"""Files that grow line by line, such as a journal.
 
-Such a file contains whole lines and at most one partial line at the end, from a writer
-that was killed. Readers skip the partial line, and the next writer truncates it.
+Such a file contains whole lines and possibly a partial last line, if its writer was
+killed. Readers skip the partial line, and the next writer removes it. Readers limit the
+size of the file and the length of its lines.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import replace_file, sync_folder
 
-MAX_LINE_BYTES = 2**24  #: bounds the memory to read one line of a foreign file
+MAX_LINE_BYTES = 2**24  #: longest line that is read, to bound the memory for it
 _CHUNK_BYTES = 2**16  #: number of bytes that are read at a time
 
 
@@ -30,7 +31,7 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
     Raises
     ------
     InputError
-        When the file is not a regular file, is larger than `harness.files.datafile`
+        If the file is not a regular file, is larger than `harness.files.datafile`
         allows, or has a line longer than `MAX_LINE_BYTES`.
 
     """
@@ -52,10 +53,10 @@ class Lines:
     """Sole writer of a file of lines.
 
     The writer keeps a digest of the content in memory to detect edits by other
-    programs. The digest is compared at the end, and whenever the file has other time
-    stamps than the last write left. Edits between two runs are allowed.
+    programs. The digest is compared when the writer ends, and whenever the time stamps
+    of the file have changed since the last write. Edits between two runs are allowed.
 
-    restored : called with a message when the file had to be written again
+    restored : called with a message if the file had to be written again
     """
 
     def __init__(self, path: Path, restored: Callable[[str], None]) -> None:
@@ -65,14 +66,14 @@ class Lines:
         self._open()
 
     def append(self, text: str) -> None:
-        """Append a line and flush it to the disk, or raise and append nothing.
+        """Append a line and flush it to the disk; after an error nothing is appended.
 
         Raises
         ------
         InputError
-            When another program writes to the file.
+            If another program has changed the content of the file.
         OSError
-            When the line cannot be written, for instance because the disk is full.
+            If the line cannot be written, for instance because the disk is full.
 
         """
         self.restore()
@@ -92,13 +93,13 @@ class Lines:
     def restore(self) -> None:
         """Write the file again if it was deleted or replaced since it was opened.
 
-        The open descriptor still refers to the old content. Lines of a replacement file
-        are kept.
+        The open descriptor still refers to the old content, from which missing lines
+        are restored. Lines that only the replacement file has are kept.
 
         Raises
         ------
         InputError
-            When another program has changed the content of the file.
+            If another program has changed the content of the file.
 
         """
         held = os.fstat(self._fd)
@@ -115,8 +116,8 @@ class Lines:
         os.close(self._fd)
         self._open()
         self._restored(
-            f"{self._path} was deleted or replaced; its {len(lost)} "
-            f"line{'s' * (len(lost) != 1)} that were missing are there again"
+            f"{self._path} was deleted or replaced; {len(lost)} missing "
+            f"line{'s' * (len(lost) != 1)} restored"
         )
 
     def _open(self) -> None:
@@ -126,12 +127,12 @@ class Lines:
         os.ftruncate(self._fd, self._end)
         self._times = _times(
             os.fstat(self._fd)
-        )  # before reading, to detect an edit meanwhile
+        )  # before reading, to detect an edit while the digest is computed
         self._digest: Digest = running_digest(self._chunks())
         sync_folder(self._path.parent)
 
     def _refuse_changed(self) -> None:
-        """Raise if the content differs from the lines read and written here."""
+        """Check that the file contains exactly the lines read and written here."""
         held = os.fstat(self._fd)
         is_same = held.st_size == self._end
         if is_same:
@@ -144,7 +145,7 @@ class Lines:
             )
         self._times = _times(
             held
-        )  # same content: the file was touched, linked or deleted
+        )  # the content is unchanged: the file was only touched, linked or deleted
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the whole lines of the open file in chunks."""
@@ -158,19 +159,20 @@ class Lines:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            if error is None:  # also after edits within the resolution of times
+            # Edits within the resolution of time stamps leave these unchanged.
+            if error is None:
                 self._refuse_changed()
         finally:
             os.close(self._fd)
 
 
 def _times(info: os.stat_result) -> tuple[int, int]:
-    """Return the times of the last change of content and of status, ns."""
+    """Return the times at which content and status last changed, in ns."""
     return info.st_mtime_ns, info.st_ctime_ns
 
 
 def _end_of_lines(fd: int) -> int:
-    """Return the offset after the last newline."""
+    """Return the offset after the last newline, or 0 if there is no newline."""
     end = os.fstat(fd).st_size
     while end > 0:
         start = max(0, end - _CHUNK_BYTES)

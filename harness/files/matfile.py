@@ -1,8 +1,8 @@
 """One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
 
-Vectors ``q, h, b, lb, ub`` are columns, matrices ``P, G, A`` sparse, ``meta`` is a JSON
-text. Indices of sets, such as ``disc_index``, start at 0. Further arrays are those of
-the case, such as F, d, B, c, R of the paper.
+The vectors ``q, h, b, lb, ub`` are columns, the matrices ``P, G, A`` are sparse, and
+``meta`` is a JSON text. Indices of sets, such as ``disc_index``, start at 0. A case may
+add arrays of its own, for instance those of the paper's dual QP: F, d, B, c and R.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
-_HEADER, _TAG = 128, 8  #: bytes of the header of a version 5 file, and of an element
-_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: types of elements, and of their parts
-_TYPES = {
+#: bytes of the header of a version 5 file, and of the tag before each element
+_HEADER, _TAG = 128, 8
+_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: codes of data types
+_TYPES = {  #: NumPy types by code
     1: "i1",
     2: "u1",
     3: "i2",
@@ -50,12 +51,12 @@ _TYPES = {
     17: "u2",
     18: "u4",
 }
-_TEXT, _SPARSE = 4, 5  #: classes of variables
+_TEXT, _SPARSE = 4, 5  #: codes of the classes of variables
 _CLASSES = frozenset(
     (_TEXT, _SPARSE, *range(6, 16))
-)  #: texts, sparse matrices and numeric arrays of every type
-_COMPLEX = 0x800  #: flag of a variable
-_COPIES = 8  #: number of copies of the content that a parser may store
+)  #: classes that are read: texts, sparse matrices and all numeric arrays
+_COMPLEX = 0x800  #: flag of complex variables
+_COPIES = 8  #: memory limit of a parser, in multiples of the size of the content
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -66,12 +67,13 @@ def save_mat(
 ) -> None:
     """Write `qp` and the arrays `more` to `path`; `meta` is as in `save_qp`.
 
-    more : further arrays by name; an operator P may be among them
+    more : further arrays by name; the operator P of `qp` may be among them
 
     Raises
     ------
     InputError
-        When the file cannot be written, or P is an operator that is too large.
+        If the file cannot be written, or P is an operator that is too large to be
+        assembled.
 
     """
     matrices, dense = explicit_matrices(qp)
@@ -89,13 +91,13 @@ def save_mat(
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read the variables of a .mat file, as None for other types than numbers and text.
+    """Read the variables of a .mat file; the value is None if not numbers or text.
 
     Raises
     ------
     InputError
-        When it cannot be read, is not a .mat file of MATLAB 4 to 7.2, or declares more
-        than `harness.files.datafile` allows.
+        If the file cannot be read, is not a .mat file of MATLAB 4 to 7.2, or declares
+        more data than `harness.files.datafile` allows.
 
     """
     data = content(path, _EXPECTED)
@@ -118,11 +120,11 @@ def read_mat(path: Path) -> dict[str, Any]:
 
 
 class _Element(NamedTuple):
-    """An element of a version 5 file, after the header."""
+    """Data element of a version 5 file."""
 
     order: str  #: byte order, in the notation of struct and NumPy
-    kind: int
-    body: bytes
+    kind: int  #: code of the data type
+    body: bytes  #: data without the tag
 
 
 def _elements(data: bytes) -> Iterator[_Element]:
@@ -138,7 +140,7 @@ def _elements(data: bytes) -> Iterator[_Element]:
 
 
 def _declared(element: _Element) -> int:
-    """Return the size of an element after decompression, as its header declares."""
+    """Return the declared size of an element after decompression, in bytes."""
     if element.kind != _COMPRESSED:
         return len(element.body)
     head = zlib.decompressobj().decompress(element.body, _TAG)
@@ -146,7 +148,7 @@ def _declared(element: _Element) -> int:
 
 
 def _decompressed(element: _Element) -> _Element:
-    """Decompress an element, up to the size that its header declares."""
+    """Decompress an element, and check that it has its declared size."""
     inflate = zlib.decompressobj()
     head = inflate.decompress(element.body, _TAG)
     kind, size = struct.unpack(f"{element.order}II", head)
@@ -159,9 +161,10 @@ def _decompressed(element: _Element) -> _Element:
 
 
 def _variable(element: _Element) -> tuple[str, Any]:
-    """Read a variable: a text, an array, a sparse matrix, or None for other types.
+    """Return the name and the value of a variable; the value may be None.
 
-    SciPy's reader is not used, since some damaged files crash it (SciPy 1.17.1).
+    The value is a text, an array or a sparse matrix, and None for other types. SciPy's
+    reader is not used, since some damaged files crash it (SciPy 1.17.1).
     """
     if element.kind == _COMPRESSED:
         element = _decompressed(element)
@@ -177,7 +180,7 @@ def _variable(element: _Element) -> tuple[str, Any]:
         raise ValueError(f"{name} is of shape {shape}")
     if kind == _SPARSE:
         rows, starts, values = (next(parts) for _ in range(3))
-        count = starts[-1]  # unused entries may follow
+        count = starts[-1]  # MATLAB may allocate more entries than it uses
         return name, compressed(values[:count], rows[:count], starts, shape)
     values = next(parts)
     if kind == _TEXT:
@@ -186,12 +189,12 @@ def _variable(element: _Element) -> tuple[str, Any]:
 
 
 def _parts(element: _Element) -> Iterator[NDArray[Any]]:
-    """Yield the numeric arrays that a variable consists of."""
+    """Yield the numeric arrays that encode a variable: flags, shape, name, values."""
     order, _, body = element
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # data of up to four bytes are part of the tag
+        if kind >> 16:  # the tag itself contains data of up to four bytes
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:
@@ -212,7 +215,8 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
     Raises
     ------
     InputError
-        When a variable is missing or has the wrong type, or they are not a QP.
+        If a variable is missing or has the wrong type, or the variables do not define a
+        valid QP.
 
     """
     vectors: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
@@ -236,7 +240,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
 
 
 def vector(arrays: Mapping[str, Any], name: str) -> Vector:
-    """Return a vector (n,) from a dense or sparse row or column."""
+    """Check that a variable is a row or column, and return it as a vector (n,)."""
     M = matrix(arrays, name)
     if M.size and 1 not in M.shape:
         raise InputError(f"{name} is of shape {M.shape}; expected one row or column")
@@ -246,7 +250,7 @@ def vector(arrays: Mapping[str, Any], name: str) -> Vector:
 
 
 def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
-    """Return a dense or sparse matrix as csc."""
+    """Check that a variable is a matrix of numbers, and return it in CSC format."""
     if name not in arrays:
         raise InputError(f"{name} is missing")
     if getattr(arrays[name], "dtype", np.dtype(object)).kind not in "iufb":

@@ -1,8 +1,8 @@
 """Npz files whose arrays can be mapped into memory.
 
-An npz file is a zip archive of npy files. Here these are uncompressed, and their values
-are aligned to 64 bytes. ``np.load`` reads such a file as usual, and `mapped` returns
-arrays in the page cache, which all processes share.
+An npz file is a zip archive of npy files. This module writes the npy files without
+compression, and aligns their values to 64 bytes. ``np.load`` reads such a file as
+usual, and `mapped` returns arrays in the page cache, which all processes share.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from mortarbench.harness.files.datafile import check_size, opened
 from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
-ALIGNMENT = 64  #: bytes of a cache line, so that alignment does not affect times
-_LOCAL_HEADER = 30  #: bytes before name and extra field of a member
-_PADDING = b"\xfe\xca"  #: id of an extra field that readers skip
+ALIGNMENT = 64  #: size of a cache line in bytes; misaligned arrays would affect times
+_LOCAL_HEADER = 30  #: bytes before the name and the extra field of a zip member
+_PADDING = b"\xfe\xca"  #: ID of an extra field that readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-#: kinds of dtypes that are read: neither objects, which are pickles, nor structures
+#: kinds of dtypes that are read; objects, which are pickles, and records are refused
 _KINDS = "biufcSU"
 _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
 
 class _PickledError(ValueError):
-    """An array of Python objects, such as a SciPy matrix saved by NumPy."""
+    """Array of Python objects, such as a SciPy matrix saved by NumPy."""
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a file that can be mapped.
 
-    An existing file is replaced, not truncated: truncation would end the processes that
-    have mapped it, with SIGBUS.
+    An existing file is replaced, not truncated: truncation would kill any process that
+    has mapped the file, by SIGBUS.
     """
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
@@ -51,22 +51,22 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(stored))
             member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             start = file.tell() + _LOCAL_HEADER + len(member.filename.encode()) + 4
-            padding = -start % ALIGNMENT  # the npy header is a multiple of 64 itself
+            padding = -start % ALIGNMENT  # the npy header fills multiples of 64
             member.extra = _PADDING + padding.to_bytes(2, "little") + bytes(padding)
             archive.writestr(member, header.getvalue() + stored.tobytes())
 
 
 def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Map all arrays of a file; writing to one changes a private copy only.
+    """Map all arrays of a file; assignments to an array change only a private copy.
 
-    limited : refuse a file above the limit of `harness.files.datafile`
+    limited : refuse a file larger than the limit of `harness.files.datafile`
 
     Raises
     ------
     InputError
-        For the same reasons as `harness.files.datafile.opened`.
+        For the same reasons as in `harness.files.datafile.opened`.
     ValueError, BadZipFile
-        When the file is not an npz file that can be mapped.
+        If the file is not an npz file that can be mapped.
 
     """
     with opened(path, EXPECTED, limited=limited) as file:
@@ -82,10 +82,10 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        For the same reasons as `harness.files.datafile.opened`, and when the arrays
-        would exceed its limit, or one is pickled.
+        For the same reasons as in `harness.files.datafile.opened`, and if the arrays
+        would exceed its limit, or one of them is pickled.
     ValueError, BadZipFile
-        When the file is not an npz file of plain arrays.
+        If the file is not an npz file of plain arrays.
 
     """
     with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
@@ -105,20 +105,23 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """Return the members of an archive by the name of their array."""
+    """Check the members of an archive, and return them by the names of the arrays."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(".npy")
         if name == member.filename or name in members:
             raise ValueError(f"{shortened(name)!r} is not an array, or occurs twice")
         if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
-            raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
+            raise ValueError(f"{shortened(name)!r}: encrypted or unknown compression")
         members[name] = member
     return members
 
 
 def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Return a view of a member, which has to be uncompressed and aligned."""
+    """Check that a member is uncompressed and aligned, and return a view of its array.
+
+    memory : the mapped archive
+    """
     begin = member.header_offset
     header = memory[begin : begin + _LOCAL_HEADER]
     skip = int.from_bytes(header[26:28], "little") + int.from_bytes(
@@ -139,7 +142,7 @@ def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read one member, and no more bytes than its header declares."""
+    """Read the array of a member, and no more bytes than its header declares."""
     with archive.open(member) as file:
         shape, fortran, dtype = _header(file)
         count = _count(shape, dtype, member.file_size - file.tell())
@@ -151,14 +154,14 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
                 raise ValueError(f"{member.filename} is truncated")
             view[begin : begin + len(piece)] = piece
             begin += len(piece)
-        file.read(1)  # the end, where the checksum is compared
+        file.read(1)  # zipfile compares the checksum only at the end of the member
     if count == 0:
         return np.empty(shape, dtype)
     return np.frombuffer(values, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read the header of an npy file: shape, True for Fortran order, and dtype."""
+    """Return shape, order (True: Fortran) and dtype from the header of an npy file."""
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in readers:
@@ -167,13 +170,16 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if dtype.hasobject:
         raise _PickledError
     if dtype.kind not in _KINDS or not dtype.itemsize:
-        raise ValueError("no plain array of numbers or text")
+        raise ValueError("not a plain array of numbers or text")
     return shape, fortran, dtype
 
 
 def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
-    """Return the number of values of an array, at most `there` bytes."""
-    count = prod(shape)  # in Python's integers, which do not overflow
+    """Return the number of values of an array, checked against the available bytes.
+
+    there : number of bytes in the file after the header
+    """
+    count = prod(shape)  # Python's integers do not overflow, unlike those of NumPy
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
         raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
     return count

@@ -1,13 +1,14 @@
 """One QP in one Parquet file, as qpbenchmark's test sets load it.
 
-A row is a problem, with the columns ``P, q, G, h, A, b, lb, ub`` (lists of doubles) and
-``name``. All matrices are dense and stored row by row, with as many columns as q has
-components. Absent constraints and bounds are null. qpbenchmark's ``ParquetTestSet``
-reads exactly these columns [1]_. Sets other than bounds, which it would ignore, have
-further columns, named as in `harness.sets.arrays`; an index is stored row by row.
+A row of the table is a problem, with the columns ``P, q, G, h, A, b, lb, ub`` (lists of
+doubles) and ``name``. All matrices are dense and stored row by row, with as many
+columns as q has components. Absent constraints and bounds are null. qpbenchmark's
+``ParquetTestSet`` reads exactly these columns [1]_. Sets other than bounds, such as
+discs, are stored in further columns, which qpbenchmark ignores. These columns are named
+as in `harness.sets.arrays`, and index arrays are stored row by row.
 
-The `meta` of `harness.files.qpfile` has no column. It is stored in the metadata of the
-schema under the key ``mortarbench``, which other readers ignore.
+The meta data of `harness.files.qpfile` are stored in the metadata of the schema under
+the key ``mortarbench``, which other readers ignore.
 
 References
 ----------
@@ -44,7 +45,8 @@ _KEY = "mortarbench"
 _READER = Path(__file__).with_name("parquetreader.py")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
-#: Entries of a matrix, 1 GiB: a row is a single page, whose size is an int32.
+#: Largest number of entries of a matrix, equal to 1 GiB. Parquet stores a matrix as one
+#: page, and the size of a page in bytes is an int32.
 _MAX_ENTRIES = 2**27
 
 
@@ -54,10 +56,11 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     Raises
     ------
     InputError
-        When a matrix is too large for a dense format, or the file cannot be written.
+        If a matrix is too large for a dense format, or the file cannot be written.
 
     """
-    import pyarrow as pa  # loads slowly, and workers do not need it
+    # imported here, because they load slowly and workers do not need them
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     n = qp.q.size
@@ -91,13 +94,13 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
-    """Read a QP and its meta data; matrices that were sparse when saved are csc.
+    """Read a QP and its meta data; matrices that were saved from sparse ones are CSC.
 
     Raises
     ------
     InputError
-        When the file is not Parquet, does not contain exactly one problem, lacks a
-        column, or the columns are not a QP.
+        If the file is not Parquet, does not contain exactly one problem, lacks a
+        column, or its columns do not define a valid QP.
 
     """
     flat, text = _columns(path)
@@ -130,14 +133,15 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 
 
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
-    """Read the columns and the text of `meta` in a process of its own.
+    """Read the columns and the text of the meta data in a separate process.
 
-    The reason is stated in `harness.files.parquetreader`.
+    A damaged file may crash Arrow, and would end this process too.
 
     Raises
     ------
     InputError
-        When the file is not Parquet, has not one row, is too large, or lacks a column.
+        If the file is not Parquet, does not have exactly one row, is too large, or
+        lacks a column.
 
     """
     reader = [sys.executable, "-I", str(_READER)]
@@ -167,7 +171,7 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
-    """Return the matrix with n columns whose rows are concatenated in `flat`."""
+    """Check and return the matrix with n columns whose rows `flat` concatenates."""
     if n == 0 or flat.size % n:
         raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
     if not np.isfinite(flat).all():
@@ -177,5 +181,5 @@ def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
 
 
 def _flat(M: Matrix) -> Vector:
-    """Return the concatenated rows of a matrix."""
+    """Return the concatenated rows of a matrix as a vector of doubles."""
     return np.asarray(M.toarray() if issparse(M) else M, dtype=float).ravel()

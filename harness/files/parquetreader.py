@@ -1,15 +1,21 @@
-"""Process that reads a Parquet file, since damaged ones can crash Arrow.
+"""Process that reads a Parquet file, since damaged files can crash Arrow.
 
 ::
 
     python parquetreader.py MAX_BYTES KEY PATTERN COLUMN... < FILE
 
-prints a line of JSON with the number of ``rows``, the columns ``missing``, the
-``bytes`` that the file declares, and as ``meta`` the text under KEY in the metadata of
-its schema. For a file of one row of at most MAX_BYTES, the line also has ``columns``:
-the length of each list, null for a null, and -1 for other types, of COLUMN... and of
-all columns whose names match PATTERN. Their numbers follow as float64. No other module
-of this package is imported, for speed.
+The process prints a line of JSON with the entries
+
+* ``rows``, the number of rows,
+* ``missing``, the names among COLUMN... that the file lacks,
+* ``bytes``, the size that the file declares, and
+* ``meta``, the text under KEY in the metadata of the schema.
+
+If the file has one row of at most MAX_BYTES and no column is missing, the line also has
+the entry ``columns``. For each COLUMN, and each column whose name matches PATTERN, it
+contains the length of the list in the row, null for a null, or -1 for another type. The
+numbers of these lists follow the line as float64. To start quickly, the process imports
+no other module of this package.
 """
 
 from __future__ import annotations
@@ -26,18 +32,17 @@ import numpy as np
 import pyarrow.parquet as pq
 
 CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
-SECONDS = 600  #: the same for elapsed time: a file may block
-ROOM = 2**29  #: bytes of address space beside four times the declared size
+SECONDS = 600  #: elapsed time after which the kernel kills it, since reading may block
+ROOM = 2**29  #: bytes of address space in addition to four times the declared size
 
 
 def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
-    """Read the file on standard input, and print its columns."""
-    # a thread of Arrow may abort Python when it ends
+    """Read the Parquet file on standard input, and print its columns."""
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     metadata = file.metadata
-    # a page can encode a billion equal values in few bytes: the limit is on values
+    # A page can encode a billion equal values in a few bytes, so values count as well.
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
@@ -69,7 +74,7 @@ def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
 
 
 def _bound(room: int) -> None:
-    """Limit the address space to `room` bytes more than are in use."""
+    """Limit the growth of the address space of this process to `room` bytes."""
     with open("/proc/self/statm") as file:
         pages = int(file.read().split()[0])
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -80,7 +85,7 @@ def _bound(room: int) -> None:
 
 
 def _numbers(scalar: Any) -> Any:
-    """Return the numbers of a list, None for a null, and a 0-d array otherwise."""
+    """Return the numbers of a list, None for a null, or a 0-d array for other types."""
     if not scalar.is_valid:
         return None
     try:
@@ -93,4 +98,5 @@ def _numbers(scalar: Any) -> Any:
 if __name__ == "__main__":
     main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4:])
     sys.stdout.flush()
-    os._exit(0)  # without waiting for threads of Arrow, which may not end
+    # Do not wait for Arrow's threads, which may never end, or may abort Python.
+    os._exit(0)

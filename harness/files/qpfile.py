@@ -4,15 +4,21 @@
 
     min ½xᵀPx + qᵀx   s.t.   Gx ≤ h,  Ax = b,  lb ≤ x ≤ ub
 
-is stored as the vectors ``q, h, b, lb, ub``; sets other than bounds by the names of
-`harness.sets.arrays`, such as ``disc_index, disc_radius``; each matrix M of ``P, G, A``
-as the parts ``M_data, M_indices, M_indptr, M_shape`` of its CSC format (both triangles
-of P); and ``meta``, a JSON object. Absent constraints have zero rows, absent bounds are
-±inf. ``meta["dense"]`` lists the matrices that were dense. The optional structure of a
-dual is stored as matrices ``K, B`` and the vector ``fixed``.
+is stored as
 
-Files of ``np.savez(path, P=P, q=q, G=G, h=h)`` are accepted as well: matrices are dense
-arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets are optional.
+* the vectors ``q, h, b, lb, ub``,
+* the arrays ``M_data, M_indices, M_indptr, M_shape`` of the CSC format of each matrix M
+  of ``P, G, A``, with both triangles of P,
+* the arrays of sets other than bounds, such as ``disc_index, disc_radius``, named as in
+  `harness.sets.arrays`, and
+* ``meta``, a JSON object, whose entry ``dense`` lists the matrices that were dense.
+
+Absent constraints have zero rows, and absent bounds are ±inf. The optional structure of
+a dual QP (`harness.qp.Structure`) is stored as the matrices ``K, B`` and the vector
+``fixed``.
+
+Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` are accepted as well: matrices
+are dense arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets are optional.
 """
 
 from __future__ import annotations
@@ -53,12 +59,12 @@ _PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
-    """Return P, G and A as matrices, and the names of dense ones.
+    """Return the matrices P, G and A by name, and the names of the dense ones.
 
     Raises
     ------
     InputError
-        When an operator P is too large to be assembled.
+        If P is an operator that is too large to be assembled.
 
     """
     P = qp.P
@@ -79,17 +85,18 @@ def save_qp(
 ) -> str:
     """Write `qp` to `path`, and return the digest of its coefficients.
 
-    An operator P is assembled, and counts as dense. Equal digests, of 16 hex digits,
-    mean equal QPs. A serialised operator has another digest than the assembled one.
+    An operator P is assembled and stored as a dense matrix. Equal digests, of 16 hex
+    digits, mean equal QPs; a serialised operator and its assembled matrix have
+    different digests.
 
-    meta : plain data; the keys ``dense`` and ``maker`` are set here
-    serialised : write a P that is a `SerialisableOperator` as its arrays, which only
-        workers of the same run can read
+    meta : plain data; the keys ``dense`` and ``maker`` are overwritten
+    serialised : store a `SerialisableOperator` P by its arrays instead of assembling
+        it; only workers of the same run can read such a file
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        If the file cannot be written.
 
     Examples
     --------
@@ -123,7 +130,11 @@ def qp_digest(qp: QP, *, serialised: bool = False) -> str:
 def _parts(
     qp: QP, *, serialised: bool
 ) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
-    """Return the arrays of a QP, names of dense matrices, and the maker of P."""
+    """Return the arrays to store for a QP, and the entries of its meta data.
+
+    The entries are the names of the dense matrices and, if P is serialised, the name of
+    its maker.
+    """
     P = qp.P
     if not (serialised and isinstance(P, SerialisableOperator)):
         return *_arrays(qp, structure=serialised), {}
@@ -133,7 +144,7 @@ def _parts(
 
 
 def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return the arrays of a QP, and the names of dense matrices."""
+    """Return the arrays to store for a QP, and the names of its dense matrices."""
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
     arrays |= set_arrays(qp.sets[1:])
@@ -152,15 +163,17 @@ def load_qp(
 ) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data.
 
-    operators : makers of operators (`harness.operators`), for a file written by the
-        case worker of the same run, which may contain an operator and has no limit of
-        size. None for a file of unknown origin: operators, an asymmetric P, and sizes
-        above the limit of `harness.files.datafile` are refused
+    operators : makers of operators by name (`harness.operators`), for a file that the
+        case worker of the same run has written; such a file may contain an operator and
+        be of any size. None for a file of unknown origin, which is refused if P is an
+        operator or asymmetric, or the size exceeds the limit of
+        `harness.files.datafile`
 
     Raises
     ------
     InputError
-        When the file is not an npz file, lacks an array, or the arrays are not a QP.
+        If the file is not an npz file, lacks an array, or its arrays do not define a
+        valid QP.
 
     """
     parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
@@ -183,7 +196,7 @@ def load_qp(
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            # a full matrix becomes a view of its values, which may be mapped
+            # without zeros, the matrix is a view of its values, which may be mapped
             M = matrices[name]
             rows, columns = M.shape
             full = M.nnz == rows * columns and M.has_canonical_format
@@ -204,7 +217,7 @@ def load_qp(
 
 
 def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
-    """Return the QP of arrays that were saved by `np.savez`."""
+    """Return the QP whose arrays a user has saved with `np.savez`."""
     try:
         for name in arrays:
             if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
@@ -238,7 +251,7 @@ def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
 
 
 def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | None:
-    """Return a vector, also from a matrix with one row or column."""
+    """Return a vector, possibly stored as a row or column; None if it is missing."""
     if name not in arrays:
         return None
     v = _vector(arrays, name)
@@ -246,12 +259,12 @@ def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | Non
 
 
 def listed_dense(meta: Mapping[str, Any]) -> set[str]:
-    """Return the names of dense matrices in the meta data.
+    """Return the names of the matrices that the meta data list as dense.
 
     Raises
     ------
     ValueError
-        When they are not a list of strings.
+        If the entry ``dense`` is not a list of strings.
 
     """
     names = meta.get("dense", [])
@@ -261,12 +274,12 @@ def listed_dense(meta: Mapping[str, Any]) -> set[str]:
 
 
 def check_dense(name: str, M: Matrix) -> None:
-    """Raise if a matrix would exceed the limit of memory as a dense array.
+    """Check that a matrix, stored as a dense array, would not exceed the memory limit.
 
     Raises
     ------
     InputError
-        For the same reason as `harness.files.datafile.check_size`.
+        If the dense array would exceed the limit of `harness.files.datafile`.
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
@@ -275,7 +288,7 @@ def check_dense(name: str, M: Matrix) -> None:
 def _check_foreign(
     matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
 ) -> None:
-    """Raise if P is an operator, which only workers read, or a matrix is too large."""
+    """Check that P is not an operator, and that the dense matrices are small enough."""
     if "maker" in meta:
         raise ValueError(
             "holds P as an operator, which is read only where the run itself wrote it; "
@@ -312,12 +325,13 @@ def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
     if arrays[name].dtype.kind not in "iuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
-    with np.errstate(over="ignore"):  # inf beyond double precision, which callers check
+    # Values beyond the range of a double become inf, for which callers check.
+    with np.errstate(over="ignore"):
         return arrays[name].astype(float, copy=False)
 
 
 def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
-    """Return a matrix from its CSC parts, after checking them."""
+    """Check the CSC parts of a stored matrix, and return the matrix."""
     data = _vector(arrays, f"{name}_data")
     if not np.isfinite(data).all():
         raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
@@ -333,17 +347,17 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
 def compressed(
     data: NDArray[Any], indices: NDArray[Any], indptr: NDArray[Any], shape: Any
 ) -> Matrix:
-    """Return a matrix from its CSC parts.
+    """Check CSC parts, and return the matrix that they define.
 
-    The parts are checked, since an index out of range would crash a product.
+    An index out of range would crash a matrix-vector product.
 
     Raises
     ------
     ValueError, TypeError, OverflowError
-        When they are inconsistent with each other or with `shape`.
+        If the parts are inconsistent with each other or with `shape`.
 
     """
-    # SciPy (1.17.1) checks differences, which may overflow
+    # SciPy (1.17.1) checks the differences of indptr, which may overflow.
     if (indptr[1:] < indptr[:-1]).any():
         raise ValueError("indptr decreases")
     M = csc_array((data, indices, indptr), shape=shape)

@@ -1,9 +1,9 @@
 """Reading of text files from untrusted sources, within limits.
 
-A file must be regular (a device or a pipe may not end), have the size that it declares
-(files in /proc declare none), be UTF-8, and not exceed a limit that users can raise.
-Its data must not be nested too deeply. All functions raise `InputError` with the place
-and the expected content.
+A file must be regular (a device or a pipe may never end) and declare its size (files in
+/proc do not). Its content must be UTF-8, not exceed a limit that users can raise, and
+not be nested too deeply. All functions raise an `InputError` that states where the
+error is and what was expected.
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from typing import Any, BinaryIO, NoReturn
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
 
-VARIABLE = "MORTARBENCH_TEXT_MIB"  #: size of the largest text file that is read
-MAX_TOML_MIB = 1.0  #: default of the variable for TOML, which takes 1 s to parse
-MAX_JSON_MIB = 64.0  #: default of the variable for other files
+#: environment variable that sets the size limit of text files, in MiB
+VARIABLE = "MORTARBENCH_TEXT_MIB"
+MAX_TOML_MIB = 1.0  #: default limit for TOML; a file of this size takes 1 s to parse
+MAX_JSON_MIB = 64.0  #: default limit for other text files
 MAX_LEVELS = 50  #: largest depth of nesting
 
-#: A TOML key with more parts than allowed levels. It has to be found before parsing,
-#: since the time of the parser grows like the square of the number of parts.
+#: A dotted TOML key with more than `MAX_LEVELS` components. Such a key is rejected
+#: before parsing, since the parser's time is quadratic in the number of components.
 _LONG_KEY = re.compile(
     r"""(?<![\w"'.-])[\w"'-]++(?:[ \t]*+\.[ \t]*+[\w"'-]++)"""
     f"{{{MAX_LEVELS}}}"
@@ -43,13 +44,14 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
     expected : description of the file, for messages
     """
     try:
-        regular = stat.S_ISREG(path.stat().st_mode)  # opening a device may have effects
+        # Checked before opening, since opening a device may have side effects.
+        regular = stat.S_ISREG(path.stat().st_mode)
         flags = (
             os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
         )  # does not block if a pipe has replaced the file
         fd = os.open(path, flags) if regular else -1
-    except (OSError, ValueError) as e:  # a NUL in the name
-        why = e.strerror if isinstance(e, OSError) else "no name of a file"
+    except (OSError, ValueError) as e:  # ValueError: a NUL character in the name
+        why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{path}: {why}; expected {expected}") from None
     if not regular or not stat.S_ISREG(os.fstat(fd).st_mode):
         if fd >= 0:
@@ -60,11 +62,13 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         try:
             if os.fstat(fd).st_size == 0 and os.pread(fd, 1, 0):
                 raise InputError(
-                    f"{path}: declares no size, like files of the kernel; "
+                    f"{path}: declares no size, as files in /proc do; "
                     f"expected {expected}"
                 )
             yield file
-        except OSError as e:  # of reading; others are of the caller's own files
+        # Errors that state a file name or a full disk were caused by other files, which
+        # the block may write.
+        except OSError as e:
             if e.errno in (None, *FULL) or e.filename is not None:
                 raise
             raise InputError(f"{path}: {e.strerror}; expected {expected}") from None
@@ -76,7 +80,7 @@ def read_text(
     """Read a text file.
 
     expected : description of the file, for messages
-    most : limit in MiB, unless the user has set another one
+    most : limit in MiB, unless the environment variable sets another limit
     """
     limit = _limit(most)
     with opened(path, expected) as file:
@@ -102,7 +106,7 @@ def read_toml(path: Path, expected: str = "a TOML file") -> dict[str, Any]:
 
 
 def toml(text: str) -> dict[str, Any]:
-    """Parse TOML."""
+    """Parse a TOML document."""
     try:
         if _LONG_KEY.search(text):
             raise RecursionError
@@ -113,7 +117,7 @@ def toml(text: str) -> dict[str, Any]:
         raise InputError(f"{place}: {what}") from None
     except RecursionError:
         raise _too_deep() from None
-    except ValueError:  # limit of Python
+    except ValueError:  # Python limits the number of digits
         raise InputError(
             "an integer with too many digits; expected at most "
             f"{sys.get_int_max_str_digits()}"
@@ -142,7 +146,7 @@ def read_json(path: Path, expected: str = "a JSON file") -> Any:
 
 
 def _refuse_deep(data: object) -> None:
-    """Raise RecursionError for data nested too deeply for recursive functions."""
+    """Raise RecursionError if data are nested more than `MAX_LEVELS` deep."""
     level = [data]
     for _ in range(MAX_LEVELS + 1):
         level = [
@@ -176,7 +180,7 @@ def _number(text: str) -> float:
 
 
 def _limit(most: float) -> float:
-    """Return the limit in force, MiB."""
+    """Return the size limit: that of the environment variable, or `most`; in MiB."""
     text = os.environ.get(VARIABLE)
     if text is None:
         return most

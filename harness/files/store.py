@@ -29,9 +29,9 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
-_SIDE = "side_{}_"  #: prefix of the arrays of a contact, with its number
+_SIDE = "side_{}_"  #: prefix of the arrays of a contact side, with its number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
-#: optional arrays of a contact
+#: optional arrays of a contact side
 _SOME = ("push", "shear", "friction", "friction_force", "exact")
 _HISTORY = "history_"
 
@@ -42,7 +42,7 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
     Raises
     ------
     InputError
-        When the point is missing or damaged.
+        If the file of the point is missing or damaged.
 
     """
     with _restorable():
@@ -50,12 +50,12 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
 
 
 def load_history(folder: Path, digest: str) -> History:
-    """Load the history of a stored point, without the point; empty if it has none.
+    """Load only the history of a stored point; empty if none was stored.
 
     Raises
     ------
     InputError
-        When it is missing or damaged, or its content is not that of the digest.
+        If the file is missing or damaged, or its content does not match `digest`.
 
     """
     with _restorable():
@@ -86,7 +86,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
     Raises
     ------
     InputError
-        When it is missing or damaged, or its content is not that of the digest.
+        If the file is missing or damaged, or its content does not match `digest`.
 
     """
     with _restorable():
@@ -97,7 +97,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 
 def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Yield the contacts of a deformed state; old files have none."""
+    """Yield the contact sides of a deformed state; files of old versions have none."""
     for i in range(len(arrays)):
         side = _with_prefix(_SIDE.format(i), arrays)
         if not set(side) >= {"name", *_ALONG}:
@@ -110,7 +110,7 @@ def _sides(arrays: Arrays) -> Iterator[ContactSide]:
 
 
 def write_point(path: Path, solution: Solution) -> None:
-    """Write the point of a solution, and its history, to a file."""
+    """Write the point and the history of a solution to a file."""
     write_arrays(path, point_arrays(solution))
 
 
@@ -121,7 +121,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def read_point(path: Path, status: Status) -> Solution:
-    """Read a file of `write_point` as a `Solution` that claims `status`."""
+    """Read a file that `write_point` wrote, as a `Solution` that claims `status`."""
     arrays = read_arrays(path, _POINT)
     x, y, z, z_box = (arrays[name] for name in _POINT)
     history = _history(path, arrays)
@@ -134,7 +134,7 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
     Raises
     ------
     InputError
-        When the file cannot be read, is not an npz file, is larger than
+        If the file cannot be read, is not an npz file, is larger than
         `harness.files.datafile` allows, or lacks one of the `expected` arrays.
 
     """
@@ -142,21 +142,21 @@ def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]
 
 
 def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Read an npz file like `read_arrays`, mapping arrays where possible.
+    """Return the arrays of an npz file, mapped into memory if possible.
 
-    limited : apply the limit of sizes to files that can be mapped as well
+    limited : apply the size limit also to files that can be mapped
 
     Raises
     ------
     InputError
-        For the same reasons as `read_arrays`.
+        For the same reasons as in `read_arrays`.
 
     """
 
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # an npz file that another program wrote
+        except ValueError:  # written by another program, which does not align arrays
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -173,7 +173,7 @@ def _expected(
             arrays = read(path)
     except InputError:
         raise
-    except Exception:  # zipfile raises many types for texts, pickles, damage
+    except Exception:  # zipfile raises many types for texts, pickles, damaged files
         raise InputError(
             f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
         ) from None
@@ -189,7 +189,7 @@ def point_arrays(solution: Solution) -> Arrays:
 
 
 def _history(path: Path, arrays: Arrays) -> History:
-    """Return the history among the arrays of a point; old files have none."""
+    """Return the history stored with a point; empty for files of old versions."""
     try:
         return checked_history(_with_prefix(_HISTORY, arrays))
     except ValueError as e:
@@ -197,7 +197,7 @@ def _history(path: Path, arrays: Arrays) -> History:
 
 
 def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
-    """Return the arrays whose names have a prefix, by the rest of the name."""
+    """Return the arrays whose names have a prefix, by name without the prefix."""
     return {
         name.removeprefix(prefix): values
         for name, values in arrays.items()
@@ -207,7 +207,7 @@ def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
 
 @contextmanager
 def _restorable() -> Iterator[None]:
-    """Add the remedy to errors about files of a result folder."""
+    """Add the remedy to errors about files of a result folder, raised in the block."""
     try:
         yield
     except InputError as e:
@@ -217,7 +217,7 @@ def _restorable() -> Iterator[None]:
 def _as_stored(
     folder: Path, digest: str, expected: tuple[str, ...]
 ) -> tuple[Path, dict[str, NDArray[Any]]]:
-    """Read stored arrays, and compare their content with the digest."""
+    """Check that stored arrays match `digest`, and return their path and the arrays."""
     path = _path(folder, digest)
     arrays = read_arrays(path, expected)
     if digest_of(arrays) != digest:
@@ -226,12 +226,15 @@ def _as_stored(
 
 
 def is_stored(folder: Path, digest: str) -> bool:
-    """Return True if a folder has arrays of that digest."""
+    """Return True if a folder contains arrays with that digest."""
     return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
 
 
 def copy_stored(source: Path, folder: Path, digest: str) -> bool:
-    """Copy arrays to another folder; return True if it has them afterwards."""
+    """Copy stored arrays to another result folder; return False if `source` lacks them.
+
+    If `folder` already has arrays with this digest, nothing is copied.
+    """
     if is_stored(folder, digest):
         return True
     if not is_stored(source, digest):
@@ -244,7 +247,10 @@ def copy_stored(source: Path, folder: Path, digest: str) -> bool:
 
 
 def _path(folder: Path, digest: str) -> Path:
-    """Return the path of stored arrays; other texts could lead out of the folder."""
+    """Check that a text is a digest, and return the path of the arrays stored under it.
+
+    Any other text might contain a path that leads out of the folder.
+    """
     if not _DIGEST.fullmatch(digest):
         raise InputError(
             f"{folder}: {shortened(digest)!r} is not a digest; expected 16 hex digits"
@@ -260,14 +266,15 @@ def save(folder: Path, arrays: Arrays) -> str:
         return digest
     archive = BytesIO()
     np.savez(archive, **arrays)  # type: ignore[arg-type]
-    replace_file(path, archive.getbuffer())  # before the journal line that refers to it
+    # on the disk before the journal line that refers to the file is written
+    replace_file(path, archive.getbuffer())
     return digest
 
 
 def digest_of(arrays: Arrays) -> str:
-    """Return the digest of names, types, shapes and values.
+    """Return the digest of the names, types, shapes and values of arrays.
 
-    The archive itself is not hashed, since it contains dates.
+    The npz file itself is not hashed, since it contains dates.
     """
 
     def parts() -> Iterator[bytes]:

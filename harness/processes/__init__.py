@@ -1,1 +1,1 @@
-"""Processes of a run: workers, their protocol with the parent, limits and measuring."""
+"""Worker processes of a run: their protocol, their limits and measurements in them."""

@@ -1,11 +1,11 @@
 """Cache of built cases on disk, shared by the processes of a run.
 
 ``FOLDER/DIGEST.npz`` contains a QP and is named after the digest of its content.
-``FOLDER/KEY.json`` maps a case to such a file. The key is a digest of the case and of
-the environment of its build, so that each version of the code has its own entry. Every
-file is stored with a digest, and a case whose file is damaged is built again. Digests
-are not signatures: anyone who can write to the folder can store another QP under the
-name of a case (docs/security.md).
+``FOLDER/KEY.json`` maps a case to such a file. KEY is a digest of the case and of the
+environment in which it is built, so that each version of the code has its own entry.
+Both files are checked by digests when they are read, and a case is built again if one
+of them is damaged. Digests are not signatures: anyone who can write to the folder can
+store a different QP under the name of a case (docs/security.md).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from mortarbench.harness.files.reading import read_text
 
 @dataclass(frozen=True, kw_only=True)
 class StoredCase:
-    """A built case in the folder."""
+    """Built case in the cache."""
 
     qp: Path  #: file that contains the QP, see `harness.files.qpfile`
     digest: str  #: digest of the content of that file
-    meta: Mapping[str, Any]  #: meta data that the case worker reported
+    meta: Mapping[str, Any]  #: meta data that `make` returned, see `find_or_build`
 
 
 def find_or_build(
@@ -41,14 +41,14 @@ def find_or_build(
 ) -> StoredCase:
     """Return a case from the folder, building it first if it is missing or damaged.
 
-    Only one process at a time looks up or builds a case; the others wait.
+    Only one process at a time looks up or builds a given case; the others wait.
 
     folder : created if it does not exist; its parent must exist
     identity : plain data that identify the case and the environment of the build
-    make : writes the QP to a file, flushes it and returns the meta data. Exceptions
-        propagate, and nothing is stored then
+    make : writes the QP to a file, flushes the file and returns the meta data. If
+        `make` raises an exception, nothing is stored and the exception propagates
     """
-    folder.mkdir(exist_ok=True)  # without parents: fails if the folder was moved
+    folder.mkdir(exist_ok=True)  # fails if the result folder around it was moved
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
     with _locked(folder / f"{key}.lock"):
         stored = _look_up(folder, key)
@@ -65,13 +65,13 @@ def find_or_build(
         size = path.stat().st_size
         index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
         text = json.dumps({**index, "check": _check(index)})
-        # The index comes last: a build that is killed before leaves no entry.
+        # The index is written last: a build that is killed earlier leaves no entry.
         replace_file(folder / f"{key}.json", text.encode())
         return StoredCase(qp=path, digest=digest, meta=meta)
 
 
 def content_digest(path: Path) -> str:
-    """Hash the content of a file."""
+    """Return 24 hex digits of the SHA-256 of a file's content."""
     with path.open("rb") as file:
         return hex_digest(pieces(file), 24)
 
@@ -83,7 +83,7 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
         if index.pop("check") != _check(index):
             return None
         path = folder / f"{index['digest']}.npz"
-        # Sizes first: hashing would read a file that was enlarged to its end.
+        # Compare sizes first: hashing would read all of a file that was enlarged.
         if path.stat().st_size != index["bytes"]:
             return None
         if content_digest(path) != index["digest"]:
@@ -102,13 +102,13 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
 
 
 def _check(index: Mapping[str, Any]) -> str:
-    """Hash an index: the digest of the QP does not cover its meta data."""
+    """Return the digest of an index, since the QP's digest does not cover meta data."""
     return hex_digest([json.dumps(index, sort_keys=True).encode()], 16)
 
 
 @contextmanager
 def _locked(lock: Path) -> Iterator[None]:
-    """Hold an exclusive lock on a file; it is released when its process ends."""
+    """Hold an exclusive file lock, which the kernel releases if this process ends."""
     fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)

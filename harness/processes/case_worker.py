@@ -1,26 +1,28 @@
 """Process that builds cases, so that the code of families runs outside the parent.
 
-It speaks `harness.processes.protocol` and answers four kinds of requests:
+The process follows `harness.processes.protocol` and answers four kinds of requests:
 
 * ``{"build": NAME, "qp": PATH, "keep": N}`` builds the case and writes its QP to PATH.
-  Reply: ``{"event": "done", "meta": {…}}``, with the digest of the QP's numbers. With
-  the entry ``"first": NAME``, another case is built and dropped first
-* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates a
-  point. Reply: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``:
-  its physical quantities and the bounds of its error. The deformed state is written to
-  ``fields``, if the case has one
+  Reply: ``{"event": "done", "meta": {…}}``, where ``meta`` includes a digest of the
+  coefficients of the QP. If the request has the entry ``"first": NAME``, that case is
+  built and discarded beforehand
+* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
+  point in the file ``point``. Reply: ``{"event": "done", "quantities": {…}, "bounds":
+  {…}, "notes": […]}``, with the physical quantities of the point and the bounds of its
+  error. If ``fields`` is a path and the case defines a deformed state, this state is
+  written to ``fields``
 * ``{"shared": NAME}`` asks, without building the case, whether ranks can emit its QP
   themselves. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
-  solver, for verdicts that residuals cannot decide, and writes the point to the second.
-  Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
+  solver, for verdicts that residuals cannot decide, and writes the solution to the
+  second. Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
 
-If a case cannot be built, the reply to the first two is ``{"event": "done", "unbuilt":
-REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true beyond the last problem of
-a sequence (`PastEndError`). NAME is ``{"family": …, "params": {…}, "form": …, "name":
-…}``; N is the number of cases to keep in memory. The map from a point back to the
-bodies is code and cannot be stored in a file, so a case whose QP is in the cache is
-built again when a point of it is described.
+If a case cannot be built, the reply to the first two requests is ``{"event": "done",
+"unbuilt": REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true if the case
+lies beyond the last problem of a sequence (`PastEndError`). NAME is ``{"family": …,
+"params": {…}, "form": …, "name": …}``; N is the number of cases to keep in memory. The
+map from a point to physical quantities is code and cannot be stored in a file. A case
+whose QP is in the cache is therefore built again before a point is evaluated.
 """
 
 from __future__ import annotations
@@ -53,18 +55,21 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import memory_mib, reset_peak
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
-MAX_STORED_BOUNDS = 10_000  #: number of points whose error bounds are cached
+MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are cached
 #: The first dual case of a process is built again if its build took less than this
 #: time, in s. First calls (page faults, caches, late imports) took 12 of the 14 ms of
-#: dualising the smallest demo case; imports alone may take a second. Without a second
-#: build they would be charged to the dual form. Relative to ten seconds, they are
-#: negligible, whereas a second build is not.
+#: dualising the smallest demo case, and imports alone may take a second. Without a
+#: second build this time would be charged to the dual form. In a build of more than ten
+#: seconds it is negligible, whereas a second build would be expensive.
 MAX_WARM_UP_SECONDS = 10.0
 
 
 @dataclass(eq=False)
 class CaseWorker:
-    """Builder of the cases of `families`, with the injected `reference` solver."""
+    """Builder of the cases of `families`, with the injected `reference` solver.
+
+    operators : makers of operators P by name, see `harness.operators`
+    """
 
     families: Mapping[str, Family]
     reference: Reference
@@ -74,13 +79,13 @@ class CaseWorker:
     _build_seconds: float = 0.0  # duration of the last build
     _build_peak_mib: float | None = None  # peak memory during that build
     _warm: bool = False  # True once a dual case has been built
-    #: bounds and objection by case name and digest of the point
+    #: error bounds and objection (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict
     )
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request; a failure of the family's code is part of the reply."""
+        """Answer one request; the reply reports any failure of the family's code."""
         if "solve" in request:
             return self._solve(Path(request["solve"]), Path(request["point"]))
         fields = request.get("build") or request.get("describe") or request["shared"]
@@ -94,7 +99,7 @@ class CaseWorker:
                 self._build(CaseId(**{**first, "family": family}))
                 self._warm = True
             case = self._case(name, request["keep"])
-        except (Exception, SystemExit) as e:  # the family's code
+        except (Exception, SystemExit) as e:  # raised by code of the family
             return {
                 "unbuilt": unbuilt(name, e),
                 "trace": traceback.format_exc(),
@@ -116,7 +121,7 @@ class CaseWorker:
         if request["fields"] is not None and case.fields is not None:
             try:
                 fields = field_arrays(case.fields(s))
-            except Exception as e:  # the family's code; it must not lose the record
+            except Exception as e:  # raised by code of the family; the record is kept
                 notes.append(note_of("fields", e))
             else:
                 write_arrays(Path(request["fields"]), fields)
@@ -132,8 +137,8 @@ class CaseWorker:
     ) -> tuple[dict[str, Any], str]:
         """Bound the error of a point, or return the bounds of an identical earlier one.
 
-        Most solvers return the same digits in every repeat. Only the first of them is
-        certified, and only its record has a `certify_seconds`.
+        Most solvers return the same digits in every repeat. Then only the answer of the
+        first repeat is certified, and only its record has `certify_seconds`.
         """
         key = name.name, digest_of(point_arrays(s))
         if key in self._bounds:
@@ -155,7 +160,8 @@ class CaseWorker:
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
-        while len(self._cases) >= keep:  # before the build: two may not fit in memory
+        # drop cases before the build, since two of them may not fit in memory
+        while len(self._cases) >= keep:
             del self._cases[next(iter(self._cases))]
         if case is None:
             case = self._build(name)

@@ -1,10 +1,10 @@
-"""Memory of a tree of processes, shared memory included.
+"""Memory of a tree of processes, including shared memory.
 
 Resident memory (VmRSS) counts shared memory only where it is mapped and touched. A file
-in /dev/shm occupies memory even when it is not mapped, and after the processes that
-created it have ended. Such files are therefore counted once each, and removed with the
-tree. Libraries that share arrays between processes (joblib, multiprocessing, MPI) leave
-them behind when they are killed.
+in /dev/shm, however, occupies memory even if no process has mapped it or the process
+that created it has ended. Each such file is therefore counted once, and removed
+together with the tree: libraries that share arrays between processes (joblib,
+multiprocessing, MPI) leave these files behind if they are killed.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Memory meter of one tree of processes, with the shared files that it created."""
+    """Meter of the memory of a process tree and of the shared files that it created."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
-        # inodes by name, of new files in SHARED that a process of the tree had open
+        # inode numbers by name of the new files in SHARED that the tree had open
         self._created: dict[str, int] = {}
 
     def mib(self, tree: Iterable[int], limit: float) -> float:
         """Return the memory of a tree, in MiB.
 
-        The cheap sum counts a shared page once per process. Only if that exceeds
-        `limit` are the proportional set sizes read, which divide a page among its users
-        but make the kernel walk all page tables.
+        Resident sizes are cheap to read, but their sum counts a shared page once per
+        process. If this sum exceeds `limit`, in MiB, the proportional set sizes are
+        read instead. They divide a shared page among the processes that map it, but
+        require the kernel to walk all page tables.
         """
         tree = list(tree)
         self.notice(tree)
-        sizes: dict[int, int] = {}  # by inode: hard links count once
+        sizes: dict[int, int] = {}  # bytes by inode, so that hard links count once
         for created in self._remaining():
             for path in (created, *created.rglob("*")):
                 with suppress(OSError):
@@ -43,7 +44,7 @@ class Footprint:
                     sizes[status.st_ino] = 512 * status.st_blocks
         files = sum(sizes.values()) / 2**20
         private, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
-        # The maximum, not the sum: mapped pages of these files are in both.
+        # The maximum, not the sum: both include the mapped pages of these files.
         total = private + max(mapped, files)
         if total > limit and len(tree) > 1:
             private, mapped = _sum(
@@ -55,7 +56,8 @@ class Footprint:
     def notice(self, tree: Iterable[int]) -> None:
         """Record the new files in SHARED that processes of a tree have open or mapped.
 
-        Files of other programs appear there too, so being new is not enough.
+        Other programs create files there as well, so only open or mapped files are
+        attributed to the tree.
         """
         new = dict(set(_listed().items()) - self._before)
         for process in tree if new.keys() - self._created.keys() else ():
@@ -65,7 +67,7 @@ class Footprint:
                     self._created[name] = new[name]
 
     def remove_shared(self) -> None:
-        """Remove the files that the tree, which has ended, left in SHARED."""
+        """Remove the files that the tree left in SHARED; its processes have ended."""
         for path in self._remaining():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():
@@ -80,7 +82,7 @@ class Footprint:
         for name, inode in self._created.items():
             with suppress(OSError):
                 status = (SHARED / name).lstat()
-                # another program may have created a file of the same name since
+                # another program may since have created a file of the same name
                 if status.st_ino == inode and status.st_uid == os.getuid():
                     remaining.append(SHARED / name)
         return remaining
@@ -115,7 +117,10 @@ def _listed() -> dict[str, int]:
 
 
 def _sum(tree: list[int], file: str, *groups: tuple[str, ...]) -> tuple[float, ...]:
-    """Sum groups of lines like "RssAnon: 12 kB" over processes; in MiB."""
+    """Return, for each group of keys, the sum of its values over all processes, in MiB.
+
+    file : file in /proc/PID with lines like "RssAnon: 12 kB"
+    """
     totals = [0.0] * len(groups)
     for process in tree:
         try:

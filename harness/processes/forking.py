@@ -1,11 +1,11 @@
 """Workers forked from the parent, instead of started as new interpreters.
 
 A fork saves half a second of CPU time for loading numpy and scipy. Like a worker
-started by its command, a forked one runs below a sub-reaper
+started by its command, a forked worker runs below a sub-reaper
 (`harness.processes.reaper`), in its own session, on one CPU, with no open files except
 its log and its two pipes. Since it starts with a copy of the parent's memory, it is
-forked before anything is read or built, and only by a parent with one thread
-(`is_safe`).
+forked before the parent reads or builds any data, and only if the parent has a single
+thread (`is_safe`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import BinaryIO
 
 from mortarbench.harness.processes import reaper
 
-#: serves requests from the first file descriptor, with replies to the second
+#: reads requests from the first file descriptor and writes replies to the second
 Serve = Callable[[int, int], None]
 
 _POLL_SECONDS = 0.001
@@ -33,19 +33,20 @@ _ENDED = os.WEXITED | os.WNOHANG
 def is_safe() -> bool:
     """Return True if this process has a single thread, so that it may fork.
 
-    A lock held by another thread would stay locked for ever in the fork.
+    A lock held by another thread at the time of the fork would never be released in the
+    child.
     """
     return len(os.listdir("/proc/self/task")) == 1
 
 
 class Fork:
-    """Sub-reaper above a forked worker, with the methods of `Popen` that we use."""
+    """Handle of the sub-reaper above a forked worker, similar to `subprocess.Popen`."""
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
-        # A number is reused once its process is reaped; the descriptor is not.
+        # The kernel may reuse the ID of a reaped process, but not the pidfd.
         self._process_fd = os.pidfd_open(pid)
-        self.stdin = stdin  #: closing it, or the parent's death, kills the tree
+        self.stdin = stdin  #: pipe to the sub-reaper, which kills the tree if it closes
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the process has ended.
@@ -53,11 +54,11 @@ class Fork:
         Raises
         ------
         subprocess.TimeoutExpired
-            If it is still running after `timeout` seconds.
+            If the process is still running after `timeout` seconds.
 
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with suppress(ChildProcessError):  # reaped already, together with its tree
+        with suppress(ChildProcessError):  # raised if the process was reaped already
             while os.waitid(os.P_PIDFD, self._process_fd, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
@@ -65,7 +66,7 @@ class Fork:
         os.close(self._process_fd)
 
     def kill(self) -> None:
-        """Send SIGKILL."""
+        """Send SIGKILL to the sub-reaper."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._process_fd, signal.SIGKILL)
 
@@ -78,14 +79,15 @@ def fork(
     log: int,
     environment: Mapping[str, str],
 ) -> Fork:
-    """Fork a worker; the caller has checked that this `is_safe`.
+    """Fork a worker; the caller must have checked `is_safe`.
 
-    cpu, pipes : see `reaper.supervise`; `serve` is called with the pipes
-    log : file descriptor of its standard output and error
-    environment : variables to set in the worker
+    serve : main function of the worker, called with the two `pipes`
+    cpu, pipes : see `reaper.supervise`
+    log : file descriptor that receives the worker's standard output and error
+    environment : environment variables to set in the worker
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        stream.flush()  # the fork would write a copy of the buffer
+        stream.flush()  # otherwise the child would write a copy of the buffer
     child_end, parent_end = os.pipe()
     pid = os.fork()
     if pid:
@@ -93,17 +95,17 @@ def fork(
         return Fork(pid, os.fdopen(parent_end, "wb"))
     try:
         os.setsid()
-        # The parent's handlers raise `TerminatedError`; in the fork that would unwind a
-        # copy of the parent's stack.
+        # The parent's handlers raise `TerminatedError`, which would unwind the copy of
+        # the parent's stack in the fork.
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, signal.SIG_DFL)
         for fd, target in ((child_end, 0), (log, 1), (log, 2)):
             os.dup2(fd, target)
-        # An inherited end of another worker's pipe would keep that worker alive.
+        # An inherited end of another worker's pipe would keep this other worker alive.
         for fd in map(int, os.listdir("/proc/self/fd")):
             if fd > 2 and fd not in pipes:
-                with suppress(OSError):  # the descriptor of this listing is closed
+                with suppress(OSError):  # listdir has closed its own descriptor already
                     os.close(fd)
         os.environ.update(environment)
         reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)

@@ -10,8 +10,8 @@ from threading import RLock
 class ForkSafeLock(ContextDecorator):
     """Reentrant lock, used as a context manager or as a decorator.
 
-    The lock is free in a child forked while another thread held it: that thread does
-    not exist in the child and could never release it.
+    If another thread holds the lock at the time of a fork, the lock is free in the
+    child, where that thread does not exist and could never release it.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""A measurement by a worker process and its verdict, shared by `run` and `solve`."""
+"""Measurement of a solver in a worker process, and the verdict on its answer."""
 
 from __future__ import annotations
 
@@ -43,17 +43,19 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-#: Largest CPU time of the harness between "start" and "timed" that the worker's clock
-#: excludes.
+#: Largest CPU time that the harness may use between the events "start" and "timed"
+#: while the worker's clock is stopped.
 HARNESS_SECONDS = 0.005
-#: The same, per repeat. On a busy machine 0.12 ms were measured; the margin avoids
-#: false suspicion of a solver.
+#: Further CPU time of this kind, per repeat of the solve. On a busy machine 0.12 ms
+#: were measured; the margin avoids false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor, and also by one of the times below, since a ratio of tiny times is noise.
+#: factor, and also by one of the times below: ratios of tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
-MIN_GAIN_SECONDS = 1e-3  #: smallest gain between the solves of one measurement
-MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: smallest gain between two measurements
+#: smallest suspicious difference between the times of solves in one measurement
+MIN_GAIN_SECONDS = 1e-3
+#: smallest suspicious difference between the first solves of two measurements
+MIN_GAIN_BETWEEN_SECONDS = 5e-3
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
@@ -64,8 +66,8 @@ class JudgedMeasurement(NamedTuple):
 
     record: Record
     solution: Solution | None  #: None if the worker ended without an answer
-    #: True if there is a point but quantities or error bounds are missing. Ranks that
-    #: evaluate their answer compute some of these
+    #: True if there is a point but its quantities or error bounds are missing. They are
+    #: present if the ranks that solved the QP have evaluated their answer completely.
     needs_evaluation: bool = True
 
 
@@ -81,19 +83,20 @@ def measure_and_judge(
 ) -> JudgedMeasurement:
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : returns the entire QP. If ranks emit the QP and evaluate the answer, it is
-        called only for values that they cannot evaluate
-    request : request to the worker, see `harness.processes.worker`, without the entries
-        that follow from the record. The worker writes the point to the file ``out``
-    time_limit, memory_limit : s and MiB
-    prove : computes a proven optimum if residuals cannot decide, see
-        `harness.verify.optimum`
+    whole : returns the entire QP. If ranks emit the QP and evaluate the answer, `whole`
+        is called only for values that they cannot evaluate
+    request : request to the worker, see `harness.processes.worker`; the tolerance and
+        the memory limit are added. The worker writes the point to the file ``out``
+    time_limit, memory_limit : limits in s and MiB
+    prove : computes a proven optimum if the residuals alone do not decide the verdict,
+        see `harness.verify.optimum`
 
     Raises
     ------
     FaultError
-        If the measurement failed for a reason other than the solver: a worker that
-        could not be started or was killed before its solve, a full disk, a lost file.
+        If the measurement failed for a reason other than the solver: the worker could
+        not be started or was killed before its solve, the disk was full, or a file was
+        lost.
 
     """
     request = {**request, "tol": record.asked_tol}
@@ -160,7 +163,7 @@ def measure_and_judge(
 
 
 def _as_tuples(data: Any) -> Any:
-    """Convert lists back to tuples: JSON has no tuples."""
+    """Convert lists, as JSON stores tuples, back to tuples."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data
@@ -169,12 +172,15 @@ def _as_tuples(data: Any) -> Any:
 def _with_cost(
     reply: Reply, record: Record, first_seconds: dict[Hashable, float]
 ) -> tuple[Record, *tuple[str, ...]]:
-    """Add the cost of a measurement to its record; return it with notes on times."""
+    """Add the cost of a measurement to its record; return the record with any notes.
+
+    first_seconds : see `_caching_notes`
+    """
     assert reply.answer is not None
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-    ):  # rank 0 measures its memory only; the parent measures all ranks
+    ):  # rank 0 measures only its own memory, the parent that of all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
@@ -183,7 +189,7 @@ def _with_cost(
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Return the entry of a request that names the case to ranks that emit its QP."""
+    """Return the entry of a request that states the case whose QP the ranks emit."""
     case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
 
@@ -191,10 +197,13 @@ def case_request(record: Record) -> dict[str, Any]:
 def sizes_from_ranks(
     emitted: Mapping[str, Any] | None, record: Record
 ) -> tuple[QP, Record]:
-    """Add the sizes of the QP that the ranks emitted to a record.
+    """Return a placeholder QP of the emitted sizes, and the record with these sizes.
 
-    Return an empty QP of these sizes, and the completed record. If the ranks emitted no
-    QP, the sizes are zero and the record is unchanged.
+    If the ranks emitted no QP, the placeholder has size zero and the record is
+    unchanged.
+
+    emitted : entries of the event "emitted", see `harness.processes.protocol`; None if
+        it was not sent
     """
     if emitted is None or not emitted["sizes"]:
         return qp_of_sizes(0, 0), record
@@ -205,11 +214,14 @@ def sizes_from_ranks(
 
 
 def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
-    """Return the worker's times if they are possible, else the parent's and a note.
+    """Return the worker's times if they are plausible, else the parent's with a note.
 
-    Their sum T must satisfy  CPU time − harness overhead ≤ T ≤ wall time  between the
-    request and the end. If T is larger, the worker's clock was wrong; if it is smaller,
-    work was done outside of it.
+    The sum T of the worker's times must satisfy
+
+        CPU time − harness overhead ≤ T ≤ wall time,
+
+    where the parent measures CPU time and wall time. A larger T means that the worker's
+    clock was wrong, a smaller T that the solver computed while this clock was stopped.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
@@ -241,9 +253,12 @@ def _caching_notes(
 ) -> list[str]:
     """Return notes on repeats that were much faster than the first solve.
 
-    first : time of the first solve of this measurement; None if there was only one
-    first_seconds : time of the first solve ever, by QP and tolerance; that of `key` is
-        added if it is missing
+    m : cost of this measurement
+    first : time of the first of several solves in this measurement, in s; None if there
+        was only one solve
+    first_seconds : time of the first solve by this worker, in s, by QP and tolerance;
+        an entry for `key` is added if it is missing
+    key : QP and tolerance of this measurement
     """
     if m.total_seconds is None:
         return []
@@ -262,7 +277,10 @@ def _caching_notes(
 
 
 def _check_memory(limit: float, record: Record) -> Record:
-    """Change the verdict if an answer exceeded the memory limit, or failed by it."""
+    """Change the verdict if the solver exceeded the memory limit or failed due to it.
+
+    limit : MiB
+    """
     if record.verdict is Verdict.DECLINED:
         return record
     peak = record.peak_mib
@@ -279,12 +297,12 @@ def _check_memory(limit: float, record: Record) -> Record:
 def single_worker(
     command: list[str], serve: Serve | None = None
 ) -> Iterator[WorkerProcess]:
-    """Provide a worker for one measurement; it ends with the context.
+    """Provide a worker for one measurement; the worker is ended with the context.
 
-    command : starts the worker; two file descriptors are appended to it
-    serve : main function of a fork of this process, which replaces the command if a
-        fork is safe. The fork starts immediately, before data that it does not need are
-        in memory
+    command : starts the worker; two file descriptors are appended
+    serve : main function of the worker as a fork of this process. If a fork is safe, it
+        is used instead of `command`, and started at once, before this process loads
+        data that the worker does not need
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")
@@ -306,10 +324,11 @@ def measure_once(
 ) -> tuple[Record, Solution | None]:
     """Measure once without limits, judge the answer, and evaluate its quantities.
 
-    case : returns the case, which is built by the first call
-    reference : solves the QP if residuals cannot decide
-    source : origin of the QP. Ranks judge their answers only if all code in them is
-        ours; the case then evaluates only the remaining values
+    case : returns the case, which the first call builds
+    reference : reference solver, called if the residuals alone do not decide the
+        verdict
+    source : origin of the QP. If it is `Source.RANKS`, the ranks judge their answer
+        themselves, and the case is built only for values that they cannot evaluate
 
     Raises
     ------
@@ -358,9 +377,9 @@ def measure_once(
 def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
-    Folders that killed processes left behind are removed first. They are recognised by
-    a free lock: the owner of a folder holds its lock, which the kernel releases when
-    the owner ends.
+    Folders that killed processes left behind are removed first. Each process holds a
+    lock on its folder, which the kernel releases when the process ends; a folder whose
+    lock is free is therefore abandoned.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):
@@ -372,8 +391,8 @@ def scratch_folder() -> Iterator[Path]:
                 finally:
                     os.close(lock)
     is_ours = False
-    # Between creation and lock another process may take the new folder for a stale one
-    # and remove it; then a new one is tried.
+    # Before the new folder is locked, another process may mistake it for an abandoned
+    # one and remove it. In that case another folder is created.
     while not is_ours:
         with TemporaryDirectory(prefix=_SCRATCH) as name:
             path = Path(name) / _LOCK

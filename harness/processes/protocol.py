@@ -1,20 +1,22 @@
 """Protocol between the parent and its workers: lines of JSON over two pipes.
 
-The parent writes one request per line, and the process answers it by one or more
-events. It ends when the pipe of requests is closed.
+The parent writes one request per line, and the worker answers each request by one or
+more events. The worker ends when the pipe of requests is closed.
 
-* ``{"event": "ready"}`` is sent once, when the process accepts requests.
+* ``{"event": "ready"}`` is sent once, when the worker accepts requests.
 * ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
-  its clock, and by ``{"event": "done", …}`` with the answer. In a measurement,
-  ``{"event": "timed"}`` comes between the two events, when the worker's clock has
-  stopped. The worker then waits for a line, so that the parent can read its CPU time.
-  Ranks that emit the QP of a case send ``{"event": "emitted", …}`` before "start". They
-  send ``{"event": "measured"}`` after "timed", before they evaluate the answer.
-* ``{"event": "fault", "what": …}`` replaces any of these if our own code fails.
+  its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
+  worker sends ``{"event": "timed"}`` between these two, when its own clock has stopped.
+  The worker then waits for a line from the parent, so that the parent can read the
+  worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
+  "emitted", …}`` before "start", and ``{"event": "measured"}`` after "timed", before
+  the ranks evaluate the answer.
+* ``{"event": "fault", "what": …}`` replaces any of these events if code of the harness
+  fails.
 
 A library that writes to the wrong file descriptor can mix other bytes into the replies;
-`event_of` refuses them.
+`event_of` rejects such lines.
 """
 
 from __future__ import annotations
@@ -30,19 +32,20 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-MAX_REPLY_BYTES = 2**22  #: bounds the memory to read one reply of foreign code
-MAX_EXCERPT_CHARACTERS = 200  #: length of a foreign reply that is quoted in a message
-MAX_FAULT_CHARACTERS = 2000  #: length of the message of a fault
+MAX_REPLY_BYTES = 2**22  #: largest reply that is read, to bound the memory for it
+MAX_EXCERPT_CHARACTERS = 200  #: longest excerpt of an invalid reply in a message
+MAX_FAULT_CHARACTERS = 2000  #: longest message of the event "fault"
 
 
 @dataclass(frozen=True)
 class Events:
-    """Callbacks by which the handler of a request reports its progress."""
+    """Callbacks with which the handler of a request sends events to the parent."""
 
-    start: Callable[[], None]  #: reports that the clock starts
-    #: reports that it has stopped; returns when the parent has read the CPU time
+    start: Callable[[], None]  #: sends "start": the parent starts its clock
+    #: sends "timed": the worker's clock has stopped. Returns after the parent has read
+    #: the CPU time
     timed: Callable[[], None]
-    #: reports the end of a stage outside the clock: name of the event, its entries
+    #: sends "emitted" or "measured", with the entries of the event
     reached: Callable[[str, Mapping[str, Any]], None]
 
 
@@ -57,10 +60,10 @@ def answer_requests(
 ) -> None:
     """Answer requests until the pipe of requests is closed.
 
-    handle : computes the answer to a request, with callbacks that report its progress
-    warm_up : performs the warm-up; returns entries of the reply, or None
+    handle : computes the answer to a request; called with the callbacks of its events
+    warm_up : performs the warm-up; returns further entries of the reply, or None
     """
-    # A program that a solver starts must not hold the pipes open, or write into them.
+    # Programs that a solver starts must neither keep the pipes open nor write to them.
     for fd in (request_fd, reply_fd):
         os.set_inheritable(fd, False)
     with os.fdopen(request_fd) as requests, os.fdopen(reply_fd, "w") as replies:
@@ -73,8 +76,8 @@ def answer_requests(
                 else:
                     answer = handle(request, _events(requests, replies))
                     reply = {"event": "done", **answer}
-                sys.stdout.flush()  # the log is truncated at the next request
-            except Exception as e:  # our own fault: handlers catch those of solvers
+                sys.stdout.flush()  # because the next request truncates the log
+            except Exception as e:  # from our code: handlers catch errors of solvers
                 traceback.print_exc()
                 what = " ".join(f"{type(e).__name__}: {e}".split())
                 reply = {"event": "fault", "what": what[:MAX_FAULT_CHARACTERS]}
@@ -98,16 +101,16 @@ def _send(replies: TextIO, **event: Any) -> None:
 
 
 class ForeignReplyError(Exception):
-    """Reply that violates the protocol; the message quotes its beginning."""
+    """Reply that violates the protocol; the message quotes the start of the reply."""
 
 
 def event_of(line: bytes, expected: str) -> dict[str, Any]:
-    """Parse a reply: an event of the expected name, or "fault".
+    """Check that a reply is the expected event or "fault", and return its entries.
 
     Raises
     ------
     ForeignReplyError
-        If the line is anything else.
+        If the line is not one of these two events.
 
     """
     try:
@@ -129,20 +132,23 @@ def _excerpt(line: bytes) -> str:
 
 
 def measures(request: Mapping[str, Any]) -> bool:
-    """Return True if a request is a measurement, the only kind with a clock."""
+    """Return True if a request is a measurement; other requests are not timed."""
     return "out" in request
 
 
 class Source(StrEnum):
-    """Origin of the QP of a measurement, and with it the judge of the answer."""
+    """Origin of the QP of a measurement, which determines who judges the answer."""
 
-    FILE = "file"  #: a file; the parent reads it as well, and judges
-    SHARES = "shares"  #: ranks emit a share each; the parent judges by the entire QP
-    RANKS = "ranks"  #: ranks emit a share each and judge together; none has all of it
+    #: The worker reads the QP from a file. The parent reads it too, and judges
+    FILE = "file"
+    #: Each MPI rank emits its share of the QP. The parent judges with the entire QP
+    SHARES = "shares"
+    #: Each rank emits its share, and the ranks judge jointly; none has the entire QP
+    RANKS = "ranks"
 
     @property
     def is_shared(self) -> bool:
-        """True if ranks emit the QP."""
+        """True if MPI ranks emit the QP."""
         return self is not Source.FILE
 
 

@@ -2,18 +2,17 @@
 
 Runs start `launch` in place of a worker: it calls `mpiexec`, which starts the worker's
 command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
-command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
-of `harness.processes.worker` and communicates with the parent; the others execute its
-orders. Each rank has its own CPU if there are enough. The memory limit applies to the
-sum over all ranks, and all ranks end when one of them ends.
+of `harness.processes.worker` and communicates with the parent; the other ranks execute
+orders that rank 0 sends. Each rank has its own CPU if there are enough CPUs. The memory
+limit applies to the sum over all ranks, and if one rank ends, all others are ended.
 
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
 each rank returns its slice of the same solution.
 
-As a baseline, ranks can also solve copies: each rank solves the entire QP
-independently, at the same time as the others. The slowest rank determines the measured
-time.
+As a baseline, the ranks can also solve copies: each rank solves the entire QP
+independently, at the same time as the other ranks. The slowest rank determines the
+measured time.
 """
 
 from __future__ import annotations
@@ -63,19 +62,19 @@ from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import memory_mib, reason_to_decline
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks
 
-_ORDER = 7  #: MPI tag of the orders that rank 0 sends to the others
+_ORDER = 7  #: MPI tag of the orders that rank 0 sends to the other ranks
 _IDLE_SECONDS = 2e-4  #: time between two probes for an order
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
-    """Run `command` on some number of ranks and report how they ended on stderr.
+    """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
-    A process above each rank records its end (`harness.processes.reaper`). The message
-    names the rank that ended first, since the others end because of it. If one rank
-    ends while others go on, these are ended whatever its exit code. The output of the
-    ranks is not parsed: its lines may be interleaved.
+    A process above each rank records how the rank ended (`harness.processes.reaper`).
+    The message names the rank that ended first, which is the cause of the others' end:
+    if one rank ends while others are running, the others are ended, whatever its exit
+    code. The output of the ranks is not parsed, since its lines may be interleaved.
 
-    command : its last two words are file descriptors, which the ranks inherit
+    command : the last two elements are file descriptors, which the ranks inherit
 
     Returns
     -------
@@ -86,8 +85,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    # The supervisor bound this process to one CPU; the sub-reaper above it, its parent,
-    # has the others.
+    # The supervisor bound this process to one CPU, and its parent, a sub-reaper, to the
+    # other CPUs.
     with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
@@ -99,25 +98,27 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         pass_fds=(*fds, write),
         env=os.environ | {RECORD: str(write)},
     )
-    # An end kept open here would hide that the ranks, or the parent, closed theirs.
+    # While this process kept an end of a pipe open, a reader would not see end of file
+    # when the ranks or the parent close theirs.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
         message = first or f"one of {ranks} ranks ended: mpiexec says {code}"
-        # The parent quotes the last line; a rank may have left an unfinished one.
+        # The parent quotes the last line of the output, which must not begin with the
+        # unfinished line of a rank.
         print(f"\n{message}", file=sys.stderr)
     return 0 if code == 0 else 1
 
 
 class _RankExits:
-    """Exits of ranks in the order of time.
+    """Exits of the ranks, in chronological order.
 
-    epoll(7) lists file descriptors in the order in which they became ready, however
-    late it is polled, so the first rank to end is known; mpiexec names the lowest one.
-    The process above a rank writes the exit status of the rank; the status is unknown
-    if that process was killed first.
+    epoll(7) lists file descriptors in the order in which they became ready, even if it
+    is polled late. This identifies the rank that ended first, whereas mpiexec names the
+    one with the lowest number. The process above a rank writes the exit status of the
+    rank; the status is unknown if that process was killed before.
     """
 
     def __init__(self, record: int, ranks: int) -> None:
@@ -125,8 +126,9 @@ class _RankExits:
         self._record = record
         self._ranks = ranks
         self._unread = b""
-        self._rank_of: dict[int, int] = {}  # rank by a file descriptor of its process
-        self._first: int | str | None = None  # a rank, or the message of its failure
+        self._rank_of: dict[int, int] = {}  # rank by pidfd of its process
+        # first rank that ended, or the message of its failure; None before any exit
+        self._first: int | str | None = None
         self._exit_description: dict[int, str] = {}  # by rank
         self._events = epoll()
         self._events.register(record, EPOLLIN)
@@ -134,8 +136,10 @@ class _RankExits:
     def first(self, mpiexec: int) -> str:
         """Wait until mpiexec has ended; describe the exit of the first rank that ended.
 
-        The other ranks then have `PEER_TIMEOUT` to end, whatever the exit code of the
-        first. Returns "" if mpiexec was the first to end.
+        After the first exit, whatever its code, the wait is limited to `PEER_TIMEOUT`.
+        Return "" if mpiexec ended before all ranks.
+
+        mpiexec : process ID
         """
         mpi, deadline = os.pidfd_open(mpiexec), np.inf
         self._events.register(mpi, EPOLLIN)
@@ -149,7 +153,7 @@ class _RankExits:
                     os.close(fd)
                 else:
                     self._take_records()
-                if fd == mpi:  # ranks that end from now on do so because of it
+                if fd == mpi:  # the end of mpiexec causes all later ends of ranks
                     self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
@@ -200,11 +204,11 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks; each rank has its own CPU if there are enough.
+    """Join the other ranks; bind this rank to a CPU of its own if there are enough.
 
-    The speed of communication is measured here, before any solve is timed.
+    The speed of communication is measured at this point, before any solve is timed.
     """
-    from mpi4py import MPI  # only runs with ranks need it
+    from mpi4py import MPI  # imported here, because only runs on ranks need it
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
@@ -220,10 +224,10 @@ def follow(
     emit: Emit,
     limit: Callable[[float | None], None],
 ) -> None:
-    """Execute the orders of rank 0 on this rank, until it sends None.
+    """Execute the orders of rank 0 on this rank, until rank 0 sends None.
 
     emit : assembles this rank's share of a case
-    limit : limits the memory of this process, in MiB; None lifts the limit
+    limit : sets the memory limit of this process, in MiB, or lifts it if None
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
@@ -233,7 +237,7 @@ def follow(
         try:
             if "case" in order:
                 run = share = emitted = None  # free memory before the next emission
-                # raised on all ranks alike; rank 0 reports it
+                # all ranks raise the same error, and rank 0 reports it
                 with suppress(InputError, RankFailedError):
                     emitted, _ = _emit_on_ranks(emit, order["case"], ranks)
                 limit(order["memory_limit"])
@@ -256,8 +260,8 @@ def follow(
             elif run is not None and share is not None:
                 solution, _ = _solve_on_ranks(run, share, ranks)
         except BaseException as e:
-            # If rank 0 failed too, it reports the failure and sends its next order. If
-            # no order comes, rank 0 still waits for this rank.
+            # If rank 0 failed too, it reports the failure and sends its next order. No
+            # order means that rank 0 is waiting for this rank, so all must be aborted.
             if _wait_for_order(ranks, PEER_TIMEOUT):
                 continue
             abort(ranks, e)
@@ -270,9 +274,9 @@ def _next_order(ranks: Ranks) -> dict[str, Any] | None:
 
 
 def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
-    """Wait for an order without spinning; return False if none came in time.
+    """Wait for an order; return False if none arrives within `seconds`.
 
-    A blocking receive would keep the CPU busy.
+    The loop sleeps between probes, because a blocking receive would keep the CPU busy.
     """
     deadline = time.monotonic() + seconds
     while not ranks.comm.iprobe(source=0, tag=_ORDER):
@@ -283,7 +287,10 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
 
 
 class RankCosts(NamedTuple):
-    """Cost of a solve on several ranks: (mean, largest); empty tables on one rank."""
+    """Cost of a solve on several ranks, as pairs (mean, largest) over the ranks.
+
+    The tables are empty for a solve in a single process.
+    """
 
     seconds: Mapping[str, tuple[float, float]] = {}  #: times by phase
     counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
@@ -295,9 +302,10 @@ class RankCosts(NamedTuple):
 
 
 class ParallelSolver:
-    """Solver on rank 0 that directs the other ranks.
+    """Solver on rank 0 that sends orders to the other ranks.
 
-    The ranks solve one QP together, each with its share, or each a copy of it.
+    The ranks jointly solve one QP, of which each has a share. If `copies` is True, each
+    rank instead solves a copy of the entire QP.
 
     Attributes
     ----------
@@ -308,7 +316,7 @@ class ParallelSolver:
     def __init__(
         self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
     ) -> None:
-        # messages of failures name the file of the wrapped solver
+        # under this name, messages of failures find the file of the wrapped solver
         self._solver = self.__wrapped__ = solver
         self._ranks = ranks
         self._emit = emit
@@ -327,9 +335,10 @@ class ParallelSolver:
 
         Returns
         -------
-        an empty QP of the same sizes, and the entries of the event "emitted": its
-        `sizes`, its `digest` and the seconds of the slowest rank. If the emission
-        fails, the sizes are zero and `declines` or `prepare` reports the failure.
+        a placeholder QP of the same sizes, and the entries of the event "emitted": the
+        `sizes` and the `digest` of the QP, and the time of the slowest rank, in s. If
+        the emission fails, the sizes are zero and `declines` or `prepare` reports the
+        failure.
 
         """
         self._order({"case": dict(case), "memory_limit": memory_limit})
@@ -343,7 +352,7 @@ class ParallelSolver:
         return qp_of_sizes(*sizes), emission
 
     def evaluate(self) -> dict[str, Any] | None:
-        """Evaluate the last answer on all ranks; None if they did not emit its QP.
+        """Evaluate the last answer on all ranks; return None if its QP was not emitted.
 
         Returns
         -------
@@ -356,7 +365,10 @@ class ParallelSolver:
         return evaluated_by_ranks(self._emitted, self._local_solution, self._ranks)
 
     def use_file(self, path: Path, memory_limit: float | None) -> None:
-        """Set the file from which all ranks read the next QP instead of emitting it."""
+        """Set the file from which all ranks read the next QP, instead of emitting it.
+
+        memory_limit : limit for each rank, in MiB; None for no limit
+        """
         self._emitted = self._emission_error = self._local_solution = None
         self._path, self._memory_limit = path, memory_limit
 
@@ -366,16 +378,17 @@ class ParallelSolver:
 
     @property
     def accepts(self) -> tuple[type, ...]:
-        """Convex sets that the solver accepts."""
+        """Classes of convex sets that the solver accepts."""
         return getattr(self._solver, "accepts", (Box,))
 
     def declines(self, qp: QP) -> str | None:
-        """Return why the solver, or the distribution over ranks, declines a QP."""
+        """Return why the QP cannot be solved on these ranks, or None if it can."""
         if self._copies:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
-        if self._emission_error is not None:  # `prepare` raises the other failures
+        # if the emission failed with another error, `prepare` raises it
+        if self._emission_error is not None:
             is_input_error = isinstance(self._emission_error, InputError)
             return str(self._emission_error) if is_input_error else None
         if self._emitted is not None:
@@ -392,7 +405,7 @@ class ParallelSolver:
         return self._solver.declines(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks; return when the last one is ready."""
+        """Prepare on all ranks; return once the slowest of them is ready."""
         if self._emission_error is not None:
             raise self._emission_error
         if self._emitted is not None:
@@ -428,20 +441,22 @@ class ParallelSolver:
 def _emit_on_ranks(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
 ) -> tuple[DistributedQP, dict[str, Any]]:
-    """Emit a case on all ranks; return this rank's part and the entries of the event.
+    """Emit a case on all ranks; return the local part and the entries of the event.
+
+    Any error is raised on all ranks.
 
     Raises
     ------
     InputError
-        If the family raises it; on all ranks.
+        If the family raises it on every rank.
     RankFailedError
-        If one rank fails otherwise; on all ranks.
+        If some ranks fail in another way.
 
     """
     start = time.perf_counter()
     try:
         emitted = run_collectively(ranks, lambda: emit(case, ranks))
-        # `agreed` is collective, so the slowest rank is done as well
+        # The call above is collective: it returns when the slowest rank is done.
         seconds = time.perf_counter() - start
         digest = run_collectively(ranks, emitted.digest)
         entries = {"sizes": emitted.sizes, "digest": digest, "build_seconds": seconds}
@@ -454,9 +469,9 @@ def _emit_on_ranks(
 
 
 def qp_of_sizes(variables: int, equality_rows: int) -> QP:
-    """Return a placeholder of given sizes for a QP that no single process has.
+    """Return a placeholder of given sizes for a QP that no single process stores.
 
-    Its vectors are broadcast scalars, so it takes no memory.
+    The vectors in the primal variables are broadcast scalars and take no memory.
     """
     n, m = variables, equality_rows
     zeros = np.broadcast_to(0.0, n)
@@ -483,17 +498,17 @@ def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
 def _solve_on_ranks(
     run: Callable[[], Solution], share: Share, ranks: Ranks
 ) -> tuple[Solution, tuple[Solution, RankCosts] | None]:
-    """Solve on this rank.
+    """Solve the local share of a QP.
 
     Returns
     -------
-    the local slice of the solution, and on rank 0 the entire solution with the costs of
-    all ranks
+    the local slice of the solution, and on rank 0 also the entire solution with the
+    costs over all ranks; None on other ranks
 
     """
     ranks.clear()
     s = run()
-    # before `share.whole`, whose communication is not a part of the solve
+    # read before `share.whole`, whose communication is not a part of the solve
     seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     solution = share.whole(s)
     peak = memory_mib("VmHWM") or 0.0

@@ -1,26 +1,27 @@
 """Sub-reaper: the process above a worker that ends all processes the worker started.
 
-Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, it starts COMMAND in a session of
-its own, bound to one CPU, and exits with the same code or signal. Every worker has one,
-so it is run by an interpreter without site packages, which starts faster. It is a
-*sub-reaper*, see prctl(2): a descendant whose parent ends becomes its child, so that
-neither a double fork nor setsid escapes from its tree. The tree is killed
+Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, the script starts COMMAND in a new
+session, bound to one CPU, and exits with the same code or signal. Every worker has a
+sub-reaper, so the script is run by an interpreter without site packages, which starts
+faster. A *sub-reaper* adopts each descendant whose parent ends, see prctl(2), so that
+neither a double fork nor setsid(2) removes a process from its tree. The tree is killed
 
 * when COMMAND ends, and
-* when the other end of its standard input is closed, by the process that started it or
-  by the kernel when that process dies, even by SIGKILL.
+* when the other end of the sub-reaper's standard input is closed, either by the process
+  that started it or, if that process dies, by the kernel.
 
 System V segments of shared memory that COMMAND created are removed as well, because
 they outlive all processes.
 
-Run as ``reaper.py rank RECORD COMMAND…``, it stands above one MPI rank: it starts
-COMMAND, writes the process and later its wait status to the file descriptor RECORD, and
-exits with the same code or signal. Until then it keeps the inherited descriptors open,
-so that mpiexec ends no other rank before the record is written.
+Run as ``reaper.py rank RECORD COMMAND…``, the script is the parent of one MPI rank: it
+starts COMMAND, writes its process ID and later its wait status to the file descriptor
+RECORD, and exits with the same code or signal. Until then it keeps the inherited
+descriptors open, so that mpiexec does not end the other ranks before the record is
+written.
 
-The run itself is not the sub-reaper, for three reasons: a killed run could not clean
-up, the trees of two workers would be indistinguishable, and a Python session that uses
-this package as a library would be changed.
+The process of the run is not a sub-reaper itself, for three reasons: if it were killed,
+it could not clean up; the trees of two workers would be indistinguishable; and it would
+adopt processes unrelated to this package in a Python session that imports it.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
 #: list of the System V segments of shared memory, see proc(5)
 SEGMENTS = "/proc/sysvipc/shm"
-END_SECONDS = 5.0  #: longest wait for processes that were sent SIGKILL
+END_SECONDS = 5.0  #: longest time to wait for the end of processes sent SIGKILL
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
@@ -53,7 +54,7 @@ _NOT_STARTED = 127  #: exit code of shells for a command that is not found
 
 
 def descendants(root: int) -> list[int]:
-    """List the living processes below `root`, zombies excluded."""
+    """List the process IDs of all descendants of `root` that are not zombies."""
     processes: list[int] = []
     unseen = [root]
     while unseen:
@@ -72,7 +73,7 @@ def descendants(root: int) -> list[int]:
 
 
 def _is_below(process: int, root: int) -> bool:
-    """Return True if a process descends from `root`, by the parents in /proc."""
+    """Return True if a process is `root` or one of its descendants, by /proc."""
     while process > 0 and process != root:
         process = int(_status(process, 1) or 0)
     return process == root > 0
@@ -90,7 +91,10 @@ def state(process: int, task: int | None = None) -> str:
 
 
 def _status(where: int | str, field: int) -> str:
-    """Return a field of /proc/WHERE/stat, counted after the name; "" if missing."""
+    """Return a field of /proc/WHERE/stat, or "" if the process has ended.
+
+    field : index of the field, 0 for the first one after the name of the program
+    """
     try:
         with open(f"/proc/{where}/stat", "rb") as file:
             # the last ")" ends the name, which may contain spaces and parentheses
@@ -102,11 +106,11 @@ def _status(where: int | str, field: int) -> str:
 def kill_descendants(root: int) -> None:
     """Kill every process below `root`, and wait until they have ended.
 
-    All are stopped before the first is killed, and the tree is listed again until no
-    new process appears: a stopped process cannot fork, whereas killing one by one would
-    let a process escape that forks faster. A process in uninterruptible sleep is waited
-    for `END_SECONDS` at most; every process is sent its signal, however slow the
-    machine.
+    All processes are stopped before the first is killed, and the tree is listed again
+    until no new process appears. A stopped process cannot fork, whereas a process that
+    forks quickly could escape if the others were killed singly. The wait, which a
+    process in uninterruptible sleep could prolong, takes at most `END_SECONDS`. Every
+    process is sent SIGKILL at least once, however slow the machine is.
     """
     deadline = time.monotonic() + END_SECONDS
     while True:
@@ -120,19 +124,23 @@ def kill_descendants(root: int) -> None:
         for process in stopped:
             _send(process, signal.SIGKILL, root)
         if root == os.getpid():
-            _reap()  # orphans became children of the sub-reaper
-        if time.monotonic() > deadline:  # after the signals, so that all are sent once
+            _reap()  # because orphans became children of the sub-reaper
+        # checked after the signals, so that each of them is sent at least once
+        if time.monotonic() > deadline:
             return
         time.sleep(0.001)
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process of the tree, but never to a later one with its number.
+    """Send a signal to a process below `root`, but not to one that reuses its ID.
 
-    A pidfd refers to one process for ever. If the number belongs to the tree after the
-    pidfd was opened, the pidfd refers to that process.
+    A pidfd always refers to the same process. If the process with this ID still belongs
+    to the tree after the pidfd was opened, the pidfd refers to a process of the tree.
+
+    process : process ID
+    number : number of the signal
     """
-    with suppress(OSError):  # it has ended, or the number is now another user's
+    with suppress(OSError):  # it has ended, or another user's process reuses its ID
         fd = os.pidfd_open(process)
         try:
             if _is_below(process, root):
@@ -142,9 +150,9 @@ def _send(process: int, number: int, root: int) -> None:
 
 
 def shared_segments() -> dict[int, int]:
-    """Return the creators of this user's System V segments, by segment number."""
+    """Return the creators' process IDs of this user's System V segments, by segment."""
     creators = {}
-    with suppress(OSError), open(SEGMENTS) as file:  # OSError: not in this kernel
+    with suppress(OSError), open(SEGMENTS) as file:  # kernels may lack this file
         names = file.readline().split()
         for line in file:
             row = dict(zip(names, map(int, line.split()), strict=False))
@@ -154,7 +162,7 @@ def shared_segments() -> dict[int, int]:
 
 
 def _reap() -> dict[int, int]:
-    """Collect the children that have ended; return their wait statuses."""
+    """Reap the children that have ended; return their wait statuses by process ID."""
     statuses = {}
     with suppress(ChildProcessError):
         while (child := os.waitpid(-1, os.WNOHANG))[0]:
@@ -163,7 +171,7 @@ def _reap() -> dict[int, int]:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command, kill its remaining descendants, and end in the same way."""
+    """Run the command, kill its remaining descendants, and exit as the command did."""
     if arguments[0] == "rank":
         _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments
@@ -172,14 +180,16 @@ def main(arguments: list[str]) -> None:
 
 
 def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> None:
-    """Become the sub-reaper above a worker; this process ends as the worker ends.
+    """Become the sub-reaper above a worker, and exit with the worker's code or signal.
 
-    begin : main function of the worker, a fork of this process; must not return
-    pipes : the worker's pipes, closed in this process
+    begin : main function of the worker, which is a fork of this process; must not
+        return
+    cpu : CPU to which the worker is bound
+    pipes : file descriptors of the worker's pipes, closed in this process
     """
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-    # SIGCHLD wakes the poll below through a pipe; a signal between a check and the poll
-    # would otherwise be missed.
+    # SIGCHLD wakes the poll below through a pipe. Without the pipe, a signal that
+    # arrives just before the poll would be missed.
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
@@ -196,7 +206,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         os.close(null)
         os.sched_setaffinity(0, {cpu})
         begin()
-    # Kept open here, the pipes would not report the death of the worker to the parent.
+    # If this process kept the pipes open, the parent would not see the worker's death.
     for fd in pipes:
         os.close(fd)
     others = os.sched_getaffinity(0) - {cpu}
@@ -215,10 +225,10 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
     kill_descendants(reaper)
-    # In a container whose init reaps nothing, zombies would fill the process table.
+    # If the init process of a container reaps nothing, zombies would accumulate.
     _reap()
-    # Only segments whose creator has ended: a living process with its number is another
-    # one, to which the segment may belong.
+    # Remove only segments whose creator has ended: a living process with the same ID is
+    # a different one, to which the segment may belong.
     for segment, creator in shared_segments().items():
         if segment not in before and creator in creators and not is_alive(creator):
             ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
@@ -237,26 +247,26 @@ def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
 
 
 def _write(record: int, **what: int) -> None:
-    """Write a line of JSON by one write(2), so that lines of ranks do not mix."""
+    """Write a line of JSON by a single write(2), so that lines of ranks do not mix."""
     line = ", ".join(f'"{name}": {value}' for name, value in what.items())
-    with suppress(OSError):  # the reader has ended
+    with suppress(OSError):  # raised if the reader has ended
         os.write(record, f"{{{line}}}\n".encode())
 
 
 def _fork_bound_to_parent() -> int:
-    """Fork a process that is killed when this one ends; return like `os.fork`."""
+    """Fork a child that is killed when this process ends; return as `os.fork` does."""
     parent = os.getpid()
     child = os.fork()
     if child == 0:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        # The parent may have died before prctl; no signal would come for that.
+        # If the parent died before the call of prctl, no signal is sent.
         if os.getppid() != parent:
             os._exit(_NOT_STARTED)
     return child
 
 
 def _execute(command: list[str]) -> NoReturn:
-    # Python ignores these two, and the disposition would survive execve(2).
+    # Python ignores these signals, and the disposition would survive execve(2).
     for number in (signal.SIGPIPE, signal.SIGXFSZ):
         signal.signal(number, signal.SIG_DFL)
     try:
@@ -267,14 +277,14 @@ def _execute(command: list[str]) -> NoReturn:
 
 
 def _end_as(status: int | None) -> NoReturn:
-    """End with the exit code or signal of a wait status; with 0 if asked to end."""
+    """End this process with the exit code or signal in a wait status; None means 0."""
     if status is None or os.WIFEXITED(status):
         os._exit(0 if status is None else os.WEXITSTATUS(status))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of this process
     with suppress(OSError):  # the handler of SIGKILL cannot be set
         signal.signal(os.WTERMSIG(status), signal.SIG_DFL)
     signal.raise_signal(os.WTERMSIG(status))
-    os._exit(_NOT_STARTED)  # reached if the signal does not end a process
+    os._exit(_NOT_STARTED)  # reached only if the signal does not end this process
 
 
 if __name__ == "__main__":

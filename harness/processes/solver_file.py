@@ -1,10 +1,10 @@
-"""Solver objects stored in files, by which a worker process receives a copy.
+"""Solver objects stored in files, from which worker processes load copies.
 
 Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
-notebook) with their code. It refers to those of modules by name. Modules that a worker
-would not find under the same name are therefore stored with their code as well:
-plug-ins, and modules beside the script, since workers do not search the working
-directory.
+notebook) with their code. To functions and classes of other modules it refers by name.
+A worker would not find plug-ins, nor modules in the folder of the script, since workers
+do not search the working directory. Such modules are therefore stored with their code
+as well.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def write_solver(path: Path, solver: Solver) -> None:
     Raises
     ------
     InputError
-        If it refers to something that cannot be copied, such as an open file.
+        If the solver refers to an object that cannot be copied, such as an open file.
 
     """
     import cloudpickle  # not needed for solvers of the registry
@@ -53,12 +53,15 @@ def write_solver(path: Path, solver: Solver) -> None:
 
 
 def read_solver(path: Path) -> Any:
-    """Load the copy that `write_solver` stored in a process of the same user.
+    """Load a solver that `write_solver` has stored.
+
+    The file is unpickled, so it must be one that a process of the same user wrote.
 
     Raises
     ------
     InputError
-        If a module that it refers to cannot be imported, or it cannot be rebuilt.
+        If the solver cannot be rebuilt, for instance because a module to which it
+        refers cannot be imported.
 
     """
     try:
@@ -72,7 +75,7 @@ def read_solver(path: Path) -> Any:
 
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
-    """Yield the loaded modules that a worker would not find, or find elsewhere."""
+    """Yield loaded modules that a worker would not find, or not in the same file."""
     importable: dict[str, bool] = {}  # by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
@@ -90,7 +93,7 @@ def _modules_unknown_to_workers() -> Iterator[ModuleType]:
 
 
 def _is_importable(module: ModuleType | None) -> bool:
-    """Return True if a worker would import this very module under its name."""
+    """Return True if a worker that imports this name would load the same module."""
     if module is None:
         return False
     spec = PathFinder.find_spec(module.__name__, [*_worker_path()])
@@ -103,7 +106,7 @@ def _is_importable(module: ModuleType | None) -> bool:
 
 @cache
 def _worker_path() -> tuple[str, ...]:
-    """Return `sys.path` of an interpreter that is started like a worker."""
+    """Return `sys.path` of an interpreter started with the options of a worker."""
     program = "import json, sys; print(json.dumps(sys.path))"
     process = subprocess.run(
         [sys.executable, "-P", "-c", program],

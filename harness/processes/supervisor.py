@@ -2,16 +2,16 @@
 
 Only SIGKILL to all processes of a worker stops every solver: C code ignores alarms, and
 some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
-keeps its processes together. Memory is limited by polling the resident size, because
-RLIMIT_AS counts address space that libraries reserve and never touch. Requires Linux's
-/proc.
+keeps these processes in one tree. Memory is limited by polling the resident size,
+because RLIMIT_AS counts address space that libraries reserve and never touch. The
+module requires /proc of Linux.
 
 The times that a worker reports are checked against the parent's clock and against the
-CPU time that the kernel counts. While one worker executes a request, all others on its
-CPU are stopped by SIGSTOP, so that threads which a solver leaves running do not disturb
-another's measurement; requests from several threads are therefore serialised. Signals
-are sent to pidfds, see pidfd_open(2), never to process IDs, which the kernel
-reuses.
+CPU time that the kernel counts. While one worker executes a request, all other workers
+on its CPU are stopped by SIGSTOP, so that threads which a solver leaves running do not
+disturb the measurement of another solver. Requests from several threads are therefore
+serialised. Signals are sent to pidfds, see pidfd_open(2), never to process IDs, which
+the kernel reuses.
 """
 
 from __future__ import annotations
@@ -50,31 +50,33 @@ from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
 POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
-START_SECONDS = 120.0  #: time limit of imports, and of loading a QP
+START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
 WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
 POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
-CLOSE_SECONDS = 1.0  #: time to end after the requests are closed, before SIGKILL
-END_SECONDS = 1.0  #: time for the sub-reaper to end when all below it are dead
+#: time that a worker has to exit after its pipe of requests is closed, before SIGKILL
+CLOSE_SECONDS = 1.0
+#: time that a sub-reaper has to exit after its descendants have ended
+END_SECONDS = 1.0
 SETTLE_SECONDS = 0.5  #: time that idle threads of pools may spin after an answer
-#: CPU time between answer and request, relative to wall time, above which a worker
-#: counts as busy
+#: CPU time of a worker between answer and next request, relative to wall time, above
+#: which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
 MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is ignored
-LOG_BYTES = 2**20  #: size at which the log of a worker is truncated
-#: length of the last line of the log that is quoted in a message
+LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
+#: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
-_LOG_TAIL_BYTES = 2**16  #: part of the log that is searched for its last line
-_MIN_FD = 3  #: a pipe must not get the number of a standard stream that is closed
-#: share of the memory limit above which a failure is attributed to lack of memory
+_LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log in which its last line is sought
+_MIN_FD = 3  #: smallest descriptor of a pipe; smaller ones are standard streams
+#: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
-_LOCK = ForkSafeLock()  #: held while a thread starts, asks, stops or ends a worker
+_LOCK = ForkSafeLock()  #: held while a thread starts, stops or ends a worker or asks it
 
 REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: part of the id of a process's CPU clock, see clock_getcpuclockid
-#: Signals by which solvers do not end themselves. A worker that one of them ends before
-#: a solve was killed by somebody else.
+_CPUCLOCK_SCHED = 2  #: bits in the ID of a CPU clock, see clock_getcpuclockid(3)
+#: Signals that solvers do not send to themselves. If one of them ends a worker before a
+#: solve, the worker was killed from outside.
 _EXTERNAL_SIGNALS = {
     signal.SIGKILL,
     signal.SIGTERM,
@@ -82,7 +84,7 @@ _EXTERNAL_SIGNALS = {
     signal.SIGHUP,
     signal.SIGQUIT,
 }
-#: last lines of processes that failed before a solve because of the machine
+#: last lines of output of processes that failed before a solve because of the machine
 _MACHINE_FAILURE = re.compile(
     r"No space left on device|Disk quota exceeded|Too many open files"
     r"|Read-only file system|Input/output error|cannot be started"
@@ -91,7 +93,7 @@ _MACHINE_FAILURE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """Bounds of the time that a worker may report, in seconds."""
+    """The parent's times of a measurement, which bound the time a worker may report."""
 
     min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
     elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
@@ -100,33 +102,34 @@ class Clock:
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """Result of a request: the worker's answer, or a diagnosis of its end."""
+    """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None if there is an answer, or a fault
-    fault: bool = False  #: True for a failure of ours or of the machine, see `message`
-    message: str = ""
-    peak_mib: float | None = None  #: largest memory that the parent saw
-    clock: Clock | None = None  #: None unless something was measured
+    verdict: Verdict | None = None  #: None if there is an answer, or `fault` is True
+    fault: bool = False  #: True if the harness or the machine failed, not the solver
+    message: str = ""  #: description of the failure, and notes
+    peak_mib: float | None = None  #: largest memory that the parent observed
+    clock: Clock | None = None  #: None unless the request was a measurement
     threads: int | None = None  #: number of threads that the worker reported
-    cpu: int | None = None  #: number of the CPU that the worker is bound to
-    #: sizes, digest and seconds of the QP that ranks have emitted; None before that
+    cpu: int | None = None  #: number of the CPU to which the worker is bound
+    #: sizes, digest and build time of the QP that ranks emitted; None if they emitted
+    #: no QP
     emitted: Mapping[str, Any] | None = None
 
 
 class WorkerProcess:
-    """A worker, started by the first request and restarted after each death.
+    """Worker process, started by the first request and replaced after it has died.
 
-    Two file descriptors are appended to `command`: of its requests and of its replies.
-    The worker runs in its own session, on one CPU (the last one that this process may
-    use), with one thread in every library that obeys its environment variable. Its
-    output goes to the file `log`.
+    Two file descriptors, for requests and for replies, are appended to `command`. The
+    worker runs in its own session, on one CPU (the last one that this process may use).
+    Environment variables set the thread pools of all common libraries to one thread.
+    The output of the worker goes to the file `log`.
 
-    Several threads of a process may have workers, or share one: each request waits
+    Several threads of a process may have workers, or share a worker: each request waits
     until the previous one is answered. Forks of this process own none of its workers.
     """
 
-    #: seconds of the first solve, by a key of the caller; not used here
+    #: times of first solves in s, by keys that the caller chooses; not used here
     first_seconds: dict[Hashable, float]
 
     _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
@@ -137,16 +140,16 @@ class WorkerProcess:
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
         self._worker = 0  # process ID of the worker, once it is ready
-        self._reaper_fd = self._worker_fd = -1  # pidfds of both
+        self._reaper_fd = self._worker_fd = -1  # pidfds; -1 if there is no process
         self._cpu = -1
         self._requests = self._replies = -1  # this process's ends of the two pipes
         self._unread = bytearray()
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
-        # clock of the parent and CPU time of the worker at its last answer
+        # time on the parent's clock and CPU time of the worker at its last answer
         self._idle_since: tuple[float, float] | None = None
-        self._facts: dict[str, Any] = {}  # fields reported after the warm-up
+        self._facts: dict[str, Any] = {}  # number of threads, CPU; see `_facts`
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
@@ -158,8 +161,9 @@ class WorkerProcess:
         """Start the worker at once, as a fork of this process that calls `serve`.
 
         The fork replaces the command and inherits the loaded modules, see
-        `harness.processes.forking`. If forking is not safe, or fails, the first request
-        starts the worker by its command. A replacement is always started so.
+        `harness.processes.forking`. If forking is not safe or fails, the first request
+        starts the worker by its command. If the fork dies, its replacement is started
+        by the command as well.
         """
         if not is_safe():
             return
@@ -174,17 +178,19 @@ class WorkerProcess:
     ) -> Reply:
         """Send a request, enforce its limits, and return the answer or the diagnosis.
 
-        If the process of an earlier request dies before the solve starts, the request
-        is repeated once in a new process: an earlier solve may have damaged it.
+        If a process that has answered earlier requests dies before the solve starts,
+        the request is repeated once in a new process, since an earlier solve may have
+        damaged the old one.
 
-        time_limit : seconds from the event "start" on, which excludes imports, warm-up
-            and loading of the QP. Ranks have the same limit to assemble the QP, and the
-            larger of it and `POINT_SECONDS` to evaluate the answer
-        memory_limit : limit for all processes of the worker together, MiB
+        time_limit : limit in s from the event "start" on, which excludes imports,
+            warm-up and loading of the QP. The same limit applies to the emission of the
+            QP by ranks; the limit for their evaluation of the answer is at least
+            `POINT_SECONDS`
+        memory_limit : limit for all processes of the worker together, in MiB
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
-        # before this worker is resumed: two must never run on its CPU
+        # Stop the others before this worker resumes: two must never run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
@@ -205,7 +211,7 @@ class WorkerProcess:
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(e))
-        # copied here, because `_kill` below may reset them
+        # copy these values, because `_kill` below may reset them
         peak = self._peak_mib or None
         facts = self._facts
         if self._others():  # processes left running would disturb the next measurement
@@ -226,7 +232,10 @@ class WorkerProcess:
 
     @_LOCK
     def close(self) -> None:
-        """Close the requests, wait up to `CLOSE_SECONDS` for the end, then kill."""
+        """Close the pipe of requests; kill the worker if it does not exit in time.
+
+        The time limit is `CLOSE_SECONDS`.
+        """
         try:
             self._resume()
             self._close("_requests")
@@ -238,7 +247,7 @@ class WorkerProcess:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Disown all workers; called in a fork, whose parent keeps them."""
+        """Disown all workers; called in a fork, since they belong to its parent."""
         for worker in tuple(cls._all):
             worker._disown()
         cls._all.clear()
@@ -268,12 +277,12 @@ class WorkerProcess:
                     elapsed_seconds=ended - started,
                     max_seconds=ended - sent,
                 )
-                # The worker waits, so no file in shared memory escapes notice.
+                # The worker waits now, so no file in shared memory can be missed.
                 self._footprint.notice(self._tree())
                 self._send({"go": True})
             if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
-                peak = self._peak_mib  # the evaluation is not the solver's memory
+                peak = self._peak_mib  # exclude the memory of the evaluation
                 stage = "evaluation of the answer: "
                 limit = max(time_limit, POINT_SECONDS)
                 try:
@@ -304,8 +313,8 @@ class WorkerProcess:
         elif end.is_oom:
             message = f"{message}: the machine ran out of memory"
             verdict = Verdict.MEMORY_LIMIT
-            # The kernel's choice need not be the cause: a worker with less than half of
-            # the available memory is not to blame.
+            # The process that the kernel kills need not be the cause: a worker that
+            # used less than half of the available memory is not blamed.
             is_fault = (peak or 0.0) < limits.memory_limit_mib() / 2
         return Reply(
             verdict=None if is_fault else verdict,
@@ -317,10 +326,11 @@ class WorkerProcess:
         )
 
     def _start(self, memory_limit: float) -> None:
-        """Start and warm up.
+        """Start the worker and run its warm-up.
 
-        A solver that dies in its warm-up is restarted without a warm-up. If something
-        else killed it, the warm-up is repeated once.
+        If the solver causes the worker's death during the warm-up, the worker is
+        restarted without a warm-up. If the worker was killed from outside, the warm-up
+        is repeated once.
         """
         if self._process is None:
             self._spawn(memory_limit)
@@ -339,7 +349,7 @@ class WorkerProcess:
                 self._spawn(memory_limit)
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
-        """Start a process: a fork that calls `serve`, or without that the command."""
+        """Start a process: a fork that calls `serve` or, if it is None, the command."""
         usable = os.sched_getaffinity(0)
         self._cpu = max(usable)
         self._footprint = Footprint()
@@ -350,8 +360,8 @@ class WorkerProcess:
         environment = ONE_THREAD | {limits.VARIABLE: str(memory_limit)}
         try:
             self._log.write_bytes(b"")
-            # Append mode: after `_trim_log` the worker writes at the new end. At its
-            # old offset, it would make the file as long as before.
+            # In append mode, the worker writes at the new end of the file after
+            # `_trim_log`. At its old offset, it would make the file as long as before.
             with self._log.open("ab") as log:
                 if serve is not None:
                     self._process = fork(
@@ -372,7 +382,7 @@ class WorkerProcess:
                             *map(str, pipes),
                             *self._command,
                         ],
-                        # closed by the kernel when this process dies; ends the tree
+                        # closed by the kernel if this process dies, which ends the tree
                         stdin=subprocess.PIPE,
                         stdout=log,
                         stderr=log,
@@ -385,30 +395,32 @@ class WorkerProcess:
             os.close(their_replies)
         self._reaper_fd = os.pidfd_open(self._process.pid)
         self._await("ready", START_SECONDS, memory_limit)
-        for worker in self._tree()[:1]:  # the child comes before its own children
+        for worker in self._tree()[:1]:  # the tree lists a parent before its children
             self._worker_fd = os.pidfd_open(worker)
-            # Still in the tree after pidfd_open, so the pidfd refers to the worker and
-            # not to a process that got its number in between.
+            # If the process ID is still in the tree after pidfd_open, the pidfd refers
+            # to the worker, not to an unrelated process that reuses its ID.
             if worker in self._tree():
                 self._worker = worker
         if not self._worker:
             raise OSError(f"/proc lists no process below {self._process.pid}")
 
     def _send(self, request: Mapping[str, Any]) -> None:
-        with suppress(BrokenPipeError):  # it has died; `_await` diagnoses that
+        with suppress(BrokenPipeError):  # the worker has died; `_await` diagnoses why
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
     def _await(
         self, event: str, limit: float, memory_limit: float, *, stage: str = ""
     ) -> dict[str, Any]:
-        """Wait for an event.
+        """Wait for an event, and return its entries.
 
-        stage : stage of a measurement, the prefix of the error's message
+        limit : s
+        memory_limit : MiB
+        stage : prefix of the error's message that states the stage of the measurement
 
         Raises
         ------
         _WorkerEndError
-            If the worker ends, exceeds a limit, or replies anything else.
+            If the worker ends, exceeds a limit, or sends a different reply.
 
         """
 
@@ -417,7 +429,7 @@ class WorkerProcess:
 
         deadline = time.monotonic() + limit
         while True:
-            # Before reading: a worker that replies and then dies has still replied.
+            # Checked before reading: the reply of a worker that then dies still counts.
             dead = self._is_dead()
             has_more = self._read(0 if dead else POLL_SECONDS)
             line, newline, rest = self._unread.partition(b"\n")
@@ -450,21 +462,21 @@ class WorkerProcess:
         return reply
 
     def _trim_log(self) -> None:
-        with suppress(OSError):  # the folder was deleted; writers of results report it
+        with suppress(OSError):  # if the folder was deleted, other code reports it
             if self._log.stat().st_size > LOG_BYTES:
                 os.truncate(self._log, 0)
 
     def _read(self, timeout: float) -> bool:
         """Read replies of the worker, waiting at most `timeout` seconds.
 
-        Return True if there is a complete line, or new bytes.
+        Return True if a complete line is available, or new bytes were read.
         """
-        if b"\n" in self._unread:  # a second reply came with the last one
+        if b"\n" in self._unread:  # a further reply was read with the last one
             return True
         has_more = False
         while select([self._replies], [], [], 0 if has_more else timeout)[0]:
             chunk = os.read(self._replies, 2**16)
-            # End of file: the worker is dying, or its solver closed all descriptors.
+            # At end of file, the worker is dying or its solver closed all descriptors.
             if not chunk:
                 time.sleep(timeout)
                 break
@@ -475,12 +487,12 @@ class WorkerProcess:
         return has_more
 
     def _tree(self) -> list[int]:
-        """List the worker and all processes below it; empty if it has ended."""
+        """List the worker and its descendants; empty if the sub-reaper has ended."""
         if self._process is None:
             return []
         processes = reaper.descendants(self._process.pid)
-        # Checked afterwards: of a dead sub-reaper the number may be another process's,
-        # and so may these descendants.
+        # Checked after the listing: if the sub-reaper was dead, another process may
+        # have reused its ID, and the descendants are those of that process.
         return [] if self._is_dead() else processes
 
     def _others(self) -> list[int]:
@@ -496,16 +508,17 @@ class WorkerProcess:
         if self._process is None or self._is_stopped:
             return
         if self._others():
-            self._kill()  # processes started after its answer; SIGSTOP misses them
+            self._kill()  # SIGSTOP would miss processes started after the answer
             return
         self._was_busy = self._was_busy or self._has_been_busy()
         self._signal(signal.SIGSTOP)
         self._is_stopped = True
 
     def _resume(self) -> bool:
-        """Resume the worker after `_stop`; return True if it was busy while idle.
+        """Resume the worker after `_stop`; return True if it computed between requests.
 
-        A worker that was busy, or has died, is killed; the next request replaces it.
+        A worker that computed between requests, or has died, is killed; the next
+        request replaces it.
         """
         if self._process is None:
             return False
@@ -559,8 +572,8 @@ class WorkerProcess:
     def _is_dead(self) -> bool:
         """Return True if the sub-reaper has ended, or was not started.
 
-        A pidfd becomes readable when its process ends, and remains so whoever reaps the
-        process; waitpid(2) would fail after other code has reaped it.
+        A pidfd becomes and remains readable when its process ends, even if other code
+        of this program reaps the process; waitpid(2) would then fail.
         """
         if self._reaper_fd == -1:
             return True
@@ -569,7 +582,10 @@ class WorkerProcess:
         return bool(poller.poll(0))
 
     def _death(self) -> tuple[str, int]:
-        """Describe a worker's end, with its last line; return that and the signal."""
+        """Describe a worker's end, with its last line of output; and return the signal.
+
+        The signal is 0 if none ended the worker.
+        """
         how, number = "ended, and other code of this process took its exit code", 0
         with suppress(ChildProcessError):
             how, number = _describe_exit(self._reaper_fd)
@@ -581,13 +597,13 @@ class WorkerProcess:
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
-        """End all processes, and remove their files in shared memory."""
+        """Kill the worker and its descendants, and remove their shared-memory files."""
         if self._process is not None:
             self._footprint.notice(self._tree())
             if not self._is_dead():
                 reaper.kill_descendants(self._process.pid)
             if self._process.stdin is not None:
-                self._process.stdin.close()  # the sub-reaper collects them and ends
+                self._process.stdin.close()  # the sub-reaper reaps them and exits
             try:
                 self._process.wait(END_SECONDS)
             except subprocess.TimeoutExpired:  # a solver may have sent it SIGSTOP
@@ -597,9 +613,10 @@ class WorkerProcess:
         self._forget()
 
     def _disown(self) -> None:
-        """Close this fork's copies of the descriptors of a worker of its parent.
+        """Close the copies that this fork has of a worker's file descriptors.
 
-        A copy that stayed open would keep the worker alive after its parent's death.
+        The worker belongs to the parent of the fork. If a copy stayed open, the worker
+        would survive the death of that parent.
         """
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
@@ -614,7 +631,7 @@ class WorkerProcess:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        """Close a file descriptor only once: its number may then be another file's."""
+        """Close a file descriptor and forget it: its number may be used again."""
         fd: int = getattr(self, name)
         setattr(self, name, -1)
         if fd != -1:
@@ -642,14 +659,14 @@ def _pipe() -> tuple[int, int]:
 
 
 def _describe_exit(process: int) -> tuple[str, int]:
-    """Describe the end of a process; return with it the signal that ended it, or 0.
+    """Describe how a process ended; return also the signal that ended it, or 0.
 
     process : pidfd of the process
 
     Raises
     ------
     ChildProcessError
-        If it was reaped already, or is not a child of this process.
+        If the process was reaped already, or is not a child of this process.
 
     """
     end = os.waitid(os.P_PIDFD, process, os.WEXITED | os.WNOWAIT)
@@ -663,9 +680,10 @@ def _describe_exit(process: int) -> tuple[str, int]:
 class _WorkerEndError(Exception):
     """End of a worker before an expected event.
 
-    event : the expected one
+    event : name of the expected event
     verdict : verdict on the solver, if the solve had started
-    number : signal that ended it, or 0
+    how : description of the end
+    number : signal that ended the worker, or 0
     stage : prefix of the message
     """
 
@@ -675,11 +693,11 @@ class _WorkerEndError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # the limit of a start, not the limit of the suite
+            verdict = Verdict.FAILED  # `START_SECONDS` expired, not the suite's limit
         self.verdict = verdict
         self.signal = number
-        self.is_fault = False  #: True if the worker reported a failure of our own code
-        self.is_oom = False  #: True if the kernel killed it because memory ran out
+        self.is_fault = False  #: True if the worker reported a failure of the harness
+        self.is_oom = False  #: True if the kernel killed the worker for lack of memory
 
 
 def _facts(reply: Mapping[str, Any]) -> dict[str, Any]:
@@ -705,14 +723,15 @@ _ALLOCATION_FAILURE = re.compile(
 
 
 def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
-    """Return True if a failure is due to lack of memory.
+    """Return True if a failure is attributed to lack of memory.
 
     A solver that lacks memory raises, aborts, crashes, hangs or returns a wrong result.
-    The evidence is its peak memory or, if a single allocation was refused, the message
-    of the library.
+    Evidence of the cause is a peak memory close to the limit or, if a single allocation
+    was refused, the message of the library.
 
     message : message of the failure, including the last line of output
-    limit : MiB
+    peak_mib : peak memory, in MiB; None if unknown
+    limit : memory limit, in MiB
     """
     near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit
     return near or _ALLOCATION_FAILURE.search(message) is not None

@@ -1,4 +1,4 @@
-"""Clean exit at SIGTERM and SIGHUP: processes end and scratch folders are removed."""
+"""Clean exit on SIGTERM and SIGHUP: workers are ended and scratch folders removed."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import current_thread, main_thread
 
-#: within this time after a signal, a further one does not interrupt the cleanup
+#: time after a signal within which a second signal does not interrupt the cleanup
 _ONCE_SECONDS = 5.0
 
 
 class TerminatedError(BaseException):
-    """Termination by a signal, of a type that `except Exception` does not catch."""
+    """Termination by a signal; a type that `except Exception` does not catch."""
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Raise `TerminatedError` on SIGTERM or SIGHUP; exit with 128 + signal number.
+    """On SIGTERM or SIGHUP, unwind the block and exit with code 128 + signal number.
 
-    Signals that are handled elsewhere, or ignored (nohup ignores SIGHUP), keep their
-    disposition. Outside the main thread nothing changes, because Python allows signal
-    handlers to be set only in the main thread.
+    The block is unwound by a `TerminatedError`. Signals that already have a handler or
+    are ignored (nohup ignores SIGHUP) keep their disposition. In other threads than the
+    main one nothing changes, because Python sets signal handlers only in the main
+    thread.
     """
     numbers = [
         number
@@ -34,8 +35,8 @@ def ended_by_signals() -> Iterator[None]:
 
     def end(number: int, _: object) -> None:
         now = time.monotonic()
-        # A second signal must not interrupt the `finally` blocks that the first one
-        # runs; one that comes later ends a cleanup that hangs.
+        # A second signal must not interrupt the `finally` blocks that run because of
+        # the first one; but a much later one must end a cleanup that hangs.
         if not received or now > received[-1][0] + _ONCE_SECONDS:
             received.append((now, number))
             raise TerminatedError
@@ -45,7 +46,7 @@ def ended_by_signals() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # Also for a later error: writing to a terminal that hung up raises OSError.
+        # The error may also be an OSError, from a write to a terminal that was closed.
         if received:
             raise SystemExit(128 + received[0][1]) from None
         raise

@@ -1,23 +1,29 @@
-"""Process of one solver, for all of its measurements.
+"""Process that executes all measurements of one solver.
 
-It speaks `harness.processes.protocol`. Its warm-up solves tiny QPs, so that imports
-which a solver defers until its first solve are not timed. It answers three kinds of
-requests:
+The process follows `harness.processes.protocol`. Its warm-up solves tiny QPs, so that
+imports which a solver defers until its first solve are not timed. It answers three
+kinds of requests:
 
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
-  the point to ``out``. Optional entries: ``digest`` of the file, which is checked;
-  without it, QPs with an operator are refused. ``memory_limit`` in MiB.
-  ``sample_seconds``, see `harness.verify.measure`. ``step`` 0, 1, … of a sequence.
-  ``tightens``: true if each step of the sequence has its own tolerance
-* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks that emit
-  the QP of a case themselves (`harness.plugin.Family.emission`). If the request has the
-  entry ``first``, the ranks emit that case before. If ``source`` is "ranks", they also
-  evaluate the answer together. The event ``emitted`` contains the ``sizes`` and the
-  ``digest`` of the QP; ``measured`` follows when the point is written
+  the point to ``out``. Optional entries are
+
+  - ``digest``: digest of the file, which is checked; without it, QPs with an operator
+    are refused,
+  - ``memory_limit``: limit in MiB,
+  - ``sample_seconds``: see `harness.verify.measure`,
+  - ``step``: index 0, 1, … of the QP in a sequence, and
+  - ``tightens``: true if each step of the sequence has its own tolerance
+
+* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: let the MPI ranks emit the QP
+  of a case (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
+  If the request has the entry ``first``, the ranks emit the case in that entry
+  beforehand. If ``source`` is "ranks", the ranks also evaluate the answer. The event
+  ``emitted`` contains the ``sizes`` and the ``digest`` of the QP; the event
+  ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads its QP again, so that a solver that modifies its arrays does not
-affect later measurements.
+Every measurement loads the QP again, so that a solver that modifies the arrays of a QP
+does not affect later measurements.
 """
 
 from __future__ import annotations
@@ -57,7 +63,9 @@ from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
-_MAX_BALLAST = 2**18  #: numbers, 2 MiB; never touched, so never resident
+#: Largest number of doubles (2 MiB) in the array that shifts addresses between
+#: measurements. Its pages are never touched and take no memory.
+_MAX_BALLAST = 2**18
 
 
 def serve(
@@ -75,7 +83,8 @@ def serve(
     operators : makers of operators P by name, see `harness.operators`
     ranks : communicator of the ranks that solve together; None in a single process
     emit : assembles the local share of a case on each rank
-    copies : True if each rank solves the entire QP independently, all at the same time
+    copies : True if each rank solves the entire QP independently, at the same time as
+        the other ranks
     """
     bench = _SolverHost(solver, operators)
     if ranks is None or emit is None:
@@ -93,7 +102,7 @@ def serve(
 
 
 class _SolverHost:
-    """A solver with its state between requests: its sequence and verified files."""
+    """Solver with the state that persists between requests, such as its sequence."""
 
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
@@ -104,14 +113,15 @@ class _SolverHost:
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
         self.parallel: ParallelSolver | None = (
-            None  #: what measures in place of the solver
+            None  #: replaces the solver in measurements, on several ranks
         )
 
     def warm_up(self) -> dict[str, Any]:
-        """Solve a QP with bounds and one with rows, ignoring how the solves end.
+        """Solve a QP with bounds and one with constraint rows, ignoring the results.
 
-        Code that is compiled or loaded at its first use must not be timed. The QP is a
-        chain of springs, long enough that a solver takes all of its branches.
+        Code that is compiled or loaded at its first use must not be timed. The QP
+        models a chain of springs, long enough for solvers to enter all of their
+        branches.
         """
         n = 32
         P = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
@@ -128,7 +138,7 @@ class _SolverHost:
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
 
     def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
-        """Measure once, or run one check."""
+        """Answer one request: measure once, or run one check."""
         if "check" in request:
             from mortarbench.harness.conformance.conformance import (
                 run_check,  # few requests need it
@@ -136,14 +146,14 @@ class _SolverHost:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        # Move the arrays between measurements. Their alignment to cache lines is
-        # random, but fixed as long as the process runs: the times of two processes of
-        # one solver then differ by 10 % and more, however often they are measured
-        # (Mytkowicz et al., ASPLOS 2009). With varied alignment this bias becomes
-        # scatter, which confidence intervals include.
+        # Place the arrays at different addresses in each measurement. Otherwise their
+        # alignment to cache lines is random but fixed for the life of the process, and
+        # the times of two processes of one solver differ by 10 % and more, however
+        # often they are measured (Mytkowicz et al., ASPLOS 2009). Varying the alignment
+        # turns this bias into scatter, which confidence intervals include.
         self._ballast = np.empty(0)
         with suppress(AttributeError):  # glibc only
-            # otherwise the allocator reuses freed blocks at their old addresses
+            # otherwise the allocator would reuse freed blocks at their old addresses
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         source = source_of(request)
@@ -184,7 +194,7 @@ class _SolverHost:
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
             "first_seconds": timed.first_seconds,
-            # fields that the parent copies into the record
+            # fields that the parent copies to the record unchanged
             "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
@@ -193,13 +203,13 @@ class _SolverHost:
         path, digest = Path(request["qp"]), request.get("digest")
         if digest is not None:
             status = path.stat()
-            # a file is hashed again only if one of these has changed
+            # hash the file again only if inode, size or time have changed
             version = (status.st_ino, status.st_size, status.st_mtime_ns)
             if self._verified_files.get(digest) != version:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
                 self._verified_files[digest] = version
-        # A file without a digest may come from anyone; its operators are not built.
+        # A file without a digest may be of any origin, so its operators are not built.
         is_ours = digest is not None
         qp, _ = load_qp(path, operators=self._operators if is_ours else None)
         if self.parallel is not None:
@@ -207,7 +217,11 @@ class _SolverHost:
         return qp
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
-        """Return the `prepare` of a step: the first one begins the sequence."""
+        """Return the `prepare` function of a step; step 0 begins a new sequence.
+
+        Return None if the request is not a step, or the solver treats each step as an
+        independent QP.
+        """
         step = request.get("step")
         if step is None or not hasattr(self._solver, "chain"):
             return None
@@ -221,7 +235,8 @@ class _SolverHost:
         )
 
         def prepare(qp: QP) -> Callable[[], Solution]:
-            if self._chain is None:  # here, because the clock runs during `prepare`
+            # Begin the sequence here, because `prepare` is timed.
+            if self._chain is None:
                 self._chain = begin(tol)
             return self._chain(qp, tol)
 
@@ -231,7 +246,11 @@ class _SolverHost:
 def _begin_sequence(
     solver: Any, tol: float, *, tightens: bool
 ) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Begin a sequence with one tolerance for all steps, or with one for each step."""
+    """Return the `prepare` function of a sequence, called with each QP and tolerance.
+
+    tightens : True if each step has its own tolerance; if the solver does not support
+        that, every step is declined
+    """
     if not tightens:
         fixed: Prepare = solver.chain(tol)
         return lambda qp, tol: fixed(qp)
@@ -243,7 +262,10 @@ def _begin_sequence(
 
 
 def canary_seconds() -> float:
-    """Time a fixed small kernel, median of five, to detect drift of the machine."""
+    """Return the median of five times of a small fixed kernel, in s.
+
+    The time shows whether the speed of the machine drifts during a run.
+    """
     matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
     times = []
     for _ in range(5):
@@ -255,24 +277,26 @@ def canary_seconds() -> float:
 
 
 def _aligned(count: int) -> Vector:
-    """Return ones aligned to a cache line, so that alignment does not affect times."""
+    """Return a vector of ones that starts at a cache line, for reproducible times."""
     buffer = np.ones(count + 8)
     start = -buffer.ctypes.data % 64 // 8
     return buffer[start : start + count]
 
 
 def _one_thread() -> int:
-    """Set all thread pools to one thread; return the largest remaining number."""
+    """Limit all thread pools to one thread; return the largest pool size afterwards."""
     libraries = ThreadpoolController()
     libraries.limit(limits=1)
     return max((pool["num_threads"] for pool in libraries.info()), default=1)
 
 
 def _limit_memory(mib: float | None) -> None:
-    """Let allocations beyond `mib` more MiB fail; None lifts the limit.
+    """Limit the memory that this process may allocate from now on.
 
     The parent polls resident memory and kills workers above the limit, which is too
     late for a single allocation that exceeds the memory of the machine.
+
+    mib : limit in MiB; None lifts the limit
     """
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = hard
@@ -292,10 +316,13 @@ def _measure_in_process(
     ends: Callable[[], None] = lambda: None,
     **how: Any,
 ) -> Timed:
-    """Measure in this process, and end any fork of it that returns from the solver.
+    """Measure in this process, and end any forked child that returns from the solver.
 
     A solver may fork and let the child return from its call. That child would answer
     the request a second time.
+
+    ends : called when the worker's clock has stopped
+    how : further arguments of `harness.verify.measure.measure`
     """
     process = os.getpid()
 

@@ -1,10 +1,11 @@
 """Engine for several machines: the blocks of a run as tasks of Dask distributed.
 
-Every Dask worker executes one block at a time, with the same supervisor as a run on one
-machine. A task is one turn of a block: one solver, measured on one case or on the steps
-of one sequence. The parent writes the records of a turn before it submits the next one.
-If a worker is lost, another worker measures the turns that were not returned, as a
-separate block. Only the parent writes the result folder.
+Every Dask worker executes one block at a time, under the same supervision as in a run
+on one machine. A task is one turn of a block: one solver, measured on one case or on
+the steps of one sequence. The parent stores the records of a turn before it submits the
+next turn. If a worker is lost, another worker measures the turns that the lost one did
+not return, and their records count as a separate block. Only the parent writes to the
+result folder.
 """
 
 from __future__ import annotations
@@ -40,20 +41,20 @@ from mortarbench.harness.results.work_unit import (
     WorkUnit,
 )
 
-if TYPE_CHECKING:  # it needs the package distributed
+if TYPE_CHECKING:  # this module imports the optional package distributed
     from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
-CONNECT_SECONDS = 10  #: time limit of the connection, and to fetch a finished result
+CONNECT_SECONDS = 10  #: time limit for connecting, and for fetching a finished result
 #: time between two checks for workers that joined or were lost
 CLUSTER_POLL_SECONDS = 2.0
 MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up
-#: exit code of a process whose main script starts a run at its import
+#: exit code of a process in which importing the main script starts a run
 _UNGUARDED_SCRIPT_CODE = 75
 
-Keep = Callable[[str, Mapping[str, Any]], None]
+Keep = Callable[[str, Mapping[str, Any]], None]  #: stores an environment by digest
 
-#: keys of an environment; nodes that differ in them do not run the same code
+#: keys of an environment in which all nodes must agree to run the same code
 _CODE = ("source", "versions.mortarbench", "plugins")
 
 
@@ -67,23 +68,24 @@ def on_cluster(
     keep: Keep,
     warn: Callable[[str], None],
 ) -> Iterator[EngineFactory]:
-    """Connect to a Dask cluster; provide the factory of the engine of a run on it.
+    """Connect to a Dask cluster, and provide a factory of engines on it.
 
-    Connecting first refuses a wrong address before a result folder is created.
+    The connection is opened first, so that a wrong address is reported before a result
+    folder is created.
 
-    address : address of a scheduler, or "local" to start one with a worker for each CPU
-        of this machine
+    address : address of a scheduler, or "local" to start a scheduler with a worker for
+        each CPU of this machine
     plugins : files that exist under the same paths on every node
     operators : makers of operators P by name, except those of `plugins`
     environment : environment of this process, with which nodes are compared
     keep : stores a node's environment under its digest
-    warn : receives messages to the user, one line each
+    warn : called with each message to the user, a single line
 
     Raises
     ------
     InputError
-        If Dask is not installed or the scheduler does not answer; while blocks are
-        executed, if a node is not fit for measuring.
+        If Dask is not installed or the scheduler does not answer. While blocks are
+        executed, if a node is unsuitable for measurements or the scheduler is lost.
 
     """
     try:
@@ -119,9 +121,9 @@ def on_cluster(
                 try:
                     yield _Cluster(client, name, nodes, address, warn)
                 finally:
-                    # End the processes of this run and of orphaned ones. The scheduler
-                    # may go away during the call, as a local one does at Ctrl-C
-                    # (CommClosedError is an OSError), or not yet have the plug-in
+                    # End the processes of this run and of orphaned runs. During the
+                    # calls, the scheduler may end, as a local one does on Ctrl-C
+                    # (CommClosedError is an OSError), or may not have the plug-in yet
                     # (KeyError).
                     with suppress(OSError, KeyError):
                         if client.status == "running":
@@ -147,15 +149,18 @@ class Nodes:
     here: Mapping[str, Any]  #: environment of this process
     keep: Keep
     warn: Callable[[str], None]
-    _stored: set[str] = field(default_factory=set)  # digests
+    _stored: set[str] = field(default_factory=set)  # digests of stored environments
 
     def add(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
-        """Store an environment if it is new, and warn if it differs from this one.
+        """Store an environment if it is new, and warn if it differs from `here`.
+
+        node : name of the machine, for messages
+        digest : digest of `environment`
 
         Raises
         ------
         InputError
-            If the node runs other code.
+            If the node runs a different version of the code.
 
         """
         if digest in self._stored:
@@ -180,23 +185,24 @@ class Nodes:
 
 @dataclass(eq=False, kw_only=True)
 class _ActiveBlock:
-    """A block in progress; one of its turns at a time is a Dask task."""
+    """Block in progress; at any time, one of its turns is a Dask task."""
 
     block: WorkUnit
     turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
-    worker: str = ""  #: address of the Dask worker that measures it
-    part: int = 0  #: incremented when a worker is lost after it has returned a turn
+    worker: str = ""  #: address of the Dask worker that measures the block
+    #: number of workers that returned some turns of the block and were then lost
+    part: int = 0
     is_measured: bool = False  #: True if the current worker has returned a turn
-    lost_workers: int = 0  #: number of workers that were lost while they had this block
+    lost_workers: int = 0  #: number of workers lost while they measured this block
 
 
 @dataclass(eq=False)
 class _Cluster:
     """Engine in which every Dask worker measures one block, one turn at a time.
 
-    Each task is bound to the worker of its block. Otherwise Dask would move the tasks
-    of a lost worker by itself, and turns measured elsewhere would pass for the same
-    part of the block.
+    Each task is bound to the worker of its block. Otherwise Dask would reassign the
+    tasks of a lost worker, and turns measured on different machines would be compared
+    as if they were from one block.
     """
 
     client: Any
@@ -204,12 +210,12 @@ class _Cluster:
     nodes: Nodes
     address: str
     warn: Callable[[str], None]
-    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
-    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # by their futures
+    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # finished futures
+    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # blocks by future
     _queue: deque[_ActiveBlock] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Execute all of `blocks`."""
+        """Execute all blocks, and yield each outcome as soon as it is available."""
         try:
             while self._top_up(blocks):
                 try:
@@ -219,8 +225,8 @@ class _Cluster:
                 except Empty:
                     if self.client.status != "running":
                         raise _SchedulerGoneError from None
-                    # A worker may be busy with a run whose parent has died, which the
-                    # scheduler notices with a delay.
+                    # A worker may be busy with a run whose parent has died; the
+                    # scheduler detects this only after a delay.
                     _end_orphaned_runs(self.client)
                 yield from self._recovered()
         finally:
@@ -266,16 +272,16 @@ class _Cluster:
         future.add_done_callback(self._finished.put)
 
     def _measured(self, future: Any) -> Iterator[Outcome]:
-        """Yield the outcomes of a turn, then submit the next turn of its block."""
+        """Yield the outcomes of a finished turn, and submit the next of its block."""
         from distributed import CancelledError
 
         if (active := self._active.get(future)) is None:  # its worker was lost
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
-        except CancelledError as e:  # together with the connection
+        except CancelledError as e:  # raised when the connection is lost
             raise _SchedulerGoneError from e
-        except TimeoutError:  # the worker is lost; `_recovered` will find that
+        except TimeoutError:  # the worker is lost; `_recovered` will detect this
             self._finished.put(future)
             return
         del self._active[future], active.turns_left[0]
@@ -294,7 +300,11 @@ class _Cluster:
             self._submit(active)
 
     def _recovered(self) -> Iterator[Outcome]:
-        """Return the blocks of lost workers to the queue, or give them up."""
+        """Put the blocks of lost workers back into the queue.
+
+        Yield a failure for each block that is given up instead, because it has lost
+        `MAX_LOST_WORKERS` workers.
+        """
         workers = self._workers()
         lost = {f: b for f, b in self._active.items() if b.worker not in workers}
         for future, active in lost.items():
@@ -307,7 +317,7 @@ class _Cluster:
                 self._queue.append(active)
             else:
                 case = active.block.turns[0][0].case
-                reason = f"{case} was given up: every Dask worker that took it was lost"
+                reason = f"{case} was given up: all Dask workers that took it were lost"
                 yield BuildFailure(block=active.block, reason=reason)
 
 
@@ -316,7 +326,9 @@ class _SchedulerGoneError(Exception):
 
 
 def _connect(address: str, stack: ExitStack) -> Any:
-    """Connect to a scheduler; a local one is started first.
+    """Connect to a scheduler, after starting one if the address is "local".
+
+    stack : closes the connection and a local cluster when it is closed
 
     Raises
     ------
@@ -326,7 +338,7 @@ def _connect(address: str, stack: ExitStack) -> Any:
     """
     from distributed import Client, LocalCluster
 
-    # Dask's messages would repeat ours, with tracebacks.
+    # Dask would log the errors that are reported here a second time, with tracebacks.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address == LOCAL:
         with _delay_interrupt():
@@ -335,14 +347,14 @@ def _connect(address: str, stack: ExitStack) -> Any:
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
                 memory_limit=0,  # the supervisor limits memory
-                dashboard_address="127.0.0.1:0",  # any free port, for several clusters
+                dashboard_address="127.0.0.1:0",  # any free port; clusters may coexist
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
             return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except Exception as e:  # each scheme of addresses has a library with its own errors
+    except Exception as e:  # each address scheme has its own library and errors
         if isinstance(e, TypeError) and address.startswith("tls:"):
             raise InputError(
                 f"--dask {address}: Dask's configuration has no certificate for it; "
@@ -358,11 +370,11 @@ def _connect(address: str, stack: ExitStack) -> Any:
 
 
 def _refuse_unguarded_script() -> None:
-    """Refuse a main script that would start this run again in every Dask worker.
+    """Check that importing the main script does not start this run again.
 
     Python imports the main script in each spawned process before anything else. One
-    process is spawned as a trial. If the script starts a run at its import, that run
-    calls this function in the trial process, which then exits with a code of its own.
+    process is therefore spawned as a trial. If importing the script starts a run, this
+    function is called in the trial process, which then exits with a special code.
 
     Raises
     ------
@@ -389,25 +401,26 @@ def _refuse_unguarded_script() -> None:
 
 @contextmanager
 def _delay_interrupt() -> Iterator[None]:
-    """Shield processes started in this context from Ctrl-C, delayed to its end.
+    """Delay Ctrl-C to the end of the context, and shield processes started in it.
 
     A terminal sends SIGINT to all processes of its group, and each Dask process would
-    print a traceback. Dask processes inherit the signal mask of this thread, and end
-    with the cluster, which this process closes. A second Ctrl-C is not delayed.
+    print a traceback. Dask processes inherit the signal mask of this thread, which
+    blocks SIGINT; they end when this process closes the cluster. A second Ctrl-C is not
+    delayed.
     """
-    if current_thread() is not main_thread():  # only the main thread is interrupted
+    if current_thread() is not main_thread():  # Ctrl-C interrupts only the main thread
         yield
         return
     before = signal.getsignal(signal.SIGINT)
     received = []
 
-    # The mask holds for this thread only. The kernel may deliver the signal to another
-    # thread, and Python then runs the handler in this one.
+    # The mask applies to this thread only. The kernel may deliver the signal to another
+    # thread, and Python then runs the handler in the main thread.
     def delay(*_: object) -> None:
         received.append(signal.SIGINT)
         signal.signal(signal.SIGINT, before)
 
-    # Started later, multiprocessing's tracker would unblock SIGINT in this thread.
+    # Start the resource tracker of multiprocessing now: its start unblocks SIGINT.
     resource_tracker.ensure_running()
     signal.signal(signal.SIGINT, delay)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
@@ -421,9 +434,9 @@ def _delay_interrupt() -> Iterator[None]:
 
 
 def _end_orphaned_runs(client: Any) -> None:
-    """Unregister plug-ins of runs whose parent has died; that ends their processes."""
+    """Unregister plug-ins of runs whose parent has died, which ends their processes."""
 
-    # executed by the scheduler, which knows the clients that are connected
+    # executed in the scheduler, where the connected clients are listed
     def orphaned(dask_scheduler: Any) -> list[str]:
         alive = {f"mortarbench-{client}" for client in dask_scheduler.clients}
         ours = (n for n in dask_scheduler.worker_plugins if n.startswith("mortarbench"))

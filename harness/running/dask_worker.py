@@ -34,7 +34,7 @@ from mortarbench.harness.running.executor import Executor
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Delivery:
-    """Outcomes of a block, with the node and environment of their measurement."""
+    """Outcomes of a block, with the node and the environment of the measurements."""
 
     outcomes: list[Outcome]
     node: str  #: host name
@@ -44,14 +44,14 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Executor in every Dask worker, including workers that join later.
+    """Plug-in with an executor in every Dask worker, including workers joining later.
 
-    commands : commands of the parent, in which its Python is replaced by that of the
+    commands : commands of the parent; its Python interpreter is replaced by that of the
         node
     plugins : files that must exist under the same paths on the node
     operators : makers of operators P by name, except those of `plugins`
-    sharing : largest number of Dask workers on one machine. Several disturb each other,
-        so the number is a part of the environment
+    sharing : largest number of Dask workers on one machine; it is recorded in the
+        environment, since several workers disturb each other's measurements
     packages : names of the packages whose versions an environment contains
     """
 
@@ -65,18 +65,20 @@ class ExecutorPlugin(WorkerPlugin):
     _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
-        """Prepare the plug-in; the first block opens the executor, in its own thread.
+        """Prepare the plug-in; the executor is opened later, by the first block.
 
-        The kernel kills solver processes when the thread that started them ends.
+        The thread that executes the blocks must open the executor, because the kernel
+        kills solver processes when the thread that started them ends.
         """
         self._worker = worker.id
         self._busy = Lock()
 
     def teardown(self, worker: Worker | None = None) -> None:
-        """End the processes of the executor, at the latest after a current measurement.
+        """End the executor's processes, if necessary after the current measurement.
 
-        Dask cannot stop a block that is being executed. The thread that executes it
-        holds the lock and calls this method when the block is done.
+        Dask cannot stop a block that is being executed. In this case the thread that
+        executes the block holds the lock, and calls this method again after the current
+        measurement.
         """
         self._ended = True
         if not self._busy.acquire(blocking=False):
@@ -92,7 +94,7 @@ class ExecutorPlugin(WorkerPlugin):
         Raises
         ------
         InputError
-            If this machine is not fit for measuring.
+            If this machine is unsuitable for measurements.
 
         """
         try:
@@ -104,7 +106,7 @@ class ExecutorPlugin(WorkerPlugin):
 
     def _carry_out(self, block: WorkUnit) -> Delivery:
         opened = self._session = self._session or self._open_session()
-        os.sched_setaffinity(0, {opened.cpu.number})  # of this thread
+        os.sched_setaffinity(0, {opened.cpu.number})  # binds this thread only
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.replace(**here) for r in turn) for turn in block.turns)
         outcomes = []
@@ -113,7 +115,7 @@ class ExecutorPlugin(WorkerPlugin):
                 outcomes.append(outcome)
                 if self._ended:
                     break
-        except InputError as e:  # its disk is full
+        except InputError as e:  # the disk of this machine is full
             raise InputError(f"{platform.node()}: {e}") from None
         return Delivery(
             outcomes=outcomes,
@@ -160,12 +162,13 @@ class ExecutorPlugin(WorkerPlugin):
 
 
 def execute(name: str, block: WorkUnit) -> Delivery:
-    """Measure a block by the plug-in of that name; runs in a Dask worker.
+    """Measure a block with the plug-in of that name; called in a Dask worker.
 
     Raises
     ------
     InputError
-        If this Dask worker is not fit for measuring.
+        If this Dask worker executes several blocks at a time, or its machine is
+        unsuitable for measurements.
 
     """
     worker = get_worker()
@@ -188,7 +191,7 @@ class _Session:
 
 
 class _Cpu:
-    """CPU claimed by a Dask worker, released when no executor refers to it any more."""
+    """CPU reserved for a Dask worker until no executor refers to it any more."""
 
     def __init__(self) -> None:
         stack = ExitStack()
@@ -196,16 +199,17 @@ class _Cpu:
         finalize(self, stack.close)
 
 
-#: claimed CPU by Dask worker of this process
+#: reserved CPUs by the IDs of the Dask workers in this process
 _cpus: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
 _cpus_lock = Lock()
 
 
 def _cpu_of(worker: str) -> _Cpu:
-    """Claim a CPU for a Dask worker; all of its executors share it.
+    """Reserve a CPU for a Dask worker; all executors in this worker share the CPU.
 
     A worker has several executors if several runs use it, or if the scheduler has not
-    yet noticed that one has died. It still executes one block at a time.
+    yet detected that the parent of an earlier run has died. In either case the worker
+    executes one block at a time.
 
     Raises
     ------
@@ -219,9 +223,11 @@ def _cpu_of(worker: str) -> _Cpu:
 
 
 def claim_cpu(stack: ExitStack) -> int:
-    """Claim a CPU that no other executor on this machine uses.
+    """Reserve a CPU that no other Dask worker on this machine has reserved.
 
-    A file lock represents the claim, so the kernel releases it when the process ends.
+    The reservation is a file lock, which the kernel releases when the process ends.
+
+    stack : releases the reservation when it is closed
 
     Raises
     ------
@@ -243,7 +249,7 @@ def claim_cpu(stack: ExitStack) -> int:
             return cpu
     raise InputError(
         f"{platform.node()} has {len(usable)} usable CPUs, and as many Dask workers "
-        "measure there already; start fewer"
+        "use them already; start fewer workers"
     )
 
 
@@ -254,16 +260,16 @@ def _lock_folder() -> Iterator[int]:
     Raises
     ------
     InputError
-        If the folder is a link or a file, belongs to another user or is accessible to
-        others, who could place links in it, or hold the locks.
+        If the path is a link or a file, or if the folder belongs to another user or is
+        accessible to other users, who could place links in it or lock its files.
 
     """
     path = Path(gettempdir()) / f"mortarbench-{os.getuid()}"
     with suppress(FileExistsError):
         path.mkdir(mode=0o700)
     wrong = InputError(
-        f"{platform.node()}: {path} is not a folder of this user's alone; remove it, "
-        "or set TMPDIR to another folder, the same for all Dask workers there"
+        f"{platform.node()}: {path} is not a folder that only this user can access; "
+        "remove it, or set TMPDIR to the same other folder for all Dask workers there"
     )
     try:
         fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)

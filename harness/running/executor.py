@@ -37,17 +37,17 @@ from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-_MAX_STORED_OPTIMA = 1000  #: number of small QPs whose optima are cached
-MAX_STEP_TOL = 1e-2  #: loosest tolerance of a step, far from the fixed point
+_MAX_STORED_OPTIMA = 1000  #: largest number of small QPs whose optima are cached
+MAX_STEP_TOL = 1e-2  #: largest tolerance of a step, used far from the fixed point
 
 
 @dataclass(eq=False)
 class Executor:
     """Sequential executor of blocks, with one worker process per solver.
 
-    scratch : folder of temporary files, used by this executor alone
-    cases : folder of built cases, see `harness.processes.case_folder`; executors may
-        share it
+    scratch : folder of temporary files that only this executor uses
+    cases : cache of built cases, see `harness.processes.case_folder`, which several
+        executors may share
     operators : makers of operators P by name, see `harness.operators`
     """
 
@@ -56,15 +56,16 @@ class Executor:
     cases: Path
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
-    _number: int = -1  # of the last block
+    _number: int = -1  # number of the current block
     _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
-    _end_reason: str = ""  # why there are fewer cases than steps of its sequence
-    _loaded: dict[str, QP] = field(default_factory=dict)  # their QPs, by digest
-    # proven optima of small QPs, by digest
+    # reason why the sequence has fewer cases than requested steps; else empty
+    _end_reason: str = ""
+    _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
+    # proven optima of small QPs by digest; None if there is no proof
     _optima: dict[str, Optimum | None] = field(default_factory=dict)
-    # the limit that building the cases of that block exceeded
+    # limit exceeded while building the cases of the current block; None otherwise
     _limit_hit: _BuildLimitError | None = None
-    # True if ranks emit the QP, by case
+    # True if ranks can emit the QP of a case, by name of the case
     _shared: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -73,7 +74,7 @@ class Executor:
         )
 
     def close(self) -> None:
-        """End the processes."""
+        """End the workers and the case worker."""
         for process in (*self._workers.values(), self._case_worker):
             process.close()
 
@@ -88,7 +89,7 @@ class Executor:
         """
         with report_full_disk(self.scratch):
             try:
-                # On a cluster, the turns of a block come one by one.
+                # On a cluster, this method is called once for each turn of a block.
                 if block.number != self._number:
                     self._number, self._entries = block.number, ()
                     self._limit_hit = None
@@ -102,10 +103,10 @@ class Executor:
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
         """Measure one solver; retry once after a fault that the solver did not cause.
 
-        All steps of a sequence are repeated, because the data that the solver carried
-        are lost; no result is yielded twice.
+        All steps of a sequence are repeated, because the data that the solver carries
+        from step to step are lost. No result is yielded twice.
         """
-        measured: set[str] = set()  # run ids
+        measured: set[str] = set()  # run IDs
         for tried_again in (True, False):
             try:
                 for result in self._results(block, turn):
@@ -139,8 +140,8 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        Ranks that emit a QP also judge the answer if all code in them is ours. The case
-        is then built only for values that they cannot evaluate.
+        If ranks emit a QP and execute no code of plug-ins, they also judge the answer.
+        The case is then built only for values that they cannot evaluate.
 
         Raises
         ------
@@ -179,7 +180,7 @@ class Executor:
             else:
                 yield Result(record=record, point=point_arrays(solution))
             stopped = is_pointless and record.verdict is not Verdict.DECLINED
-            # the solver's data for later steps are lost
+            # after a failed step, the solver's data for later steps are lost
             if block.is_sequence and stopped:
                 yield from _unreached_steps(available[step + 1 :], record)
                 break
@@ -192,7 +193,7 @@ class Executor:
     def _request(
         self, block: WorkUnit, record: Record, step: int, source: Source
     ) -> tuple[dict[str, Any], Record]:
-        """Return the request for a measurement, and its record with case data."""
+        """Return the request for a measurement, and the record with the case's data."""
         request = {
             "out": str(self._point),
             "source": source,
@@ -202,7 +203,8 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
-            if block.warm_up is not None:  # in new processes, as on a single one
+            # each case of a series of growing sizes is emitted by new processes
+            if block.warm_up is not None:
                 self._worker(record.solver).close()
                 request["first"] = dict(block.warm_up)
         if source is Source.RANKS:
@@ -211,13 +213,14 @@ class Executor:
         if not source.is_shared:
             request |= {"qp": str(entry.qp), "digest": entry.digest}
         keys = ["qp", "build_seconds", "dualise_seconds"]
-        if block.warm_up is not None:  # else its process may hold earlier cases
+        # without a new process, the peak memory may include that of earlier cases
+        if block.warm_up is not None:
             keys.append("build_peak_mib")
         meta = {key: entry.meta.get(key) for key in keys}
         return request, record.replace(**meta, step_tol=_step_tol(record, entry))
 
     def _source(self, record: Record) -> Source:
-        """Return the origin of the QP of a record, asking the case worker once."""
+        """Return the origin of a record's QP, asking the case worker once per case."""
         if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
             return Source.FILE
         if record.case not in self._shared:
@@ -231,7 +234,10 @@ class Executor:
         return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
-        """Build the cases of a block, once; a sequence may have fewer than steps."""
+        """Build the cases of the current block, unless they are built already.
+
+        If a sequence ends before the last step of `turn`, fewer cases are built.
+        """
         if self._limit_hit is not None:
             raise self._limit_hit
         if self._entries:
@@ -252,7 +258,7 @@ class Executor:
     def _describe(
         self, block: WorkUnit, record: Record, solution: Solution | None
     ) -> Result:
-        """Add quantities and error bounds of the point, from the case worker."""
+        """Add physical quantities and error bounds, computed by the case worker."""
         if solution is None or not has_point(solution):
             return Result(record=record)
         first = record.verdict is Verdict.VERIFIED and record.repeat == 0
@@ -299,7 +305,7 @@ class Executor:
         is_limited = block.warm_up is not None
         for _ in range(
             2
-        ):  # it may have been killed from outside, or by an earlier case
+        ):  # again if it was killed from outside, or crashed due to an earlier case
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)},
                 time_limit=block.time_limit if is_limited else inf,
@@ -324,7 +330,7 @@ class Executor:
         return reply.answer
 
     def _optimum(self, entry: StoredCase, qp: QP) -> Optimum | None:
-        """Return the proven optimum of the QP of a case, from the cache if possible."""
+        """Return the proven optimum of a case's QP; None if there is no proof."""
         if entry.digest not in self._optima:
             optimum = proven_optimum(qp, partial(self._reference, entry))
             while len(self._optima) >= _MAX_STORED_OPTIMA:
@@ -338,9 +344,9 @@ class Executor:
         Raises
         ------
         ArithmeticError
-            If the reference finds no solution.
+            If the reference solver fails.
         FaultError
-            If the case worker dies, or a file cannot be exchanged with it.
+            If the case worker does not answer.
 
         """
         point = self.scratch / "reference.npz"
@@ -376,7 +382,7 @@ def local_engine(
     *,
     operators: Mapping[str, Maker] = NO_MAKERS,
 ) -> Iterator[Engine]:
-    """Open the engine of one machine, which takes a block when the last one is done."""
+    """Open the engine for one machine, which executes the blocks sequentially."""
     with closing(Executor(commands, scratch, cases, operators)) as executor:
         yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
 
@@ -384,10 +390,11 @@ def local_engine(
 def _step_tol(record: Record, entry: StoredCase) -> float | None:
     """Return the tolerance of a step of a fixed-point iteration.
 
-    The tolerance is θ·δ, at most `MAX_STEP_TOL`, with the distance δ of the QP from the
-    fixed point (`harness.plugin.Case.unsettled`) and θ is `Record.tighten` (Eisenstat
-    and Walker 1996, SIAM J. Sci. Comput. 17). Return None if that is not looser than
-    the tolerance asked for, as for the last QP, where δ = 0.
+    The tolerance is θ·δ, but at most `MAX_STEP_TOL`, where δ is the relative distance
+    of the QP from the fixed point (`harness.plugin.Case.unsettled`) and θ is
+    `Record.tighten` (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). If this is
+    not looser than the requested tolerance, as in the last step with δ = 0, return
+    None.
     """
     delta = float(entry.meta.get("unsettled", 0.0))
     tol = min(MAX_STEP_TOL, record.tighten * delta)
@@ -395,7 +402,10 @@ def _step_tol(record: Record, entry: StoredCase) -> float | None:
 
 
 def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
-    """Yield results of the steps after one that ended a sequence, with its verdict."""
+    """Yield a result for each step after the one, `end`, that ended the sequence.
+
+    Each of these results has the verdict of `end`.
+    """
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
         yield Result(record=record.replace(verdict=end.verdict, message=reason))
@@ -410,7 +420,7 @@ class _BuildError(Exception):
 
 
 class _BuildLimitError(_BuildError):
-    """A limit that ended the process which builds or evaluates a case."""
+    """Time or memory limit exceeded while a case was built or evaluated."""
 
     def __init__(self, reason: str, verdict: Verdict) -> None:
         super().__init__(reason, "")
@@ -418,5 +428,8 @@ class _BuildLimitError(_BuildError):
 
 
 def _case(r: Record) -> dict[str, Any]:
-    """Return the name of a record's case for `harness.processes.case_worker`."""
+    """Return the NAME of a record's case in requests to the case worker.
+
+    See `harness.processes.case_worker`.
+    """
     return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}

@@ -9,22 +9,23 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.special import stdtrit
 
-COVERAGE = 0.95  #: coverage of the intervals
+COVERAGE = 0.95  #: default coverage probability of the confidence intervals
 
-#: session and repeat; solvers that share it, for one case and tolerance, were measured
-#: next to each other
+#: Session and repeat that identify a block of measurements. Within a block, all solvers
+#: were measured in immediate succession on the same case at the same tolerance.
 Block = tuple[str, int]
 Key = TypeVar("Key", Block, int)
 
 
 class Ratio(NamedTuple):
-    """A ratio of times and its confidence interval, of 95 % by default."""
+    """Ratio of times with its confidence interval, by default of 95 % coverage."""
 
     value: float
-    low: float
-    high: float
-    pairs: int  #: number of pairs; for two samples, the size of the smaller one
-    paired: bool = True  #: False for samples from different sessions
+    low: float  #: lower end of the interval
+    high: float  #: upper end of the interval
+    #: number of pairs or, if the samples are not paired, the size of the smaller sample
+    pairs: int
+    paired: bool = True  #: False for samples without a common block
 
     @property
     def half_width(self) -> float:
@@ -33,13 +34,13 @@ class Ratio(NamedTuple):
 
 
 def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None:
-    """Compare two solvers by the blocks in which both were measured.
+    """Return the mean ratio of two solvers' times over the blocks that both have.
 
-    The logarithms of the ratios within blocks are averaged, with Student's interval. A
-    disturbance that slows down a whole block cancels. Return None for fewer than two
-    common blocks.
+    The logarithms of the ratios within blocks are averaged, and Student's t yields the
+    interval. A disturbance that slows down a whole block cancels in the ratio. If there
+    are fewer than two common blocks, return None.
 
-    a, b : seconds by block
+    a, b : times of the two solvers by block, in s
 
     >>> ratio = paired_ratio({1: 2.0, 2: 4.2, 3: 1.9}, {1: 1.0, 2: 2.0, 3: 1.0})
     >>> round(ratio.value, 2), ratio.pairs
@@ -59,14 +60,14 @@ def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None
 def unpaired_ratio(
     a: Iterable[float], b: Iterable[float], coverage: float = COVERAGE
 ) -> Ratio | None:
-    """Compare two samples of times that have no block in common.
+    """Return the ratio of the mean times of two samples that share no block.
 
-    The means of their logarithms are compared, with Welch's interval [1]_. Nothing
-    cancels here, and a change of the machine between the two sessions is not contained
-    in the interval. Return None for fewer than two values in either sample.
+    The means are geometric. Their ratio has Welch's interval [1]_. Disturbances do not
+    cancel in this ratio, and the interval does not account for a change of the machine
+    between the two sessions. If a sample has fewer than two values, return None.
 
-    a, b : seconds
-    coverage : coverage of the interval
+    a, b : times in s
+    coverage : coverage probability of the interval
 
     References
     ----------
@@ -89,27 +90,31 @@ def unpaired_ratio(
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Compare two solvers by their common blocks, or without them as two samples.
+    """Return the paired ratio of two solvers' times if possible, or else the unpaired.
 
-    Return None if neither comparison has an interval.
+    If there are too few times for either ratio, return None.
 
-    a, b : seconds by block
+    a, b : times of the two solvers by block, in s
     """
     return paired_ratio(a, b) or unpaired_ratio(a.values(), b.values())
 
 
 @cache
 def _student(freedom: float, coverage: float = COVERAGE) -> float:
-    """Return the half-width of Student's interval in standard errors."""
+    """Return the half-width of a two-sided Student interval, in standard errors.
+
+    freedom : degrees of freedom
+    """
     return float(stdtrit(freedom, 0.5 + coverage / 2))
 
 
 def largest_half_width(times: Mapping[str, Mapping[Block, float]]) -> float | None:
     """Return the largest relative half-width of the ratios to the fastest solver.
 
-    Return None for fewer than two solvers, and infinity if a ratio has no interval yet.
+    The fastest solver is the one with the smallest median time. Return None if there
+    are fewer than two solvers, and infinity if a ratio has no interval yet.
 
-    times : seconds by solver and block
+    times : times by solver and block, in s
     """
     if len(times) < 2:
         return None

@@ -12,18 +12,18 @@ if TYPE_CHECKING:
 class Progress(Protocol):
     """Progress callbacks.
 
-    A run calls `start` once, `say` before each unit of work, `advance` after a cell
-    (one measurement of one solver) and `warn` at any time.
+    A run calls `start` once, `say` before each block of measurements, `advance` after
+    each cell (one measurement of one solver), and `warn` at any time.
     """
 
     def start(self, total: int) -> None:
-        """Begin a run of `total` cells, counting those measured by earlier runs."""
+        """Begin a run of `total` cells, including those measured by earlier runs."""
 
     def say(self, text: str) -> None:
         """Show the current activity."""
 
     def warn(self, text: str) -> None:
-        """Show a problem, in a line that stays visible."""
+        """Show a warning in a line that stays visible."""
 
     def advance(self, record: Record | None) -> None:
         """Count a cell as done; `record` is None if the cell was not measured."""

@@ -1,7 +1,8 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process selects the measurements, and it alone writes the result folder. An engine
-executes the blocks, so that a run is the same on one machine and on many.
+This process selects the measurements, and is the only one that writes to the result
+folder. The blocks of measurements are executed by an engine: one for this machine, or
+one for a cluster.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Missing:
-    """Measurements that a run could not make; the same command retries them."""
+    """Measurements that are missing after a run; the same command retries them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
     faults: list[Fault]  #: measurements prevented by something other than the solver
@@ -75,8 +76,8 @@ def run(
 ) -> Missing:
     """Complete the measurements of `suite` in the result folder `out`.
 
-    resolve : returns the configured solver, whose options are stored in the records
-    environment, digest : content of environment.json, and its digest
+    resolve : returns a solver with its options set; all options are stored in records
+    environment, digest : content of environment.json, and the digest of that content
     fresh : delete the content of `out` first
     engine : opens the engine that executes the blocks
 
@@ -87,9 +88,9 @@ def run(
     Raises
     ------
     InputError
-        If `out` is not a result folder, belongs to another suite, case or environment,
-        is in use, was moved or deleted during the run, or if its disk is full. Any
-        other failure loses only the measurements that it affects.
+        If `out` is not a result folder, contains results of a different suite, case or
+        environment, is in use, or was moved or deleted during the run, or if its disk
+        is full. Any other failure affects single measurements, which are then missing.
 
     """
     refuse_foreign(out)
@@ -151,7 +152,7 @@ def run(
 
 @dataclass(eq=False, kw_only=True)
 class _Recorder:
-    """Writer of the outcomes of an engine, each once, and reporter of progress."""
+    """Writer that stores each outcome of an engine once and reports progress."""
 
     out: Path
     lock: FolderLock
@@ -159,19 +160,19 @@ class _Recorder:
     schedule: Schedule
     progress: Progress
     was_deleted: bool = False  #: True if the folder was deleted since the last outcome
-    _counted: set[str] = field(default_factory=set)  # run ids reported to `progress`
-    _faults: dict[str, Fault] = field(default_factory=dict)  # last one, by run id
+    _counted: set[str] = field(default_factory=set)  # run IDs reported to `progress`
+    _faults: dict[str, Fault] = field(default_factory=dict)  # last fault by run ID
 
     def take(self, outcome: Outcome) -> None:
-        """Write one result, or the reason why it is missing.
+        """Store one result, or the reason why it is missing.
 
         Raises
         ------
         InputError
-            If the folder was moved, or locked by another run, meanwhile.
+            If the folder has been moved, or another run has locked it.
         OSError
-            If writing fails, for instance on a full disk; the journal then contains
-            nothing of the result.
+            If the result cannot be written, for instance because the disk is full; the
+            journal then has no line for it.
 
         """
         match outcome:
@@ -185,7 +186,7 @@ class _Recorder:
             case MeasurementFault():
                 self._take_fault(outcome)
             case Result() if self.schedule.is_settled(outcome.record):
-                # a block or sequence that was repeated; the first result counts
+                # from a repetition of a block or sequence; the first result counts
                 self._count(outcome.record, None)
             case Result():
                 self._take_result(outcome)
@@ -204,7 +205,7 @@ class _Recorder:
             number = self.schedule.block_of_part(record.block, result.part)
             record = record.replace(block=number)
         self.was_deleted = not self.lock.is_there()
-        # The line comes last: it must not refer to files that were not written.
+        # The line is written last, because it must not refer to missing files.
         if result.point is not None:
             record = record.replace(vectors=save(self.out, result.point))
         if result.fields is not None:
@@ -233,7 +234,7 @@ class _Recorder:
             self._count(record, None)
 
     def _count(self, record: Record, result: Record | None) -> None:
-        """Report a cell as done, once even if it has several outcomes."""
+        """Report a cell as done, but only once even if it has several outcomes."""
         if record.run_id not in self._counted:
             self._counted.add(record.run_id)
             self.progress.advance(result)
@@ -254,10 +255,14 @@ def _check_same(
     suite: Suite,
     options: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Refuse to continue if a name has changed its meaning since the last run.
+    """Check that no name has changed its meaning since the last run.
 
-    The run is refused if a label has other options, if a case has left the suite, or if
-    the file of a case has changed.
+    Raises
+    ------
+    InputError
+        If a solver label now has different options, a case is no longer in the suite,
+        or a parameter of a case, such as the digest of its file, has changed.
+
     """
     now = {case.name: case.params for case in suite.names}
     configured = {label: finite(plain(value)) for label, value in options.items()}
@@ -285,9 +290,16 @@ def _check_same(
 
 
 def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
-    """Refuse new steps of a sequence in front of steps that were measured.
+    """Check that no step of a sequence was inserted before steps already measured.
 
-    A solver carries data from step to step, so the measured steps would be others.
+    A solver carries data from step to step, so that the measured results would not be
+    those of the new sequence.
+
+    Raises
+    ------
+    InputError
+        If a step was inserted.
+
     """
     measured: dict[tuple[str, str, float, int], list[str]] = {}
     for r in past:

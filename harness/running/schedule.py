@@ -1,12 +1,13 @@
-"""Schedule of a suite: its remaining measurements, their order, and a stopping rule.
+"""Schedule of a suite: remaining measurements, their order, and a stopping rule.
 
-The design consists of complete randomised blocks. A block is every solver once on one
-case (or one sequence) at one tolerance, in random order; every second block has the
-reverse order of the previous one. If the suite sets a precision, blocks continue beyond
-its repeats until every confidence interval of a ratio between a verified solver and the
-fastest one (`harness.running.pairs`) is narrow enough, or a limit is reached. The rule
-is fixed in the suite before the first measurement and depends only on the journal, so a
-resumed run stops where an uninterrupted one does.
+The experimental design is one of complete randomised blocks. In each block, every
+solver is measured once on one case (or sequence) at one tolerance, in random order;
+every second block reverses the order of the previous one. If the suite sets a
+precision, further blocks are measured after the prescribed repeats. They end when, for
+every verified solver, the confidence interval of the ratio of its time to that of the
+fastest solver (`harness.running.pairs`) is narrow enough, or when a limit is reached.
+This stopping rule is fixed in the suite before the first measurement and depends only
+on the journal, so that a resumed run stops where an uninterrupted run would.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 @dataclass(eq=False, kw_only=True)
 class Schedule:
-    """Blocks of a suite that are not in the journal and remain to be measured."""
+    """Remaining blocks of measurements of a suite, in the order of execution."""
 
     suite: Suite
-    #: options of each solver, defaults resolved
+    #: options by solver label, including those with default values
     options: Mapping[str, Mapping[str, Any]]
     environment: str  #: digest of the environment
     session: str = ""  #: session of the run, see `harness.record.Record`
@@ -42,11 +43,12 @@ class Schedule:
     #: records by cell; empty unless the suite sets a precision
     _records: dict[Cell, list[Record]] = field(default_factory=dict)
     _declined: set[tuple[str, Cell]] = field(default_factory=set)  # solver and cell
-    #: solver and cell, in series of growing sizes, without a verified answer
+    #: solver and cell of answers that were not verified, in series of growing sizes
     _ended: set[tuple[str, Cell]] = field(default_factory=set)
-    _done: set[str] = field(default_factory=set)  # run ids
+    _done: set[str] = field(default_factory=set)  # run IDs in the journal
     _next: int = 0  # number of the next new block
-    _parts: dict[tuple[int, int], int] = field(default_factory=dict)  # their numbers
+    # new block number by the original block number and the number of the part
+    _parts: dict[tuple[int, int], int] = field(default_factory=dict)
 
     @property
     def cells(self) -> int:
@@ -55,7 +57,7 @@ class Schedule:
         return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
 
     def add(self, record: Record) -> None:
-        """Add a measurement that is in the journal."""
+        """Take a measurement in the journal into account."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
         if record.verdict is Verdict.DECLINED:
@@ -66,10 +68,11 @@ class Schedule:
             self._records.setdefault(_cell(record), []).append(record)
 
     def is_settled(self, record: Record) -> bool:
-        """Return True for a record that is in the journal, or that is not needed.
+        """Return True if a measurement is in the journal, or is not needed.
 
-        A solver that declined a case once declines it in every repeat. In a series of
-        growing sizes, one answer that is not verified ends the series of its solver.
+        A solver that declined a case once would decline it in every repeat. In a series
+        of cases of growing size, a solver is not measured any more after its first
+        answer that is not verified.
         """
         cell = record.solver, _cell(record)
         if record.run_id in self._done or cell in self._declined | self._ended:
@@ -78,7 +81,7 @@ class Schedule:
         return growth is not None and self._has_ended(record, growth)
 
     def _has_ended(self, record: Record, growth: Growth) -> bool:
-        """Return True if the solver was not verified on a smaller case."""
+        """Return True if the solver's answer to a smaller case was not verified."""
         while growth.smaller:
             cell = record.mode, growth.smaller, record.tol
             if (record.solver, cell) in self._ended:
@@ -91,9 +94,9 @@ class Schedule:
         return run_id in self._done
 
     def block_of_part(self, block: int, part: int) -> int:
-        """Return the block number of a part that was measured later or elsewhere.
+        """Return the new block number of a part measured later or on another machine.
 
-        Times are paired within blocks only, so such a part must not keep the number.
+        Times are paired within blocks, so that such a part needs a number of its own.
         """
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next
@@ -101,7 +104,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Exclude all cases of a block as unbuilt; return False if they already are."""
+        """Exclude all cases of a block as unbuilt; return False if all were already."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)
@@ -109,8 +112,8 @@ class Schedule:
     def blocks(self) -> Iterator[WorkUnit]:
         """Yield the remaining blocks.
 
-        Each depends on the journal at the time of the request: the stopping rule
-        sees all blocks that were measured before.
+        Each block is determined when it is requested, so that the stopping rule takes
+        all measurements before it into account.
         """
         for group in self.suite.groups:
             for tol in self.suite.tolerances:
@@ -132,7 +135,7 @@ class Schedule:
         return s.repeats if s.precision is None else max(s.repeats, s.max_repeats)
 
     def _is_enough(self, group: Group, tol: float) -> bool:
-        """Return True if the precision is reached or the budget is spent."""
+        """Return True if the requested precision is reached or the budget is spent."""
         assert self.suite.precision is not None
         records = [
             r
@@ -141,7 +144,7 @@ class Schedule:
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
-        # one failure excludes a solver: its times are not those of solving the problem
+        # One failure excludes a solver: a time without a solution is not comparable.
         failed = {r.solver for r in records if not r.verdict.is_verified}
         times: dict[str, dict[Block, float]] = {}
         for solver in {r.solver for r in records} - failed:
@@ -152,9 +155,10 @@ class Schedule:
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
-        """Return the remaining turns of a block in random order; None if none remain.
+        """Return a block with its remaining turns in random order; None if none remain.
 
-        A sequence is repeated as a whole: a solver carries data from step to step.
+        If any step of a sequence is missing, all steps are measured again, because a
+        solver carries data from step to step.
         """
         turns = []
         is_given_up = any(case.name in self.unbuilt for case in group.cases)
@@ -180,8 +184,8 @@ class Schedule:
                 turns.append(turn)
         if not turns:
             return None
-        # A pair of repeats shares the seed, so that the second reverses the first: over
-        # the pair, all solvers have the same mean position in their block.
+        # Two consecutive repeats have the same seed, and the second reverses the order
+        # of the first, so that all solvers have the same mean position in the two.
         seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
         random.Random(seed).shuffle(turns)
         if repeat % 2:
@@ -202,11 +206,11 @@ class Schedule:
 
 
 def _by_block(records: Iterable[Record]) -> dict[Block, float]:
-    """Return the total seconds of the steps of each repeat, by block.
+    """Return the total time of the steps of each repeat, in s, by block.
 
-    A sequence that was interrupted and resumed has records of several sessions; their
-    names together form its block, so that it is paired only with sequences of the same
-    sessions.
+    If a sequence was interrupted and resumed, its records are from several sessions.
+    The names of all these sessions then identify its block, so that the sequence is
+    paired only with sequences of the same sessions.
     """
     repeats: dict[int, list[Record]] = {}
     for r in records:
@@ -220,7 +224,7 @@ def _by_block(records: Iterable[Record]) -> dict[Block, float]:
 
 
 def _fields(case: CaseId) -> dict[str, Any]:
-    """Return the name of a case for `harness.processes.case_worker`."""
+    """Return the NAME of a case in requests to `harness.processes.case_worker`."""
     return {
         "family": case.family.name,
         "params": dict(case.params),

@@ -1,1 +1,1 @@
-"""The command line: one module per command, and shared code."""
+"""Command line: one module for each command, and `main` for all of them."""

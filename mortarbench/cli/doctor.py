@@ -9,7 +9,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Print a description of this machine and recommended changes."""
+    """Describe this machine, and recommend changes for better measurements."""
     from rich.console import Console
 
     from mortarbench.harness.environment.doctor import as_json, examine, render

@@ -89,10 +89,11 @@ def solvers_page(solvers: Mapping[str, Solver]) -> str:
 
 
 def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
-    """Describe the solvers of a registry on several pages, by the names of their files.
+    """Return the Markdown pages on the solvers of a registry, by name of the file.
 
-    The first page contains the table and the solvers whose backend can be chosen. The
-    others contain the sections on our solvers and on the solvers of libraries.
+    The first page has the table of all solvers and the sections on solvers whose
+    backend can be chosen. The other two pages have the sections on our own solvers and
+    on the solvers of libraries.
     """
     pages: dict[str, list[str]] = {
         "solvers.md": [HEAD, *_overview(solvers)],
@@ -151,7 +152,7 @@ def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str
 
 
 def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
-    """Return the table of options, with a column of values for each solver name."""
+    """Return the table of options, with one column of values for each solver."""
     columns = {name: options_of(solvers[name]) for name in names}
     options = list(columns[names[0]])
     if not options:

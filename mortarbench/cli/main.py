@@ -1,8 +1,8 @@
 """Command line: commands with their options, and exit codes.
 
-Exit codes: 0 success; 1 completed with a negative result; 2 invalid input, with one
-line on stderr; 3 an internal error, with a traceback; 129 hung up (SIGHUP), 130
-interrupted, 143 terminated (SIGTERM).
+The exit codes are 0 for success, 1 for completion with a negative result, 2 for invalid
+input (with one line on stderr), 3 for an internal error (with a traceback), 129 after
+SIGHUP, 130 after an interrupt and 143 after SIGTERM.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from mortarbench.harness.processes.termination import TerminatedError, ended_by_
 from mortarbench.harness.registry import PluginFile
 from mortarbench.registries import Registries, defer_parts_of_numpy, installed
 
-_Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
+_Run = Callable[[Registries, argparse.Namespace], int]  #: command; returns an exit code
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that raises `InputError`, with one line, for an invalid command line."""
+    """Parser that raises an `InputError` if the command line is invalid."""
 
     def error(self, message: str) -> NoReturn:
         usage = " ".join(self.format_usage().split())
@@ -43,10 +43,9 @@ class _Parser(argparse.ArgumentParser):
         args: Sequence[str] | None = None,
         namespace: argparse.Namespace | None = None,
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Refuse unknown options of a command, then parse the others.
+        """Check that all options of a command are known, then parse the arguments.
 
-        argparse would first report a missing required option, which may only be
-        misspelt.
+        Without this check, argparse would report a misspelt required option as missing.
         """
         if self._subparsers is None:  # a command
             options = [name for name in self._option_string_actions if len(name) > 2]
@@ -59,8 +58,8 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """Exit after a help text."""
-        # flush here: `main` handles a closed pipe, a flush at interpreter exit fails
+        """Exit after a help text has been printed."""
+        # flush here, where `main` handles a closed pipe, not at interpreter exit
         print(end="", flush=True)
         super().exit(status, message)
 
@@ -121,16 +120,16 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         try:
             code = run(registries, options)
         except TerminatedError:
-            if argv[:1] != ["run"]:  # `run` has its own message: it can be continued
+            if argv[:1] != ["run"]:  # `run` reports itself that it can be continued
                 _print_error("terminated")
             raise
-        # flush here: `main` handles a closed pipe, a flush at interpreter exit fails
+        # flush here, where `main` handles a closed pipe, not at interpreter exit
         print(end="", flush=True)
     return code
 
 
 def _file_error(e: OSError, path: Path) -> str:
-    """Return the message for a file error, with a remedy if one is known."""
+    """Return the one-line message for an error of the operating system on a file."""
     if isinstance(e, FileExistsError | NotADirectoryError):
         path = next((p for p in (path, *path.parents) if p.is_file()), path)
         return f"{path}: a file exists where a folder is needed; move the file away"
@@ -147,8 +146,8 @@ def _print_error(message: str) -> int:
 def _open_standard_streams() -> None:
     """Open /dev/null for standard streams that are closed.
 
-    Otherwise the next file would get the number of the stream, and libraries would
-    print into it.
+    Otherwise the next file that is opened would get the file descriptor of the stream,
+    and libraries would print into this file.
     """
     while (fd := os.open(os.devnull, os.O_RDWR)) < len(_STREAMS):
         os.set_inheritable(fd, True)
@@ -168,7 +167,7 @@ _STREAMS = {
     "stdin": "r",
     "stdout": "w",
     "stderr": "w",
-}  #: in the order of their numbers
+}  #: modes of the standard streams, in the order of their file descriptors
 
 
 class _Version(argparse.Action):
@@ -185,7 +184,7 @@ class _Option(NamedTuple):
     """Argument of a command: an option, or positional if its name has no dashes."""
 
     names: str  #: names, separated by spaces
-    metavar: str  #: empty: a flag, or an argument with `choices`
+    metavar: str  #: metavar; empty for a flag or an argument with `choices`
     what: str  #: help text
     settings: Mapping[str, Any] = {}  #: further settings of argparse
 
@@ -210,7 +209,7 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-#: types of arguments by their metavar; the others are strings
+#: types of arguments by metavar; arguments with other metavars are strings
 _KINDS: Mapping[str, Callable[[str], Any]] = {
     "DIR": Path,
     "DIR2": Path,
@@ -251,10 +250,10 @@ def _option(what: str) -> _Option:
 class _Command(NamedTuple):
     """Subcommand with its module in `mortarbench.cli`, its help and its arguments."""
 
-    module: str
+    module: str  #: module name, without `mortarbench.cli`
     what: str  #: help text
-    options: Sequence[_Option]
-    more: str = ""  #: continues the help text in the command's own help
+    options: Sequence[_Option]  #: arguments of the command
+    more: str = ""  #: further sentences of ``COMMAND --help``
     excluding: Sequence[_Option] = ()  #: options that exclude each other
 
 
@@ -278,7 +277,7 @@ _COMMANDS = {
         "run",
         "measure a suite and write a report on the results",
         [
-            _Option("suite", "SUITE.toml", "a file, or a name of `list suites`"),
+            _Option("suite", "SUITE.toml", "a file, or a name from `list suites`"),
             _Option(
                 "--out",
                 "DIR",
@@ -298,8 +297,8 @@ _COMMANDS = {
                 _SEVERAL,
             ),
             _option(
-                "set an option of every solver that has it; each of several "
-                "values is measured"
+                "set an option of every solver that has it; of several values, as in "
+                "max_iter=50,100, each is measured"
             ),
             _PLUGIN,
             _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
@@ -327,7 +326,9 @@ _COMMANDS = {
         "run one solver on one case, once, and verify its answer",
         [
             _CASE,
-            _Option("--solver", "NAME", "a name of `list solvers`", {"required": True}),
+            _Option(
+                "--solver", "NAME", "a name from `list solvers`", {"required": True}
+            ),
             _Option(
                 "--tol",
                 "T",

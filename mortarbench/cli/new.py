@@ -12,7 +12,7 @@ from mortarbench.registries import Registries
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-#: command that is recommended for the new file
+#: command to try next with the new file, by kind of the template
 _NEXT = {
     "solver": "mortarbench test-solver {0} --plugin {0}.py",
     "problem": "mortarbench solve {0}/primal --solver clarabel --plugin {0}.py",
@@ -21,7 +21,7 @@ _NEXT = {
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Write NAME.py or NAME.toml into the working directory, unless it exists."""
+    """Write NAME.py or NAME.toml to the working directory, unless the file exists."""
     kind, name = options.kind, options.name
     if not _NAME.fullmatch(name):
         raise InputError(

@@ -14,7 +14,8 @@ from mortarbench.registries import Registries
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Reference
 
-#: Suites whose results the paper does not contain, and their reduction for --quick.
+#: Suites that go beyond the paper, each with the arguments of `run` that reduce it for
+#: --quick.
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
         "cases": ("*/Nr=4/*", "*/Nr=8/*", "*/Nr=15/*", "*/Nr=30/*dual*"),
@@ -48,8 +49,8 @@ def measure_and_write(
 ) -> list[Path]:
     """Measure and write the figures and tables of the paper; return the files.
 
-    quick : fewer sizes and repeats
-    say : called with a message at each stage
+    quick : True for fewer sizes and repeats
+    say : called with messages about the progress
 
     Raises
     ------
@@ -86,6 +87,6 @@ def measure_and_write(
 
 
 def _answer(registries: Registries, name: str) -> Reference:
-    """Return a function that solves QPs by one of our solvers at tolerance 1e-8."""
+    """Return a function that solves QPs with a registered solver at tolerance 1e-8."""
     solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

@@ -10,7 +10,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Repeat one stored measurement and compare; return 0 if it is reproduced."""
+    """Repeat a stored measurement; return 0 if the stored verdict is reproduced."""
     check_result_folder(options.folder)
     registries = registries.with_files(options.plugin)
 

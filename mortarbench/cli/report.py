@@ -1,4 +1,4 @@
-"""The command `report`: report on a result folder, or on changes between several."""
+"""The command `report`: report on a result folder, or on changes between folders."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _main_paths(files: Sequence[Path]) -> list[Path]:
-    """Return the pages to open: HTML, else Markdown, else the folders of the files."""
+    """Return the HTML pages, else the Markdown pages, else the folders of the files."""
     for suffix in (".html", ".md"):
         if pages := [file for file in files if file.suffix == suffix]:
             return pages

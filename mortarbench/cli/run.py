@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure the missing part of a suite and write the report.
+    """Perform the missing measurements of a suite and write the report.
 
-    Return 1 if a measurement is missing or, with ``--strict``, if a claim is refuted or
-    a measurement ended without an answer.
+    Return 1 if a measurement is missing. With ``--strict``, also return 1 if a claim is
+    refuted or a measurement ended without an answer.
     """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)

@@ -62,7 +62,7 @@ def run(registries: Registries, options: Namespace) -> int:
     with session as solve:
         case = Case(id=parsed, registries=registries)
         if pictures or options.mpi == 1 or not (is_builtin and is_shared(parsed)):
-            # after the fork, so that the worker does not carry the memory of the case
+            # built after the fork, so that the worker does not inherit the memory
             _build(case, pictures)
         answer = solve(case, options.tol)
     _print(answer, options)
@@ -95,7 +95,16 @@ def _print(answer: Answer, options: Namespace) -> None:
 
 
 def _build(case: Case, pictures: Sequence[str]) -> None:
-    """Build the case and print its remarks; raise if requested pictures need bodies."""
+    """Build the case and print its remarks.
+
+    pictures : options for pictures on the command line
+
+    Raises
+    ------
+    InputError
+        If pictures are requested and the case has no bodies.
+
+    """
     for remark in case.remarks:
         say(remark)
     if pictures and case.family_case.fields is None:
@@ -104,7 +113,7 @@ def _build(case: Case, pictures: Sequence[str]) -> None:
 
 
 def _hint(answer: Answer) -> str:
-    """Return a hint to the dual form if `declines` is due to inequality rows."""
+    """Return a hint to use the dual form if the solver declined inequality rows."""
     case = answer.case
     if case.form != "primal" or "dual" not in case.id.family.forms:
         return ""
@@ -117,7 +126,7 @@ def _hint(answer: Answer) -> str:
 
     qp = case.family_case.qp
     n = qp.q.size
-    # multipliers of inequality rows have bounds, those of cones ‖w‖ ≤ t lie in discs
+    # In the dual, multipliers of inequality rows have bounds; cones become discs.
     discs = [
         Discs(one.index[:, 1:], np.ones(len(one.index)))
         for one in qp.sets
@@ -131,7 +140,7 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        # a QP with bounds instead of inequality rows represents the dual
+        # test the solver on a QP that has bounds or discs instead, like the dual
         reason = reason_to_decline(solver, like_dual)
     except Exception:  # code of a plug-in failed: no hint
         return ""
@@ -141,15 +150,16 @@ def _hint(answer: Answer) -> str:
 def _imports_from_working_directory() -> bool:
     """Return True if libraries may have been imported from the working directory.
 
-    ``python -m`` searches this directory first, but workers do not (-P). A fork of this
-    process could therefore use other libraries than the worker of a run.
+    ``python -m`` searches this directory first, but workers do not, because they are
+    started with -P. A fork of this process could therefore use different libraries than
+    the worker of a run.
     """
     first, *others = sys.path
     return first in ("", os.getcwd()) and first not in others
 
 
 def _draw(answer: Answer, options: Namespace) -> None:
-    """Write the requested pictures."""
+    """Write the requested pictures, unless the answer has no point."""
     if not answer.has_point:
         say(f"no picture: {answer.record.solver} returned no point")
         return

@@ -13,7 +13,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Run all checks; return 1 if one fails or a solver solves no QP."""
+    """Run all checks; return 1 if a check fails or a solver solves no QP."""
     registries = registries.with_files(options.plugin)
     specs = [
         SolverSpec(name=name, label=name)
@@ -54,7 +54,7 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _named(pattern: str, solvers: Collection[str]) -> list[str]:
-    """Return the solvers that match a pattern; the pattern itself if none matches."""
+    """Return the solvers that match a pattern; if none matches, return the pattern."""
     if "*" not in pattern or pattern in solvers:
         return [pattern]
     matches = [s for s in fnmatch.filter(solvers, pattern) if not s.endswith(":*")]

@@ -1,10 +1,11 @@
-"""Template of a family of problems: replace the keys and the mathematics of `build`.
+"""Template for a family of problems: replace the keys, and the model in `build`.
 
     mortarbench solve NAME/n=100/primal --solver clarabel --plugin NAME.py
 
-Its name in suites is NAME, and its cases are NAME/key=value/…/FORM. Scale the data of
-the QP to order one, so that tolerances have the same meaning as elsewhere. `recover`,
-`quantities` and energy = scale · objective + constant convert to physical units.
+Suites refer to the family as NAME, and its cases are called NAME/key=value/…/FORM.
+Scale the data of the QP to order one, so that tolerances have the same meaning as for
+other families. The functions `recover` and `quantities` convert results to physical
+units; the energy in these units is scale · objective + constant.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ from mortarbench.harness import (
 
 @dataclass(frozen=True)
 class Problem(Family):
-    """A string on (0, 1) under a load of one, above a flat obstacle: u ≥ −depth."""
+    """String on (0, 1) under a unit load, above a flat obstacle: u ≥ −depth."""
 
     name: str = "NAME"
-    #: keys of case names with their defaults, in the order of the names
+    #: keys with their default values, in the order in which case names contain them
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: {"n": 50, "depth": 0.05}, hash=False
     )
     forms: tuple[str, ...] = ("primal",)
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Refuse values out of range with a one-line message, before building."""
+        """Raise an `InputError` with a one-line message if a value is out of range."""
         n, depth = int(params["n"]), float(params["depth"])
         if n < 2:
             raise InputError(f"NAME: n = {n}; expected at least 2")
@@ -50,7 +51,7 @@ class Problem(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Build one case: linear elements on n inner nodes."""
+        """Build one case, with linear finite elements and n interior nodes."""
         n, depth = int(params["n"]), float(params["depth"])
         h = 1 / (n + 1)
         K = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)) / h

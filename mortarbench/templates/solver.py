@@ -1,4 +1,4 @@
-"""Template of a QP solver: replace `iterates` by your method or by a library call.
+"""Template for a QP solver: replace `iterates` with your method or a library call.
 
     mortarbench test-solver NAME --plugin NAME.py
     mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver NAME --plugin NAME.py
@@ -8,8 +8,12 @@ A solver receives the QP
     minimise ½xᵀPx + qᵀx   subject to   Ax = b,  Gx ≤ h,  lb ≤ x ≤ ub,
 
 in which absent constraints have no rows and absent bounds are ±inf. It returns x and
-multipliers with Px + q + Aᵀy + Gᵀz + z_box = 0, where z ≥ 0, and z_box is ≤ 0 at an
-active lb, ≥ 0 at an active ub. The harness verifies every claim independently.
+multipliers y, z and z_box with
+
+    Px + q + Aᵀy + Gᵀz + z_box = 0,   z ≥ 0,
+
+where z_box ≤ 0 at active lower bounds, z_box ≥ 0 at active upper bounds and z_box = 0
+otherwise. The harness verifies every answer independently.
 """
 
 from __future__ import annotations
@@ -31,9 +35,9 @@ from mortarbench.harness import (
 
 @dataclass(frozen=True)
 class Solver:
-    """Dense interior-point method: Mehrotra's predictor and corrector."""
+    """Dense interior-point method with Mehrotra's predictor-corrector steps."""
 
-    max_iter: int = 100  #: every field is an option: --option max_iter=50
+    max_iter: int = 100  #: each field is an option of the solver: --option max_iter=50
 
     def __post_init__(self) -> None:
         if self.max_iter < 1:
@@ -46,11 +50,11 @@ class Solver:
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP and return a function that solves it. Both are timed."""
+        """Convert the QP, and return a function that solves the QP. Both are timed."""
         P, A, G = (
             M if isinstance(M, np.ndarray) else M.toarray() for M in (qp.P, qp.A, qp.G)
         )
-        # Gx ≤ h and the finite bounds, as one system Cx ≤ d
+        # write Gx ≤ h and the finite bounds as one system Cx ≤ d
         up, low, eye = np.isfinite(qp.ub), np.isfinite(qp.lb), np.eye(qp.q.size)
         C = np.vstack([G, eye[up], -eye[low]])
         d = np.concatenate([qp.h, qp.ub[up], -qp.lb[low]])
@@ -67,7 +71,9 @@ class Solver:
                 z=z_rows,
                 z_box=z_box,
                 iterations=k,
-                message="" if status is Status.SOLVED else f"{k} iterations, no end",
+                message=""
+                if status is Status.SOLVED
+                else f"not converged after {k} iterations",
             )
 
         def solve() -> Solution:
@@ -85,19 +91,21 @@ class Solver:
 def iterates(
     P: Vector, q: Vector, A: Vector, b: Vector, C: Vector, d: Vector
 ) -> Iterator[tuple[Vector, Vector, Vector]]:
-    """Yield the iterates x, y, z for the QP with Ax = b and Cx + s = d, s ≥ 0.
+    """Yield the iterates x, y, z for the constraints Ax = b and Cx + s = d, s ≥ 0.
 
+    Here s are slack variables, and y and z the multipliers of the two constraints.
     Reference: J. Nocedal, S. J. Wright, Numerical Optimization (2006), algorithm 16.4.
     """
     p = d.size
     x, y = solve_kkt(P, A, C, np.ones(p), C.T @ d - q, b)
     gap = d - C @ x
-    # start far inside, relative to |gap|, so that the start is independent of units
+    # The starting point is far inside the feasible set relative to |gap|, so that it
+    # does not depend on units.
     s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)
     z = np.full(p, np.abs(q).max(initial=0.0) or 1.0)
 
     def newton(r_z: Vector) -> tuple[Vector, Vector, Vector, Vector]:
-        """Solve Newton's equations, the last of which is z ds + s dz = −r_z."""
+        """Return the Newton step dx, dy, ds, dz, for which z ds + s dz = −r_z."""
         r_x, r_y, r_s = P @ x + q + A.T @ y + C.T @ z, A @ x - b, C @ x + s - d
         dx, dy = solve_kkt(P, A, C, z / s, C.T @ ((r_z - z * r_s) / s) - r_x, -r_y)
         ds = -r_s - C @ dx
@@ -118,7 +126,7 @@ def iterates(
 def solve_kkt(
     P: Vector, A: Vector, C: Vector, weights: Vector, right: Vector, b: Vector
 ) -> tuple[Vector, Vector]:
-    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b, slightly regularised."""
+    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b, with regularisation."""
     m, n = A.shape
     K = np.block([[P + C.T @ (weights[:, None] * C), A.T], [A, np.zeros((m, m))]])
     size = np.abs(P).max(initial=0.0) or 1.0
@@ -128,7 +136,7 @@ def solve_kkt(
 
 
 def max_step(v: Vector, dv: Vector) -> float:
-    """Return the longest step, at most 100, that keeps v + step·dv ≥ 0."""
+    """Return the longest step with v + step·dv ≥ 0, or 100 if that is longer."""
     return float((-v[dv < 0] / dv[dv < 0]).min(initial=100.0))
 
 

@@ -1,8 +1,8 @@
-"""Extension of griffe that converts our docstrings to numpydoc for the reference.
+"""Extension of griffe that converts our docstrings to numpydoc for the API reference.
 
-We write ``tol : relative accuracy``; numpydoc has the type after the colon and the
-description below. Types are in the signature. Attributes are described by comments
-``#:`` beside or above them.
+Our docstrings describe an argument as ``tol : relative accuracy``, since its type is in
+the signature. In numpydoc, the type follows the colon, and the description is on the
+lines below. Attributes are described by comments ``#:`` beside or above them.
 """
 
 from __future__ import annotations
@@ -12,19 +12,19 @@ from typing import Any
 
 import griffe
 
-#: one or more arguments with their description, further lines indented
+#: names of one or more arguments, and their description with indented further lines
 _ENTRY = r"\w+(?:, \w+)* : .*\n(?: +.*\n)*"
 _ENTRIES = re.compile(rf"(?:\A|(?<=\n\n))(?:{_ENTRY})+(?=\n|\Z)")
-#: asterisk behind a letter (u*), which Markdown would take for emphasis
+#: asterisk after a letter, as in u*, which Markdown would interpret as emphasis
 _STAR = re.compile(r"(?<=\w)\*(?!\*)")
 _SECTION = re.compile(rf"(?<=\nParameters\n----------\n)(?:{_ENTRY})+")
 
 
 class Docstrings(griffe.Extension):
-    """Extension that rewrites docstrings of functions and adds those of attributes."""
+    """Extension that rewrites docstrings of functions and adds them to attributes."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Escape the asterisks of formulas."""
+        """Escape the asterisks of formulas in a docstring."""
         if obj.docstring is not None:
             obj.docstring.value = starred(obj.docstring.value)
 
@@ -37,7 +37,7 @@ class Docstrings(griffe.Extension):
         """Use the comment beside or above an attribute as its docstring."""
         if attr.docstring is None and attr.lineno is not None and attr.endlineno:
             sources = attr.parent.module.lines_collection  # type: ignore[union-attr]
-            if attr.filepath not in sources:  # in the stub of a compiled module
+            if attr.filepath not in sources:  # the stub of a compiled module
                 return
             if text := beside(
                 sources[attr.filepath], attr.lineno - 1, attr.endlineno - 1
@@ -46,14 +46,14 @@ class Docstrings(griffe.Extension):
 
 
 def starred(text: str) -> str:
-    """Escape asterisks behind letters, which Markdown would take for emphasis."""
+    """Escape asterisks after letters, which Markdown would interpret as emphasis."""
     parts = re.split(r"(`[^`]*`|^ {4,}.*$)", text, flags=re.MULTILINE)
     parts[::2] = [_STAR.sub(r"\\*", part) for part in parts[::2]]
     return "".join(parts)
 
 
 def as_numpydoc(text: str) -> str:
-    """Move descriptions of arguments below their names, into a section Parameters."""
+    """Convert the descriptions of arguments to a numpydoc section Parameters."""
     text += "\n"
 
     def entry(match: re.Match[str]) -> str:
@@ -72,7 +72,10 @@ def as_numpydoc(text: str) -> str:
 
 
 def beside(lines: list[str], first: int, last: int) -> str:
-    """Return the comment ``#:`` at the end of lines, or in those directly above."""
+    """Return the text of comments ``#:`` on lines, or else directly above these.
+
+    first, last : indices of the lines of an attribute
+    """
     comments = [c for line in lines[first : last + 1] if (c := _comment(line))]
     if not comments:
         above = first - 1

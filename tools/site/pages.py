@@ -1,8 +1,9 @@
-"""Hook of mkdocs for pages from other sources than docs/*.md, and for formulas.
+"""Hooks of mkdocs for pages from sources other than docs/*.md, and for formulas.
 
-README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; notebooks of
-docs/gallery are run and become pages; the help of each command is inserted into
-`commands.md`; formulas, LaTeX between dollars in the sources, become MathML.
+README, CONTRIBUTING and CHANGELOG become pages of the site. Notebooks in docs/gallery
+are executed and converted to pages. The help text of each command is inserted into
+`commands.md`. Formulas, which the sources contain as LaTeX between dollar signs, are
+converted to MathML.
 """
 
 from __future__ import annotations
@@ -28,20 +29,20 @@ PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
-}  #: file of the root → page of the site
+}  #: pages of the site by the name of the file in the root of the project
 #: formula in the output of pymdownx.arithmatex, displayed or inline
 FORMULA = re.compile(
     r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
 )
-#: asterisk of a formula, u*, that Markdown has taken for the begin of emphasis
+#: asterisk of a formula, as in u*, that Markdown has interpreted as start of emphasis
 SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
-HELP = "<!-- help of every command -->"  #: replaced by the help texts in commands.md
-#: one thread in every library, as in the processes of a run
+HELP = "<!-- help of every command -->"  #: placeholder in commands.md for help texts
+#: environment variables of notebooks and help texts: one thread, 80 columns
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages from files of the root and from notebooks."""
+    """Add pages for files in the root of the project and for notebooks."""
     from mkdocs.structure.files import File
 
     os.environ.update(ENVIRONMENT)
@@ -57,7 +58,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(
     markdown: str, *, page: Page, config: MkDocsConfig, files: Files
 ) -> str:
-    """Redirect links to files of the root and to notebooks; insert help texts."""
+    """Redirect links to files in the root and to notebooks, and insert help texts."""
     up = "../" * page.file.src_uri.count("/")
     for name, target in PAGES.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
@@ -69,12 +70,13 @@ def on_page_markdown(
 def on_page_content(
     content: str, *, page: Page, config: MkDocsConfig, files: Files
 ) -> str:
-    """Convert the formulas of a page.
+    """Convert the formulas of a page to MathML.
 
     Raises
     ------
     PluginError
-        If a formula cannot be converted, or Markdown has taken one for emphasis.
+        If a formula cannot be converted, or Markdown has interpreted an asterisk in a
+        formula as emphasis.
 
     """
     from mkdocs.exceptions import PluginError
@@ -86,12 +88,13 @@ def on_page_content(
 
 
 def typeset(content: str) -> str:
-    """Replace the formulas in HTML by MathML.
+    """Replace the formulas in HTML with MathML.
 
     Raises
     ------
     ValueError
-        If a formula cannot be converted, or Markdown has taken one for emphasis.
+        If a formula cannot be converted, or Markdown has interpreted an asterisk in a
+        formula as emphasis.
 
     """
     if swallowed := SWALLOWED.search(content):
@@ -105,7 +108,7 @@ def typeset(content: str) -> str:
 
 
 def from_root(text: str) -> str:
-    """Return the text of a file of the root, with links as in the folder docs/."""
+    """Adapt the links in a file from the root of the project to the folder docs/."""
     text = re.sub(r"\]\(docs/", "](", text)
     for name, page in PAGES.items():
         text = text.replace(f"]({name}", f"]({page}")
@@ -113,7 +116,7 @@ def from_root(text: str) -> str:
 
 
 def help_texts() -> str:
-    """Return the help of all commands, a section each."""
+    """Return the help texts of all commands, one section for each command."""
 
     def printed(*arguments: str) -> str:
         command = [sys.executable, "-m", "mortarbench", *arguments, "--help"]
@@ -126,7 +129,7 @@ def help_texts() -> str:
 
 
 def gallery_page(path: Path) -> dict[str, str | bytes]:
-    """Run a notebook in an empty folder; return its page and pictures by path."""
+    """Execute a notebook in an empty folder; return its page and pictures by path."""
     import nbformat
     from nbconvert import MarkdownExporter
     from nbconvert.preprocessors import ExecutePreprocessor

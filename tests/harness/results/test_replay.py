@@ -157,7 +157,7 @@ def test_another_qp_is_reported_and_exits_with_1(cli, stored):
     code, out, _ = cli("replay", "done", then.run_id)
 
     assert code == 1
-    assert "another QP" in out
+    assert "a different QP" in out
 
 
 def test_a_journal_without_digests_of_qps_is_not_a_problem(cli, stored):
