@@ -122,9 +122,9 @@ def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
 
     Let hₐ be the mean edge length of a block along direction a. The block may have
     most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
-    across its longest side: of the equal parts that this limit requires, one half lies
-    on each side of the cut. Boxes of cubic cells are cut as in `blocks`. With equal
-    numbers of cells along all directions, slender cells would result in slender
+    across its longest side: the limit requires several equal parts, and half of them
+    (rounded down) precede the cut. Boxes of cubic cells are cut as in `blocks`. With
+    equal numbers of cells along all directions, slender cells would result in slender
     subdomains: the condition number of PFP (see `problems.feti.spectrum`) is 439 with
     4 × 4 × 4 cells of 1 : 1 : 4 in beam-ring/Nr=4/Nh=2/depth=4.
 
