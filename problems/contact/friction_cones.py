@@ -1,7 +1,9 @@
 """Coulomb's law for contacts between many bodies, by sequences of convex problems.
 
-The unknowns are the contact forces r, in blocks (N, T₁[, T₂]) in friction cones K,
-‖r_T‖ ≤ μ r_N. The velocities are u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
+The unknowns are the contact forces r, with a normal and one or two tangential
+components per contact, in the product K of the friction cones ‖r_T‖ ≤ μ r_N, and
+multipliers λ of the equations Vᵀr = b. The relative velocities at the contacts are
+u = W r + Vλ + q. Coulomb's law is
 
     û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
 
@@ -16,11 +18,11 @@ its predecessor:
   ``cones``.
 
 If rigid bodies have more contacts than equations of motion, W is singular, and contact
-forces are not unique. The bounds of ``tresca`` then drift in the null space, and the
-loop does not converge for three stacked boxes. This loop therefore takes proximal
-steps: it adds ½δ‖r − r'‖² to the objective, where r' are the forces of the predecessor.
-The term vanishes as the loop converges. The loop ``cones`` takes proximal steps from
-the first problem without a solution on.
+forces are not unique. In this case the bounds of ``tresca`` drift in the null space of
+W, and the loop does not converge for three stacked boxes. The loop ``tresca`` therefore
+takes proximal steps: it adds ½δ‖r − r'‖² to the objective, where r' are the forces of
+the predecessor. The term vanishes as the loop converges. The loop ``cones`` takes
+proximal steps only after one of its problems has had no solution.
 """
 
 from __future__ import annotations
@@ -41,8 +43,9 @@ from mortarbench.harness.sets.discs import Discs
 from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
 
 LOOPS = ("cones", "tresca")
-#: largest asymmetry of W, relative to its largest entry, that counts as rounding. The
-#: change of the scaled natural map is about as large, far below the required 1e-6
+#: largest asymmetry of W, relative to its largest entry, that counts as rounding.
+#: Symmetrising W changes the scaled natural map by about as much, which is far below
+#: the required 1e-6
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9
@@ -59,12 +62,12 @@ ACTIVE = 1e-6  #: forces below this fraction of the largest count as zero
 
 @dataclass(frozen=True, eq=False)
 class FrictionalContact:
-    """Contacts with Coulomb friction: W, q, μ, and equations A r = b for the forces.
+    """Contacts with Coulomb friction; see the module docstring for the symbols.
 
     Raises
     ------
     InputError
-        If W is not symmetric, in which case the steps are not convex problems.
+        If W is not symmetric, so that the problems of the loops are not convex.
 
     """
 
@@ -123,7 +126,7 @@ class FrictionalContact:
         return Cones(np.arange(n).reshape(k, n // k), self.mu)
 
     def velocity(self, r: Vector, multipliers: Vector) -> Vector:
-        """Return u (n,) for forces r (n,) and multipliers λ (p,)."""
+        """Return the velocities u (n,) for forces r (n,) and multipliers λ (p,)."""
         u: Vector = self.W @ r + self.q + self.A.T @ multipliers
         return u
 
@@ -136,6 +139,8 @@ class FrictionalContact:
         self, r: Vector, multipliers: Vector, omega: float | None = None
     ) -> float:
         """Evaluate  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖,  zero at solutions.
+
+        Π is the projector onto the friction cones.
 
         Parameters
         ----------
@@ -197,13 +202,13 @@ class ConvexStep(NamedTuple):
 def coulomb_steps(
     contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
 ) -> list[ConvexStep]:
-    """Return convex problems of the sequence `loop`, at most `count`.
+    """Return the first convex problems of a sequence for Coulomb's law.
 
     Parameters
     ----------
-    loop : one of `LOOPS`
+    loop : name of the sequence, one of `LOOPS`
     solve : solves a convex problem; raises ArithmeticError if it has no solution
-    count : number of problems; 0 continues until convergence
+    count : largest number of problems; with 0, the sequence ends at convergence
 
     Raises
     ------
@@ -247,7 +252,7 @@ class _ProximalMethod:
         self._solve, self._delta = solve, PROXIMITY * contact.stiffness
 
     def solve(self, qp: QP, r: Vector) -> Solution:
-        """Solve `qp`; with proximal steps, its objective plus ½δ‖x − r‖²."""
+        """Solve `qp`; in a proximal step, ½δ‖x − r‖² is added to its objective."""
         if not self.is_proximal:
             try:
                 return self._solve(qp)

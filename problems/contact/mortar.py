@@ -19,12 +19,12 @@ node j
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
 −Φ_j ν on the master at x(ξ) + g n, along the same line. So the forces of a row are in
 equilibrium and have no moment, up to rounding, even on curved sides. (With n_j outside
-the integrals
-the moments are O(h²). A body supported by contact alone then rotates until a row far
-from the contact, at the end of an arc, balances the moments of the active rows.) Not
-normalising ν amounts to a weight of 1 − O(h²). The integrands of D are then
-polynomials, which the Gauss rule integrates exactly: D is independent of the position
-of the master's nodes, and a row of the dual basis acts on the slave along n_j.
+the integrals, the moments would be O(h²). A body supported by contact alone would then
+rotate until a row far from the contact, at the end of an arc, balances the moments of
+the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
+In return, the integrands of D are polynomials, which the Gauss rule integrates exactly:
+D is independent of the position of the master's nodes, and a row of the dual basis acts
+on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -78,8 +78,9 @@ from mortarbench.problems.fem.mesh import Nodes, dofs_of
 #: integration segments shorter than this, in ξ, are due to rounding of the projection
 #: and are dropped
 MIN_SEGMENT = 1e-8
-#: averaged normals of a straight side differ by at most this. Smaller components of
-#: ν − n_j count as zero, so that B is as sparse on straight sides as with one normal
+#: averaged normals of a straight side differ by at most this value. Smaller components
+#: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single
+#: normal
 NORMAL_ROUNDING = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -138,8 +139,8 @@ def mortar(
     slave, master : (s,), (v,) chains of nodes with their body on the left
     basis : multiplier basis, "dual" or "standard"
     reach : limits on the angle and distance of integration segments. Without a limit on
-        the angle, rays can graze a distant master. Because the dual basis is negative
-        in places, weighted gaps between separate bodies would then be negative
+        the angle, rays can graze a distant master. Weighted gaps between separate
+        bodies could then be negative, because the dual basis is negative in places
     tangential : add tangential rows for friction
 
     Raises

@@ -285,8 +285,8 @@ def _replicated_partition(
     )
     if len(set(ranks.comm.allgather(digest))) > 1:
         raise InputError(
-            "ranks have cut the bodies into different subdomains; expected the same "
-            "version of METIS on all nodes"
+            "the subdomains of the bodies differ between ranks; expected the same "
+            "version of METIS on all computers"
         )
     return ranks_of
 
