@@ -56,7 +56,7 @@ def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
 
 
 def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
-    """Raise an error for loads that neither supports nor contacts can balance.
+    """Check that supports and contacts together can balance the load on all bodies.
 
     B : (m, n) contact rows at u = 0
 
@@ -108,7 +108,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Raise an error for a load that friction with prescribed bounds cannot balance.
+    """Check that supports, contacts and friction within bounds can balance the load.
 
     A load can be balanced if there are forces λ_n ≥ 0 of the contact rows B and
     ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program

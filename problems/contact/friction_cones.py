@@ -167,13 +167,19 @@ class FrictionalContact:
         )
 
     def cone_step(self, slip: Vector) -> QP:
-        """Return the problem over friction cones with s = (slip (k,), 0)."""
+        """Return the problem of the loop `cones` with s = (slip, 0).
+
+        slip : (k,) μ‖u_T‖ of each contact
+        """
         q = self.q.copy()
         q[self.cones.index[:, 0]] += slip
         return self._qp(q, np.full(q.size, -np.inf), self.cones)
 
     def tresca_step(self, bound: Vector) -> QP:
-        """Return Tresca's problem, ‖r_T‖ ≤ bound (k,)."""
+        """Return the problem of the loop `tresca` with ‖r_T‖ ≤ bound.
+
+        bound : (k,) friction bound g of each contact
+        """
         lower, index = np.full(self.q.size, -np.inf), self.cones.index
         lower[index[:, 0]] = 0.0
         return self._qp(self.q, lower, Discs(index[:, 1:], bound))

@@ -134,7 +134,7 @@ class LinearisedProblem(Protocol):
         """Return the multipliers λ_n (m,) of the contact rows."""
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) and the normal forces (places,) of a solution."""
+        """Return u (w,) and the normal forces (places,) of all slave nodes."""
 
 
 P = TypeVar("P", bound=LinearisedProblem)
@@ -155,7 +155,7 @@ class LoadPath(Generic[P]):
     Raises
     ------
     ArithmeticError
-        If a reference solve is not accurate.
+        If a reference solution is not accurate enough.
     InputError
         If the fixed-point iteration for Coulomb's law does not converge, has fewer
         iterates than requested, or reaches bounds for which no equilibrium exists.

@@ -71,7 +71,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 class DecomposedLinearisation:
     """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
-    All ranks must call its methods together; each rank receives the same values.
+    All ranks must call its methods together; the results are equal on all ranks.
     """
 
     stage: Stage
@@ -100,13 +100,14 @@ class DecomposedLinearisation:
         return z[: self.sides.place.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) on the contact sides and the normal nodal forces (places,).
+        """Return u (w,) on the contact sides and the normal forces (places,).
 
-        Both are nondimensional.
+        The normal forces are those of all slave nodes. Displacements and forces are
+        nondimensional.
         """
         dual, sides = self.dual, self.sides
         solution = local_solution(dual.subdomains, dual.halo, s)
-        vars(self).pop("_qp", None)  # explicit blocks are large and no longer needed
+        vars(self).pop("_qp", None)  # free the explicit blocks, which are large
         forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
         return solution.at(sides.component), forces
 

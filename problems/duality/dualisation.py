@@ -83,7 +83,7 @@ def dualise(
     ----------
     primal : QP with P = K and no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
-    free : K⁺f (n,), if already computed
+    free : K⁺f (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
@@ -130,7 +130,7 @@ def dual_bounds(
     primal : QP whose equality rows are unit vectors with zero right-hand side
     clamped : K⁺ that is zero at the components these rows fix, with an orthonormal
         basis R of the rigid motions that are zero there
-    free : K⁺f (n,), if already computed
+    free : K⁺f (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """

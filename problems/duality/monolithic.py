@@ -88,7 +88,10 @@ class MonolithicLinearisation:
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (n,), valid on contact sides only, and normal forces (places,)."""
+        """Return u (n,), valid on contact sides only, and normal forces (places,).
+
+        The normal forces are those of all slave nodes.
+        """
         places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces

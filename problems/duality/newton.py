@@ -17,11 +17,11 @@ u and not to an increment:
 allow, which is tested by a Cholesky factorisation. Otherwise negative eigenvalues of
 the tangents of single cells are raised (`problems.fem.finite_strain.convex_tangent`).
 The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
-previous iteration ("geometric" contact stiffness), may be added to the tangent; without
-them convergence is linear if both sides deform. The term ρB_DᵀB_D is added to K. It
-vanishes where u = 0 on the supports and makes K definite on rotations, on which the
-tangent of a compressed body is indefinite rather than singular. The kernel that remains
-consists exactly of the translations that the supports allow.
+previous iteration ("geometric" contact stiffness), may be added to the tangent. Without
+these derivatives, convergence is linear if both sides deform. The term ρB_DᵀB_D is
+added to K. This term vanishes where u = 0 on the supports and makes K definite on
+rotations, on which the tangent of a compressed body is indefinite rather than singular.
+The remaining kernel of K consists of the translations that the supports allow.
 
 *Line search*: with the solution u of (1), d = u − u^j and a weight w above ‖λ‖∞, d is a
 descent direction of the exact penalty function (Nocedal and Wright, (18.27))
@@ -117,7 +117,8 @@ class Gaps(NamedTuple):
     linearise: Linearise
     curvature: Curvature | None = None  #: None if contact stiffness is neglected
     #: returns, for a displacement (n,) in m and a mask (places,) of slave nodes, gaps
-    #: with these nodes kept on their closest segments; None if there are no segments
+    #: with these nodes kept on their closest segments; None if the method of contact
+    #: has no segments, or if nodes already keep their segments
     keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
@@ -423,8 +424,8 @@ class NewtonPath:
 
         The tangent is positive definite on the motions that the supports allow, except
         for translations. If the exact tangent is indefinite, negative eigenvalues of
-        the contact stiffness are removed. If this does not suffice, negative
-        eigenvalues of cell tangents are removed as well.
+        the contact stiffness are removed first, and those of cell tangents only if this
+        does not suffice.
         """
         supports = self.bodies.B_D
         factorised: list[tuple[csc_array, GeneralisedInverse]] = []
@@ -562,8 +563,8 @@ def _merit(at: Configuration, weight: float) -> float:
 def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
     """Return an orthonormal basis (n, r) of the rigid motions that the supports allow.
 
-    The rotations are those of the undeformed bodies; translations are rigid motions of
-    the deformed bodies, too.
+    Rotations refer to the undeformed bodies; translations do not depend on the
+    deformation.
     """
     rigid = bodies.rigid
     fixed = rigid[bodies.B_D.indices]

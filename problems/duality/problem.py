@@ -77,7 +77,7 @@ class Shape(Protocol):
     def sides(self) -> Mapping[str, Nodes]:
         """Contact sides by name: chains of nodes in the plane, faces in space.
 
-        In the plane, evaluating them does not generate the mesh.
+        In the plane, this property does not generate the mesh.
         """
 
     def layout(self, size: int) -> Subdivision:
@@ -262,7 +262,14 @@ class ElasticBodies:
 
     @cached_property
     def clamped(self) -> GeneralisedInverse:
-        """K⁺ with zeros at fixed components; InputError if a rigid motion is free."""
+        """K⁺ with zeros at fixed components.
+
+        Raises
+        ------
+        InputError
+            If the supports allow a rigid motion of some body.
+
+        """
         return factorise_clamped(self.assembled)
 
     @cached_property
@@ -345,8 +352,8 @@ class ContactProblem:
 
     bodies: ElasticBodies
     stages: tuple[Stage, ...]
-    #: returns the function that maps a displacement in m to contact rows, for bodies
-    #: (or their contact sides) and the friction laws of their contact pairs
+    #: given bodies (or their contact sides) and the friction laws of their contact
+    #: pairs, returns the function that maps a displacement in m to contact rows
     linearise: Callable[
         [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
     ]

@@ -12,7 +12,7 @@ contributions to
 No rank stores an array of global size, only the columns of B and the rows of vectors
 that its subdomains touch. Graph partitioning (METIS) distributes the subdomains so
 that the work is balanced and few rows are shared. If a class occurs on several ranks,
-one of them computes its explicit blocks and sends them to the others.
+one of these ranks computes the explicit blocks and sends them to the other ranks.
 """
 
 from __future__ import annotations
@@ -160,11 +160,17 @@ def balanced_partition(
     Parameters
     ----------
     graph : (S, S) number of rows shared by each pair of subdomains
+    work, size : (S,) work and size of each subdomain, each in an arbitrary unit
     cluster : (S,) cluster of each subdomain; clusters are not split between ranks
 
     Returns
     -------
     rank of each subdomain, (S,)
+
+    Raises
+    ------
+    InputError
+        If there are fewer subdomains (or clusters) than ranks.
 
     """
     name = "subdomain"
@@ -327,8 +333,9 @@ def build_halo(
 class RowsOverRanks:
     """Local rows of B for the products Bᵀx and By with distributed vectors.
 
-    Messages are posted first and completed after the products with owned rows, so that
-    communication and computation overlap.
+    M is the number of columns of the local rows. Messages are posted first and
+    completed after the products with owned rows, so that communication and computation
+    overlap.
     """
 
     halo: Halo
@@ -377,7 +384,7 @@ class RankOperator:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of the owned slice, (o, o)."""
+        """Shape (o, o) of the operator on owned slices."""
         return (self.halo.owned.size,) * 2
 
     def __call__(self, x: Dense) -> DistributedVector:
@@ -409,7 +416,7 @@ class RankOperator:
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
     def average_forces(self) -> DistributedColumns:
-        """Return a basis, as rows (c, o), of the multipliers with Fλ = 0.
+        """Return a basis of the multipliers with Fλ = 0 as rows (c, o).
 
         These multipliers satisfy Bᵀλ = Cᵀμ for some μ, with C of `Clusters`: the forces
         Bᵀλ do no work on displacements v with Cv = 0. Without clusters, c = 0.
@@ -580,7 +587,7 @@ class Assignment(NamedTuple):
     work: int  #: estimated work, in one arbitrary unit for all classes
     ranks: list[int]  #: ranks with subdomains of the class
     factor_rank: int  #: rank that factorises the stiffness matrix
-    block_rank: int  #: rank that computes the blocks and sends them to the others
+    block_rank: int  #: rank that computes the blocks and sends them to other ranks
 
 
 def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
@@ -617,8 +624,8 @@ def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
     """Return the number of blocks that a rank computes before factors are exchanged.
 
     Such blocks only require factors of this rank, and are computed while slower ranks
-    are still factorising. If no factors are exchanged, the rank computes all its blocks
-    before.
+    are still factorising. If no factors are exchanged, the result is the number of all
+    blocks of the rank.
     """
     factors: dict[int, float] = {}
     for task in tasks.values():

@@ -175,9 +175,10 @@ def distributed_qp(
 ) -> DistributedQP:
     """Return the distributed dual QP; all ranks must call this function together.
 
-    If the QP depends on solutions of previous problems, its data vary by rounding with
-    the number of ranks. In this case, the digest of the QP is computed from the first
-    of these problems and their number, so that it is the same for any number of ranks.
+    If the QP depends on solutions of previous problems, runs with different numbers of
+    ranks have different rounding errors in its data. In this case, the digest of the QP
+    is computed from the first of these problems and their number, so that it is
+    independent of the number of ranks.
 
     Parameters
     ----------

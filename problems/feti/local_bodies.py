@@ -36,12 +36,12 @@ from mortarbench.problems.feti.substructures import LocalProblems
 class LocalSolution:
     """Local part of a displacement, with contact multipliers replicated on all ranks.
 
-    All ranks must call its methods together; each rank receives the same values.
+    All ranks must call its methods together; the results are equal on all ranks.
     """
 
     subdomains: LocalSubdomains
     bodies: LocalBodies
-    u: Vector  #: (n,) at `bodies.components`; equal on all ranks with a component
+    u: Vector  #: (n,) at `bodies.components`; equal on ranks that store a component
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
@@ -134,9 +134,10 @@ def evaluation(
 def certifier(
     local: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
-    """Return a function that bounds the error of a displacement on a single process.
+    """Return a function that certifies solutions on a single process.
 
-    The arguments of this function are the displacement and the contact multipliers.
+    Its arguments are a displacement and contact multipliers; the certificate bounds the
+    error of the displacement.
 
     K : (n, n) stiffness matrix of the undivided bodies
     """

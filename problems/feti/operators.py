@@ -89,7 +89,7 @@ COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """Subdomains of one class, with the components that B touches in any of them."""
+    """Subdomains of one class, with the union of the components that B touches."""
 
     template: SubdomainClass
     explicit: bool  #: True if (K⁺)_bb is computed in advance
@@ -141,7 +141,7 @@ class Packed:
         within = B.indices - (np.cumsum(sizes) - sizes)[group]
         component, subdomain = np.divmod(within, np.array(members)[group])
 
-        # all pairs of entries in the same row, then those within one subdomain
+        # first all pairs of entries in the same row, then only those in one subdomain
         entries = np.diff(B.indptr)
         row = np.repeat(np.arange(entries.size), entries)
         left = np.repeat(np.arange(B.nnz), entries[row])
@@ -180,7 +180,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
 
 
 def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """Return, for each class, the components that B touches in any of its members."""
+    """Return, per class, the components that B touches in any of its subdomains."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)
@@ -204,7 +204,8 @@ class DualOperator:
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
-    #: yields (K⁺)_bb and S_bb of explicit groups with their positions, in any order
+    #: yields (K⁺)_bb and S_bb of explicit groups in any order, each with the index of
+    #: its group in the argument
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
@@ -613,7 +614,8 @@ def block_pseudoinverse(M: csr_array) -> csr_array:
 def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
     """Return a mask of the classes with explicit blocks.
 
-    These are the classes with the smallest blocks, as many as `MAX_EXPLICIT_MIB` allow.
+    These are the classes with the smallest blocks, as many as fit into
+    `MAX_EXPLICIT_MIB`.
     """
     sizes = np.array([part.size for part in touched_components(B, domains)])
     order = np.argsort(sizes, kind="stable")
@@ -625,7 +627,7 @@ def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
 
 
 def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
-    """Return the memory (bytes) for both blocks of each class, which are stored once.
+    """Return the memory (bytes) for the blocks (K⁺)_bb and S_bb of each class.
 
     sizes : (classes,) number of components of the blocks
     """

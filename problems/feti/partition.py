@@ -124,7 +124,7 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    from pymetis import CSRAdjacency, Options, part_graph  # late: few cases need it
+    from pymetis import CSRAdjacency, Options, part_graph  # here: few cases need it
 
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
     # k-way partitions are better, but may contain empty parts if parts have few cells

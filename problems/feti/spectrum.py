@@ -138,7 +138,7 @@ def spectra_over_ranks(
     """Compute the extreme eigenvalues of F, once for each preconditioner.
 
     F acts on the multipliers of supports and gluing. All ranks must call this function
-    together; each receives the same spectra.
+    together; the results are equal on all ranks.
 
     Parameters
     ----------

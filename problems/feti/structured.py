@@ -137,9 +137,11 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return the first column and row of nodes, and the numbers of both, per block.
+        """Return the first column, first row, number of columns and number of rows.
 
-        block : (k,) numbers of blocks; each of the four results is (k,)
+        Columns and rows are those of the nodes of each block; each result is (k,).
+
+        block : (k,) numbers of blocks
         """
         at = Places(*(x[block] for x in self.block))
         first, last = (

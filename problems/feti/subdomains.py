@@ -91,7 +91,7 @@ class Contact(NamedTuple):
     """Global contact rows followed by friction rows, replicated on every rank."""
 
     rows: csr_array  #: (m_I, n) in components of the undivided bodies
-    c: Vector  #: (m_I,)
+    c: Vector  #: (m_I,) right-hand side
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
 
@@ -169,8 +169,9 @@ class DecomposedProblem:
     def contact_scale(self) -> Vector:
         """Scale √E/‖B_i‖ of each contact row (m,), with E of the softest body touched.
 
-        The scales of all rows of a tangential vector are equal in exact arithmetic and
-        are set to that of its first row.
+        B_i is the row on the torn unknowns before scaling. The scales of all rows of a
+        tangential vector are equal in exact arithmetic and are set to that of its first
+        row.
         """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
@@ -362,7 +363,7 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # `classify` allows 2
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # more than in `classify`
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         candidates = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -518,7 +519,7 @@ class LocalSubdomains:
         """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
         copy = replace(self, problem=replace(self.problem, contact=contact))
-        # no cached property depends on the bound
+        # cached properties remain valid, because none depends on the bound
         vars(copy).update({**vars(self), "problem": copy.problem})
         return copy
 
@@ -538,12 +539,12 @@ class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
 
     number: Nodes  #: (t,) global numbers, ascending
-    B: csr_array  #: (t, N_p)
+    B: csr_array  #: (t, N_p) in local torn unknowns
     #: (t,) number of the first row of the tangential vector that contains the row, or
     #: of the row itself; all rows of such a group have the same owner
     group: Nodes
     reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
-    c: Vector  #: (t,)
+    c: Vector  #: (t,) right-hand side
     equalities: int  #: number of equality rows on all ranks
     total: int  #: number of rows on all ranks
 
@@ -844,6 +845,6 @@ def _equality_count(problem: DecomposedProblem) -> int:
 
 
 def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
-    """Return all subdomains as local subdomains of this process."""
+    """Return all subdomains as the local subdomains of a single process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
     return LocalSubdomains(problem, single_process(), every)
