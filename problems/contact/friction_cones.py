@@ -83,8 +83,8 @@ class FrictionalContact:
         asymmetry = abs(self.W - self.W.T).max() / (largest or 1.0)
         if asymmetry > MAX_ASYMMETRY:
             raise InputError(
-                f"W is unsymmetric by {asymmetry:.2g} of its largest entry, so that no "
-                "step is a convex problem; expected a symmetric W"
+                f"W is not symmetric: the largest entry of W − Wᵀ is {asymmetry:.2g} "
+                "of the largest entry of W; expected a symmetric W"
             )
         object.__setattr__(self, "W", csc_array((self.W + self.W.T) / 2))
         if self.A is None:
@@ -95,9 +95,9 @@ class FrictionalContact:
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
-                f"W has the negative eigenvalue {least:.2g}, relative to its largest "
-                f"{least / self.stiffness:.1g}, so that no step is a convex problem; "
-                "expected a positive semidefinite W"
+                f"W has the negative eigenvalue {least:.2g}, which is "
+                f"{least / self.stiffness:.1g} times the largest one; expected a positive "
+                "semidefinite W"
             )
 
     @cached_property
@@ -242,7 +242,7 @@ def coulomb_steps(
             break
         r, qp = s.x, _successor(contact, loop, s)
     raise InputError(
-        f"Coulomb's law does not converge by loop={loop}: after {len(steps)} convex "
+        f"loop={loop} does not converge to Coulomb's law: after {len(steps)} convex "
         f"problems the scaled natural map is {errors[-1]:.1e}, and was at best "
         f"{min(errors):.1e}; expected another loop, or a smaller mu"
     )

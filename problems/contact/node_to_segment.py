@@ -84,7 +84,8 @@ def node_to_segment(
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    The result has one contact row per slave node; see the module for B, c and T.
+    The result has one contact row per slave node. B, c and T are defined in the module
+    docstring.
 
     Parameters
     ----------

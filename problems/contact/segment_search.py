@@ -31,7 +31,7 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
-ROOTS = 16  #: largest number of sub-chains on the top level; further levels do not pay
+ROOTS = 16  #: largest number of sub-chains on the top level; smaller values are slower
 #: relative rounding of distances; without it, equally close segments could rule each
 #: other out
 ROUNDING = 1e-12

@@ -53,7 +53,7 @@ def continue_slip(end: State) -> State:
 
 
 def restart_slip(end: State) -> State:
-    """Return the final state of the preceding stage as the new slip origin."""
+    """Return the final state of the preceding stage, with the slip origin at its u."""
     return end._replace(slip_origin=end.u)
 
 

@@ -495,9 +495,9 @@ class NewtonPath:
             return str(e)
         if self.gaps.curvature is not None and not self._is_supported:
             return (
-                "contact_stiffness=geometric where contact alone holds a body is not "
-                "built: its translations change the contact forces; expected "
-                "contact_stiffness=none, or supports that hold every body"
+                "contact_stiffness=geometric is not built for bodies supported by "
+                "contact alone, because their translations change the contact forces; "
+                "expected contact_stiffness=none, or supports that fix every body"
             )
         return ""
 

@@ -61,7 +61,7 @@ def graph_partition(
     if not counts.size <= parts <= max(counts.size, len(cells) // 2):
         raise InputError(
             f"parts={parts} for {counts.size} bodies with {len(cells)} cells; expected "
-            f"{counts.size} to {len(cells) // 2}, or 0 for one piece per body"
+            f"{counts.size} to {len(cells) // 2}, or 0 for undivided bodies"
         )
     label, first = np.empty(len(cells), dtype=np.int64), 0
     for b, of_body in enumerate(_parts_by_body(counts, parts)):
@@ -120,7 +120,7 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
     if connected_components(graph)[0] > 1:
         raise InputError(
             "the cells of a body are not all connected by edges (faces in space); "
-            "expected a body for each of its pieces"
+            "expected each connected piece to be a body of its own"
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)

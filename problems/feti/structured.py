@@ -294,7 +294,7 @@ class Layout:
         return np.concatenate(lengths)
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Count, for each node (k,), the preceding nodes with as many copies."""
+        """Count, for each node, the preceding nodes of equal multiplicity, (k,)."""
         columns, rows, at = self._columns, self._rows, self.places(node)
         column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
         m = columns.multiplicity[column] * rows.multiplicity[row]
@@ -364,7 +364,7 @@ class Layout:
 
 
 def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean lengths of adjacent edges along row and column of each node.
+    """Return, for each node, the mean lengths of its edges along its row and column.
 
     The result is (l·k, 2).
 
