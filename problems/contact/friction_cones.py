@@ -3,7 +3,8 @@
 The unknowns are the contact forces r, with a normal and one or two tangential
 components per contact, in the product K of the friction cones ‖r_T‖ ≤ μ r_N, and
 multipliers λ of the equations Vᵀr = b. The relative velocities at the contacts are
-u = W r + Vλ + q. Coulomb's law is
+u = W r + Vλ + q, with a positive semidefinite matrix W (Delassus operator) and the
+velocities q in the absence of forces. Coulomb's law is
 
     û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
 
@@ -18,11 +19,11 @@ its predecessor:
   ``cones``.
 
 If rigid bodies have more contacts than equations of motion, W is singular, and contact
-forces are not unique. In this case the bounds of ``tresca`` drift in the null space of
-W, and the loop does not converge for three stacked boxes. The loop ``tresca`` therefore
-takes proximal steps: it adds ½δ‖r − r'‖² to the objective, where r' are the forces of
-the predecessor. The term vanishes as the loop converges. The loop ``cones`` takes
-proximal steps only after one of its problems has had no solution.
+forces are not unique. In this case the bounds of ``tresca`` would drift in the null
+space of W, and the loop would not converge for three stacked boxes, for instance. The
+loop ``tresca`` therefore takes proximal steps: it adds ½δ‖r − r'‖² to the objective,
+where r' are the forces of the predecessor. The term vanishes as the loop converges. The
+loop ``cones`` takes proximal steps only after one of its problems has had no solution.
 """
 
 from __future__ import annotations
@@ -95,9 +96,9 @@ class FrictionalContact:
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
-                f"W has the negative eigenvalue {least:.2g}, which is "
-                f"{least / self.stiffness:.1g} times the largest one; expected a positive "
-                "semidefinite W"
+                f"W has the negative eigenvalue {least:.2g}, "
+                f"{least / self.stiffness:.1g} times the largest one; expected a "
+                "positive semidefinite W"
             )
 
     @cached_property

@@ -1,9 +1,9 @@
 """Extreme eigenvalues of F on the null space of the equalities, with error bounds.
 
-Let Gλ = Rᵀf be the equalities of the dual, G = RᵀBᵀ, and let P be the orthogonal
-projector onto ker G ∩ range B. If averages join subdomains into clusters, F is singular
-on this space, and P projects onto the orthogonal complement of ker F in it. The spectra
-are those of
+Let G = RᵀBᵀ be the matrix of the equalities of the dual, and P the orthogonal projector
+onto ker G ∩ range B. If averages join subdomains into clusters, F is singular on this
+subspace, and P projects onto the part of the subspace that is orthogonal to ker F. The
+spectra are those of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,

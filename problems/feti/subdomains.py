@@ -5,8 +5,8 @@ loads, and the rows of B with entries at their nodes (the rows that *touch* them
 single process assembles all subdomains. Global numbers are determined by the
 subdivision (`problems.feti.subdivision`), which is replicated on all ranks: tables as
 long as the sides of structured grids, or a list of the nodes on interfaces. In
-addition, each rank stores a few numbers for every subdomain, local or not, as many as
-the coarse problem has unknowns, up to a factor.
+addition, each rank stores a few numbers for every subdomain of every rank; these data
+are of about the same size as a vector of the coarse problem.
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
 and Kučera 2006). Every copy of a fixed component has a support row. The m copies
@@ -17,8 +17,8 @@ v_1 … v_m of a free component are glued by one of
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
 Contact rows act on the average of the copies, which are all equal at the solution.
-Therefore a contact condition at a node of several subdomains is a single row, which is
-orthogonal to the gluing rows.
+Therefore a contact condition at a node of several subdomains is a single row. This row
+is orthogonal to the gluing rows.
 
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
