@@ -76,7 +76,7 @@ class FrictionalContact:
     q: Vector  #: (n,) velocity in the absence of contact forces
     mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
     A: Any = None  #: (p, n) = Vᵀ
-    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,)
+    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,) right-hand side
 
     def __post_init__(self) -> None:
         """Symmetrise W up to rounding."""

@@ -105,7 +105,7 @@ class Overlaps(NamedTuple):
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 2) both ends, as ξ on the slave segment, ascending
+    xi: NDArray[np.float64]  #: (p, 2) coordinates ξ of both ends, ascending
 
 
 class GaussPoints(NamedTuple):
@@ -113,11 +113,11 @@ class GaussPoints(NamedTuple):
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 3) on the slave segment, in [−1, 1]
-    beta: NDArray[np.float64]  #: (p, 3) on the master segment, in [0, 1]
+    xi: NDArray[np.float64]  #: (p, 3) coordinate on the slave segment, in [−1, 1]
+    beta: NDArray[np.float64]  #: (p, 3) coordinate on the master segment, in [0, 1]
     field: NDArray[np.float64]  #: (p, 3, 2) ν(ξ), |ν| ≤ 1
-    gap: NDArray[np.float64]  #: (p, 3) m
-    weight: NDArray[np.float64]  #: (p, 3) m
+    gap: NDArray[np.float64]  #: (p, 3) gap g(ξ), m
+    weight: NDArray[np.float64]  #: (p, 3) quadrature weights, m
 
 
 def mortar(
@@ -166,7 +166,7 @@ def mortar(
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
-    """Integrate D, M, the weighted gaps and the covered lengths."""
+    """Compute D, M, weighted gaps and covered lengths by Gauss quadrature."""
     gauss = cast_rays(slave, master, overlaps(slave, master), reach)
     N = _shape(gauss.xi)
     phi = _dual(gauss) if basis == "dual" else N

@@ -62,7 +62,7 @@ class ContactRows(NamedTuple):
     row: Nodes  #: (k,) contact row of each tangential row
     #: (m_I,) length ∫N_j of the slave side assigned to the row, m; area in space, m²
     share: Vector
-    place: Nodes  #: (m_I,) position of the row's node in the slave chain
+    place: Nodes  #: (m_I,) index of the slave node of each row in the slave chain
 
 
 class ClosestPoints(NamedTuple):

@@ -56,8 +56,8 @@ class RigidPlane:
 class RigidSphere:
     """A ball, or a disc in the plane."""
 
-    centre: tuple[float, ...]  #: m
-    radius: float  #: m
+    centre: tuple[float, ...]  #: position of the centre, m
+    radius: float  #: radius, m
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -70,7 +70,7 @@ class RigidCylinder:
 
     point: tuple[float, ...]  #: a point on the axis, m
     axis: tuple[float, ...]  #: unit vector along the axis
-    radius: float  #: m
+    radius: float  #: radius, m
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""

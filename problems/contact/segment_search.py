@@ -63,8 +63,8 @@ class Reach:
 class Chords(NamedTuple):
     """One level of the tree: sub-chains of equally many segments, in chain order."""
 
-    start: Points  #: (k, 2)
-    edge: Points  #: (k, 2) from start to end
+    start: Points  #: (k, 2) position of the first node, m
+    edge: Points  #: (k, 2) vector from the first to the last node, m
     inverse: Vector  #: (k,) 1/|edge|², 0 where a sub-chain closes on itself
     deviation: Vector  #: (k,) δ, m
 
@@ -77,8 +77,8 @@ Criterion = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 class Nearest(NamedTuple):
     """Closest points on a chain; segments are numbered as in its `Surface`."""
 
-    segment: Nodes  #: (s,)
-    xi: Vector  #: (s,) coordinate on the segment, from 0 at its first node to 1
+    segment: Nodes  #: (s,) number of the segment with the closest point
+    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
 
 
 def nearest(x: Points, line: Surface) -> Nearest:

@@ -35,7 +35,7 @@ class Forces(NamedTuple):
     """Non-dimensional nodal forces at some components; zero at all others."""
 
     component: Nodes  #: (k,) distinct components
-    value: Vector  #: (k,)
+    value: Vector  #: (k,) force at each component
 
 
 class State(NamedTuple):

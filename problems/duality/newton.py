@@ -150,10 +150,10 @@ class Configuration(NamedTuple):
 
     u: Vector
     rows: ContactRows
-    gap: Vector  #: (m,) nondimensional
+    gap: Vector  #: (m,) gaps of the contact rows, nondimensional
     cells: EnergyDerivatives
-    energy: float  #: Π
-    r: Vector  #: (n,) Π'
+    energy: float  #: Π(u), nondimensional
+    r: Vector  #: (n,) gradient Π'(u)
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """The operator F of decomposed bodies, applied to arrays (m,) or (m, k)."""
 
-    B: csr_array  #: (m, N)
+    B: csr_array  #: (m, N) rows on all torn unknowns
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
@@ -364,7 +364,7 @@ class _Joints:
     """
 
     groups: tuple[Group, ...]
-    columns: list[Dense]  #: (n_g, p_g) for each group
+    columns: list[Dense]  #: [(K⁺Φ)_b, R_b] (n_g, p_g) of each group
     #: (k, p) combinations for the unknowns (μ_1, α_1, μ_2, α_2, …) of clusters; columns
     #: are packed like components
     combine: csr_array
@@ -522,7 +522,7 @@ def _implicit(group: Group) -> tuple[Any, Any]:
 
 
 class _Part(NamedTuple):
-    """The block M_bb of a matrix M (n, n) that is available only as a product."""
+    """The block M_bb of a matrix M (n, n), given by a function that multiplies by M."""
 
     n: int
     b: Nodes

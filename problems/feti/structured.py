@@ -38,8 +38,8 @@ class Places(NamedTuple):
     """Positions of nodes, or of blocks, in the grids."""
 
     body: Integers  #: (k,) number of the grid
-    column: Integers  #: (k,) i
-    row: Integers  #: (k,) j
+    column: Integers  #: (k,) column i
+    row: Integers  #: (k,) row j
 
 
 @dataclass(frozen=True, eq=False)

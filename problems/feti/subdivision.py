@@ -119,9 +119,9 @@ class ListedSubdivision:
     `holder` and `before` accept listed nodes only.
     """
 
-    nodes: int
-    body: Integers  #: (S,)
-    sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
+    nodes: int  #: number of nodes of all bodies
+    body: Integers  #: (S,) body of each subdomain
+    sizes: NDArray[np.int64]  #: (S,) number of nodes of each subdomain
     node: Nodes  #: (k,) listed nodes, ascending
     #: (k + 1,) index of the first holder of each node, followed by l
     start: NDArray[np.int64]

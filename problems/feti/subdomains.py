@@ -192,7 +192,7 @@ class Entries(NamedTuple):
 
     row: NDArray[np.int64]  #: (e,) global rows
     column: NDArray[np.int64]  #: (e,) local torn unknowns
-    value: Vector  #: (e,)
+    value: Vector  #: (e,) values of the entries
     reached: NDArray[np.int64]  #: (k, 2) pairs of a row and a rank that touches it
 
 

@@ -27,9 +27,9 @@ CONGRUENCE_TOL = 1e-11
 class SubdomainMesh(NamedTuple):
     """Mesh of one subdomain, with nodes 0 … n_k − 1."""
 
-    points: NDArray[np.float64]  #: (n_k, dim)
-    cells: Nodes  #: (E_k, corners)
-    material: NDArray[np.int64]  #: (E_k,)
+    points: NDArray[np.float64]  #: (n_k, dim) positions of the nodes
+    cells: Nodes  #: (E_k, corners) nodes of each cell
+    material: NDArray[np.int64]  #: (E_k,) material of each cell
 
 
 def blocks(
