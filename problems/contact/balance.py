@@ -56,14 +56,14 @@ def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
 
 
 def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
-    """Raise an error for loads that neither supports nor contacts can balance.
+    """Check that supports and contacts together can balance the load on all bodies.
 
     B : (m, n) contact rows at u = 0
 
     Raises
     ------
     InputError
-        If the load can move a body. The message states the body, and the direction or
+        If the load can move a body. The message names the body, and the direction or
         the centre of rotation of its motion.
 
     """
@@ -108,7 +108,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Raise an error for a load that friction with prescribed bounds cannot balance.
+    """Check that supports, contacts and friction within bounds can balance the load.
 
     A load can be balanced if there are forces λ_n ≥ 0 of the contact rows B and
     ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
@@ -223,7 +223,7 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     A = (rows / np.linalg.norm(rows, axis=1)[:, None]).T
     try:
         forces, _ = nnls(A, load, maxiter=100 * A.shape[1])
-    except RuntimeError:  # the iteration limit does not prove an imbalance: accept
+    except RuntimeError:  # reaching the iteration limit does not prove an imbalance
         return np.zeros_like(load)
     return np.asarray(load - A @ forces)
 
@@ -231,8 +231,8 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
 def _imbalance_message(moving: list[_BodyMotion], size: float, held: set[str]) -> str:
     """Return the message about an unbalanced force or moment.
 
-    held : names of bodies with a support; of several that move together, the message
-        names those without
+    held : names of the bodies with a support; if several bodies move together, the
+        message lists those without a support
     """
     names = [body.name for body in moving]
     its = "its" if len(names) == 1 else "their"

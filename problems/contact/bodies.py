@@ -71,11 +71,11 @@ class ContactSides:
     """Contact sides of bodies, without the interior of the bodies."""
 
     mesh: Mesh  #: nodes of the sides, m; without cells
-    body_of_node: NDArray[np.int64]  #: (N,)
+    body_of_node: NDArray[np.int64]  #: (N,) body of each node
     names: tuple[str, ...]  #: names of all bodies
     pairs: tuple[ContactPair, ...]
-    length: float  #: l, unit of length of `Bodies`, m
-    force: float  #: F₀, unit of force of `Bodies`, N/m; N in space
+    length: float  #: l, unit of length of the QPs, m
+    force: float  #: F₀, unit of force of the QPs, N/m; N in space
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,7 +105,7 @@ class UnassembledBodies:
 
     def __post_init__(self) -> None:
         if (np.diff(self.body_of_node) < 0).any():
-            raise ValueError("nodes must be numbered one body after another")
+            raise ValueError("nodes must be numbered in the order of their bodies")
 
     @property
     def body_of_node(self) -> NDArray[np.int64]:
@@ -133,12 +133,12 @@ class UnassembledBodies:
 
     @property
     def mesh_size(self) -> float:
-        """Mean distance between neighbouring nodes of the slave sides, over `length`.
+        """Mean distance of consecutive nodes of the slave sides, divided by `length`.
 
-        Without contact pairs, the mean is that over the whole boundary.
+        Without contact pairs, the mean is taken over the whole boundary.
         """
         mesh, chains = self.mesh, [pair.slave for pair in self.pairs]
-        if not chains or mesh.dim > 2:  # around each facet
+        if not chains or mesh.dim > 2:  # consecutive nodes of each facet
             chains = chains or [boundary_facets(mesh.cells, mesh.dim)]
             chains = [facet for facets in chains for facet in facets]
         sides = [mesh.points[chain] for chain in chains]
@@ -223,7 +223,7 @@ def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
 def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     """Factorise K with all rigid modes as kernel, for duals with support rows in B.
 
-    condense : compute (K⁺)_cc once, on the components c with entries in B; otherwise,
+    condense : compute (K⁺)_cc once, on the components c with entries in B. If False,
         as in the paper, BK⁺Bᵀ of eq. (3) requires one solve per row of B in every load
         step
     """
@@ -245,7 +245,7 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
 
     """
     prescribed = bodies.B_D.indices
-    # the factorisation may not detect this: rounding can make a singular K regular
+    # a factorisation may not detect a singular K, because rounding can make it regular
     if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
             "the supports allow a rigid motion of some body, so dual-bounds does not "

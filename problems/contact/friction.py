@@ -33,7 +33,7 @@ from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 
-#: largest residual ‖g − mu·λ_n‖/‖g‖ of a converged fixed-point iteration
+#: residual ‖g − mu·λ_n‖/‖g‖ at which the fixed-point iteration counts as converged
 FIXED_POINT_TOLERANCE = 1e-10
 MAX_ITERATES = 1000  #: largest number of Tresca problems per fixed-point iteration
 #: the iteration is abandoned after this many Tresca problems without a new smallest
@@ -60,7 +60,10 @@ class FrictionLaw:
 
 
 def law_of(params: Mapping[str, Any]) -> FrictionLaw:
-    """Return the law from the keys `friction`, `bound` and `mu`, already validated."""
+    """Return the law from the keys `friction`, `bound` and `mu`.
+
+    The values must have been validated.
+    """
     kind = str(params["friction"])
     return FrictionLaw(
         kind,
@@ -112,7 +115,7 @@ def coulomb_fixed_point(
 ) -> list[Friction]:
     """Solve Coulomb's law by fixed-point iteration; return friction for each iterate.
 
-    `Friction.unsettled` of every iterate except the last is its residual.
+    In all iterates except the last, `Friction.unsettled` is the residual.
 
     Parameters
     ----------

@@ -1,7 +1,10 @@
 """Coulomb's law for contacts between many bodies, by sequences of convex problems.
 
-The unknowns are the contact forces r, in blocks (N, T₁[, T₂]) in friction cones K,
-‖r_T‖ ≤ μ r_N. The velocities are u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
+The unknowns are the contact forces r, with a normal and one or two tangential
+components per contact, in the product K of the friction cones ‖r_T‖ ≤ μ r_N, and
+multipliers λ of the equations Vᵀr = b. The relative velocities at the contacts are
+u = W r + Vλ + q, with a positive semidefinite matrix W (Delassus operator) and the
+velocities q in the absence of forces. Coulomb's law is
 
     û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
 
@@ -16,11 +19,11 @@ its predecessor:
   ``cones``.
 
 If rigid bodies have more contacts than equations of motion, W is singular, and contact
-forces are not unique. The bounds of ``tresca`` then drift in the null space, and the
-loop does not converge for three stacked boxes. This loop therefore takes proximal
-steps: it adds ½δ‖r − r'‖² to the objective, where r' are the forces of the predecessor.
-The term vanishes as the loop converges. The loop ``cones`` takes proximal steps from
-the first problem without a solution on.
+forces are not unique. In this case the bounds of ``tresca`` would drift in the null
+space of W, and the loop would not converge for three stacked boxes, for instance. The
+loop ``tresca`` therefore takes proximal steps: it adds ½δ‖r − r'‖² to the objective,
+where r' are the forces of the predecessor. The term vanishes as the loop converges. The
+loop ``cones`` takes proximal steps only after one of its problems has had no solution.
 """
 
 from __future__ import annotations
@@ -41,8 +44,9 @@ from mortarbench.harness.sets.discs import Discs
 from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
 
 LOOPS = ("cones", "tresca")
-#: largest asymmetry of W, relative to its largest entry, that counts as rounding. The
-#: change of the scaled natural map is about as large, far below the required 1e-6
+#: largest asymmetry of W, relative to its largest entry, that counts as rounding.
+#: Symmetrising W changes the scaled natural map by about as much, which is far below
+#: the required 1e-6
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9
@@ -59,12 +63,12 @@ ACTIVE = 1e-6  #: forces below this fraction of the largest count as zero
 
 @dataclass(frozen=True, eq=False)
 class FrictionalContact:
-    """Contacts with Coulomb friction: W, q, μ, and equations A r = b for the forces.
+    """Contacts with Coulomb friction; see the module docstring for the symbols.
 
     Raises
     ------
     InputError
-        If W is not symmetric, in which case the steps are not convex problems.
+        If W is not symmetric, so that the problems of the loops are not convex.
 
     """
 
@@ -72,7 +76,7 @@ class FrictionalContact:
     q: Vector  #: (n,) velocity in the absence of contact forces
     mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
     A: Any = None  #: (p, n) = Vᵀ
-    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,)
+    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,) right-hand side
 
     def __post_init__(self) -> None:
         """Symmetrise W up to rounding."""
@@ -80,8 +84,8 @@ class FrictionalContact:
         asymmetry = abs(self.W - self.W.T).max() / (largest or 1.0)
         if asymmetry > MAX_ASYMMETRY:
             raise InputError(
-                f"W is unsymmetric by {asymmetry:.2g} of its largest entry, so that no "
-                "step is a convex problem; expected a symmetric W"
+                f"W is not symmetric: the largest entry of W − Wᵀ is {asymmetry:.2g} "
+                "of the largest entry of W; expected a symmetric W"
             )
         object.__setattr__(self, "W", csc_array((self.W + self.W.T) / 2))
         if self.A is None:
@@ -92,9 +96,9 @@ class FrictionalContact:
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
-                f"W has the negative eigenvalue {least:.2g}, relative to its largest "
-                f"{least / self.stiffness:.1g}, so that no step is a convex problem; "
-                "expected a positive semidefinite W"
+                f"W has the negative eigenvalue {least:.2g}, "
+                f"{least / self.stiffness:.1g} times the largest one; expected a "
+                "positive semidefinite W"
             )
 
     @cached_property
@@ -123,7 +127,7 @@ class FrictionalContact:
         return Cones(np.arange(n).reshape(k, n // k), self.mu)
 
     def velocity(self, r: Vector, multipliers: Vector) -> Vector:
-        """Return u (n,) for forces r (n,) and multipliers λ (p,)."""
+        """Return the velocities u (n,) for forces r (n,) and multipliers λ (p,)."""
         u: Vector = self.W @ r + self.q + self.A.T @ multipliers
         return u
 
@@ -136,6 +140,8 @@ class FrictionalContact:
         self, r: Vector, multipliers: Vector, omega: float | None = None
     ) -> float:
         """Evaluate  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖,  zero at solutions.
+
+        Π is the projector onto the friction cones.
 
         Parameters
         ----------
@@ -162,13 +168,19 @@ class FrictionalContact:
         )
 
     def cone_step(self, slip: Vector) -> QP:
-        """Return the problem over friction cones with s = (slip (k,), 0)."""
+        """Return the problem of the loop `cones` with s = (slip, 0).
+
+        slip : (k,) μ‖u_T‖ of each contact
+        """
         q = self.q.copy()
         q[self.cones.index[:, 0]] += slip
         return self._qp(q, np.full(q.size, -np.inf), self.cones)
 
     def tresca_step(self, bound: Vector) -> QP:
-        """Return Tresca's problem, ‖r_T‖ ≤ bound (k,)."""
+        """Return the problem of the loop `tresca` with ‖r_T‖ ≤ bound.
+
+        bound : (k,) friction bound g of each contact
+        """
         lower, index = np.full(self.q.size, -np.inf), self.cones.index
         lower[index[:, 0]] = 0.0
         return self._qp(self.q, lower, Discs(index[:, 1:], bound))
@@ -197,13 +209,13 @@ class ConvexStep(NamedTuple):
 def coulomb_steps(
     contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
 ) -> list[ConvexStep]:
-    """Return convex problems of the sequence `loop`, at most `count`.
+    """Return the first convex problems of a sequence for Coulomb's law.
 
     Parameters
     ----------
-    loop : one of `LOOPS`
+    loop : name of the sequence, one of `LOOPS`
     solve : solves a convex problem; raises ArithmeticError if it has no solution
-    count : number of problems; 0 continues until convergence
+    count : largest number of problems; with 0, the sequence ends at convergence
 
     Raises
     ------
@@ -231,7 +243,7 @@ def coulomb_steps(
             break
         r, qp = s.x, _successor(contact, loop, s)
     raise InputError(
-        f"Coulomb's law does not converge by loop={loop}: after {len(steps)} convex "
+        f"loop={loop} does not converge to Coulomb's law: after {len(steps)} convex "
         f"problems the scaled natural map is {errors[-1]:.1e}, and was at best "
         f"{min(errors):.1e}; expected another loop, or a smaller mu"
     )
@@ -247,7 +259,7 @@ class _ProximalMethod:
         self._solve, self._delta = solve, PROXIMITY * contact.stiffness
 
     def solve(self, qp: QP, r: Vector) -> Solution:
-        """Solve `qp`; with proximal steps, its objective plus ½δ‖x − r‖²."""
+        """Solve `qp`; in a proximal step, ½δ‖x − r‖² is added to its objective."""
         if not self.is_proximal:
             try:
                 return self._solve(qp)

@@ -26,7 +26,7 @@ from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
 from mortarbench.problems.fem.mesh import Nodes
 
-#: methods "nts" and "mortar" by dimension
+#: functions that implement the methods "nts" and "mortar", by dimension
 METHODS: Mapping[int, tuple[Callable[..., ContactRows], Callable[..., ContactRows]]] = {
     2: (node_to_segment, mortar),
     3: (node_to_face, face_mortar),
@@ -42,7 +42,7 @@ def linearisation(
 ) -> Callable[[Vector], ContactRows]:
     """Return a function that maps a displacement (n,) in m to the rows of all pairs.
 
-    It raises InputError if no row results at u = 0.
+    This function raises InputError if the displacement is zero and no pair has a row.
 
     contact : "nts" (node to segment, or node to face in space) or "mortar"; pairs with
         a rigid master have nodal rows
@@ -108,9 +108,9 @@ def contact_stiffness(
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return a function that evaluates the blocks −λ_i g_i''(u).
 
-    Its arguments are u (n,) in m and λ (m,) in N/m; it returns the result of
-    `problems.contact.node_to_segment.geometric_stiffness` for all pairs. Contact is
-    node to segment, with one row per slave node.
+    The arguments of this function are u (n,) in m and λ (m,) in N/m, and its result is
+    that of `problems.contact.node_to_segment.geometric_stiffness` for all pairs.
+    Contact is node to segment, with one row per slave node.
 
     fixed_segments : see `linearisation`
     """

@@ -19,12 +19,12 @@ node j
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
 −Φ_j ν on the master at x(ξ) + g n, along the same line. So the forces of a row are in
 equilibrium and have no moment, up to rounding, even on curved sides. (With n_j outside
-the integrals
-the moments are O(h²). A body supported by contact alone then rotates until a row far
-from the contact, at the end of an arc, balances the moments of the active rows.) Not
-normalising ν amounts to a weight of 1 − O(h²). The integrands of D are then
-polynomials, which the Gauss rule integrates exactly: D is independent of the position
-of the master's nodes, and a row of the dual basis acts on the slave along n_j.
+the integrals, the moments would be O(h²). A body supported by contact alone would then
+rotate until a row far from the contact, at the end of an arc, balances the moments of
+the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
+In return, the integrands of D are polynomials, which the Gauss rule integrates exactly:
+D is independent of the position of the master's nodes, and a row of the dual basis acts
+on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -78,8 +78,9 @@ from mortarbench.problems.fem.mesh import Nodes, dofs_of
 #: integration segments shorter than this, in ξ, are due to rounding of the projection
 #: and are dropped
 MIN_SEGMENT = 1e-8
-#: averaged normals of a straight side differ by at most this. Smaller components of
-#: ν − n_j count as zero, so that B is as sparse on straight sides as with one normal
+#: averaged normals of a straight side differ by at most this value. Smaller components
+#: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single
+#: normal
 NORMAL_ROUNDING = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
@@ -104,7 +105,7 @@ class Overlaps(NamedTuple):
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 2) both ends, as ξ on the slave segment, ascending
+    xi: NDArray[np.float64]  #: (p, 2) coordinates ξ of both ends, ascending
 
 
 class GaussPoints(NamedTuple):
@@ -112,11 +113,11 @@ class GaussPoints(NamedTuple):
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 3) on the slave segment, in [−1, 1]
-    beta: NDArray[np.float64]  #: (p, 3) on the master segment, in [0, 1]
+    xi: NDArray[np.float64]  #: (p, 3) coordinate on the slave segment, in [−1, 1]
+    beta: NDArray[np.float64]  #: (p, 3) coordinate on the master segment, in [0, 1]
     field: NDArray[np.float64]  #: (p, 3, 2) ν(ξ), |ν| ≤ 1
-    gap: NDArray[np.float64]  #: (p, 3) m
-    weight: NDArray[np.float64]  #: (p, 3) m
+    gap: NDArray[np.float64]  #: (p, 3) gap g(ξ), m
+    weight: NDArray[np.float64]  #: (p, 3) quadrature weights, m
 
 
 def mortar(
@@ -138,8 +139,8 @@ def mortar(
     slave, master : (s,), (v,) chains of nodes with their body on the left
     basis : multiplier basis, "dual" or "standard"
     reach : limits on the angle and distance of integration segments. Without a limit on
-        the angle, rays can graze a distant master. Because the dual basis is negative
-        in places, weighted gaps between separate bodies would then be negative
+        the angle, rays can graze a distant master. Weighted gaps between separate
+        bodies could then be negative, because the dual basis is negative in places
     tangential : add tangential rows for friction
 
     Raises
@@ -165,7 +166,7 @@ def mortar(
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
-    """Integrate D, M, the weighted gaps and the covered lengths."""
+    """Compute D, M, weighted gaps and covered lengths by Gauss quadrature."""
     gauss = cast_rays(slave, master, overlaps(slave, master), reach)
     N = _shape(gauss.xi)
     phi = _dual(gauss) if basis == "dual" else N

@@ -49,7 +49,7 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
-#: closest points within this distance in ξ of an end of a segment move to the vertex
+#: closest points within this distance in ξ of an end of a segment are moved to this end
 VERTEX_TOLERANCE = 1e-9
 
 
@@ -60,8 +60,9 @@ class ContactRows(NamedTuple):
     c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
-    share: Vector  #: (m_I,) length ∫N_j of the slave side assigned to the row, m
-    place: Nodes  #: (m_I,) position of the row's node in the slave chain
+    #: (m_I,) length ∫N_j of the slave side assigned to the row, m; area in space, m²
+    share: Vector
+    place: Nodes  #: (m_I,) index of the slave node of each row in the slave chain
 
 
 class ClosestPoints(NamedTuple):
@@ -83,7 +84,8 @@ def node_to_segment(
 ) -> ContactRows:
     """Linearise the non-penetration condition of all slave nodes at u.
 
-    The result has one contact row per slave node; see the module for B, c and T.
+    The result has one contact row per slave node. B, c and T are defined in the module
+    docstring.
 
     Parameters
     ----------
@@ -132,7 +134,7 @@ def geometric_stiffness(
     multipliers: Vector,
     fixed_segments: Nodes | None = None,
 ) -> tuple[NDArray[np.float64], Nodes]:
-    """Differentiate the forces Bᵀλ of the slave nodes at fixed λ: −λ g''(u) per node.
+    """Differentiate Bᵀλ at fixed λ: return the block −λ g''(u) of each slave node.
 
     With the edge e = x_2 − x_1 of the segment and d = x_s − x_1, the gap is g = a/L
     with the area a = d_x e_y − d_y e_x and the length L = |e|, and

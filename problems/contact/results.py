@@ -29,12 +29,12 @@ IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
 class BulkResults(NamedTuple):
-    """Results of the bodies that do not refer to contact."""
+    """Results of the bodies other than those of contact."""
 
     nodes: int
     elements: int
     supports: int  #: number of prescribed components
-    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m
+    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m; J in space
     #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
     max_von_mises: Sequence[float]
 
@@ -73,11 +73,11 @@ def results_of(
 
     `energy` is ½uᵀKu − fᵀu in J/m. `contact_force` is the total force −ΣBᵀλ of contact
     and friction on the body of the master (of the slave if the master is rigid) in N/m.
-    It is absent if there are several pairs, whose sum is meaningless; `contacts` then
-    contains the force of each pair. In space, energies are in J and forces in N.
-    `max_von_mises` is the largest patch-recovered stress per body in Pa. `contacts` has
-    the results per pair, see `pair_results`. With friction, the items of
-    `friction_quantities` are added.
+    With several pairs it is omitted, because the sum over pairs would be meaningless.
+    In space, energies are in J and forces in N. `max_von_mises` is the largest
+    patch-recovered von Mises stress of each body in Pa. `contacts` contains the results
+    of each pair, see `pair_results`. With friction, the items of `friction_quantities`
+    are added.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def pair_results(
     overlap; `half_width` is half the undeformed length in m of the slave side under
     pressure (in space, `pressed_area` is its area in m²). With friction,
     `friction_force` is the contribution of friction to the force on the slave in N/m,
-    and the numbers of nodes that stick and slip are included.
+    and `stick` and `slip` are the numbers of sticking and slipping slave nodes.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)
@@ -201,7 +201,7 @@ def fields(
     stresses: Mapping[str, Vector] | None = None,
     subdomains: NDArray[np.int64] | None = None,
 ) -> Fields:
-    """Return the deformed state for pictures, in SI units.
+    """Return displacements, stresses and contact results for plots, in SI units.
 
     stresses : see `quantities`
     subdomains : (E,) subdomain of each cell, if the bodies are decomposed

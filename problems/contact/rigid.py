@@ -6,8 +6,9 @@ x = X + u^k and n fixed there,
 
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
-which is exact for planes. The nonzero entries of a row belong to one node, so that the
-rows are orthonormal. Friction rows are T = −t at the node, with the tangents t.
+which is exact for planes. The nonzero entries of a row belong to a single node, so that
+the contact rows are orthonormal. Friction rows are T = −t at the node, with the
+tangents t.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class RigidBody(Protocol):
-    """A rigid body, described by its signed distance function."""
+    """A rigid body, described by its signed distance function, positive outside."""
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -55,8 +56,8 @@ class RigidPlane:
 class RigidSphere:
     """A ball, or a disc in the plane."""
 
-    centre: tuple[float, ...]  #: m
-    radius: float  #: m
+    centre: tuple[float, ...]  #: position of the centre, m
+    radius: float  #: radius, m
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -69,7 +70,7 @@ class RigidCylinder:
 
     point: tuple[float, ...]  #: a point on the axis, m
     axis: tuple[float, ...]  #: unit vector along the axis
-    radius: float  #: m
+    radius: float  #: radius, m
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -103,7 +104,7 @@ def rigid_rows(
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
     side : boundary of a `Mesh`
-    clamped : nodes of the side without a row, all components of which are prescribed
+    clamped : nodes of the side whose components are all prescribed; they have no row
     tangential : add tangential rows for friction
 
     Raises

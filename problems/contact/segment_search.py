@@ -7,12 +7,12 @@ traverses all of AB. Hence the distance from any point p satisfies
 
     |p − AB| − δ  ≤  |p − sub-chain|  ≤  |p − AB| + δ.
 
-Descending the tree, a query follows a sub-chain unless these bounds rule it out. On a
-smooth chain δ decreases with the square of the sub-chain's length, so that each query
-follows O(1) sub-chains per level at any distance, whereas with bounding boxes or balls
-their number would grow with the distance. Leaves are segments with δ = 0, so that the
-result is exact. The worst case is a point equidistant from the whole chain (the centre
-of an arc), for which no sub-chain can be ruled out.
+A query for a point descends the tree into all sub-chains that these bounds do not rule
+out. On a smooth chain δ decreases with the square of the sub-chain's length, so that
+each query visits O(1) sub-chains per level at any distance, whereas with bounding boxes
+or balls their number would grow with the distance. Leaves are segments with δ = 0, so
+that the result is exact. In the worst case, the point is equidistant from the whole
+chain (the centre of an arc), and no sub-chain can be ruled out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
-ROOTS = 16  #: largest number of sub-chains on the top level; more levels cost more
+ROOTS = 16  #: largest number of sub-chains on the top level; smaller values are slower
 #: relative rounding of distances; without it, equally close segments could rule each
 #: other out
 ROUNDING = 1e-12
@@ -41,9 +41,10 @@ ROUNDING = 1e-12
 class Reach:
     """Limits of angle and distance within which points of two sides may touch."""
 
-    #: largest n_s·n_m; −½ admits normals that deviate by at most 60° from opposite
+    #: largest n_s·n_m of the normals of slave and master; −½ admits normals that are at
+    #: most 60° from opposite
     cosine: float = -0.5
-    #: largest distance, m; None: the larger extent of the two sides
+    #: largest distance, m; None selects the larger extent of the two sides
     distance: float | None = None
 
     def __post_init__(self) -> None:
@@ -62,21 +63,22 @@ class Reach:
 class Chords(NamedTuple):
     """One level of the tree: sub-chains of equally many segments, in chain order."""
 
-    start: Points  #: (k, 2)
-    edge: Points  #: (k, 2) from start to end
+    start: Points  #: (k, 2) position of the first node, m
+    edge: Points  #: (k, 2) vector from the first to the last node, m
     inverse: Vector  #: (k,) 1/|edge|², 0 where a sub-chain closes on itself
     deviation: Vector  #: (k,) δ, m
 
 
-#: map from (level, query (p,), sub-chain (p,)) to a mask of the pairs to follow
+#: maps a level and pairs of a query (p,) and a sub-chain (p,) to a mask of the pairs
+#: whose sub-chains are visited
 Criterion = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 
 
 class Nearest(NamedTuple):
     """Closest points on a chain; segments are numbered as in its `Surface`."""
 
-    segment: Nodes  #: (s,)
-    xi: Vector  #: (s,) coordinate on the segment, from 0 at its first node to 1
+    segment: Nodes  #: (s,) number of the segment with the closest point
+    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
 
 
 def nearest(x: Points, line: Surface) -> Nearest:
@@ -102,9 +104,10 @@ def nearest(x: Points, line: Surface) -> Nearest:
 def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
     """Return the pairs of slave and master segments that may overlap along normals.
 
-    With f_j(p) = (x_j − p) × n_j, a point p lies between the lines along the averaged
-    normals of nodes j and j + 1 if f_j(p) ≥ 0 ≥ f_{j+1}(p). The master segment of each
-    returned pair has a point with f_j ≥ 0 and a point with f_{j+1} ≤ 0.
+    Let f_j(p) = (x_j − p) × n_j for the slave node j at x_j with the averaged normal
+    n_j. A point p lies between the lines along the normals of nodes j and j + 1 if
+    f_j(p) ≥ 0 ≥ f_{j+1}(p). The master segment of each returned pair has a point with
+    f_j ≥ 0 and a point with f_{j+1} ≤ 0.
 
     Returns
     -------
@@ -136,8 +139,8 @@ def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
 def _descend(
     queries: int, levels: list[Chords], keep: Criterion
 ) -> tuple[Nodes, Nodes]:
-    """Descend from the roots; return pairs (query, leaf) sorted by both."""
-    # a vectorised descent of all queries at once, level by level
+    """Descend from the roots; return pairs (query, leaf) sorted by query, then leaf."""
+    # the queries descend together, level by level, to vectorise the work
     roots = len(levels[0].inverse)
     query = np.repeat(np.arange(queries), roots)
     node = np.tile(np.arange(roots), queries)

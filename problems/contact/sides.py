@@ -38,18 +38,21 @@ def contact_sides(
 ) -> tuple[ContactSide, ...]:
     """Return forces, pressures and gaps along the slave side of each pair, in SI units.
 
-    The nodal force is the sum of contact and friction. The pressure is the component of
-    the contact force along the normal of the deformed side, divided by the undeformed
-    length ∫N_j (in space, area) that belongs to the node. The gap is the slack c − Bu
-    of the node's row; with mortar contact, this is the mean gap around the node with
-    the weights of the row. With friction, the shear is the friction force along the
-    tangent (−n_y, n_x) over the same length, in space its size over the area, and each
-    node with a row has one of the `states`, any other an empty one.
+    The nodal force is the sum of the contact and friction forces on a slave node. The
+    pressure is the component of the contact force against the outward normal of the
+    deformed side, divided by the undeformed length ∫N_j (in space, area) that belongs
+    to the node. The gap is the slack c − Bu of the row of the node; with mortar
+    contact, it is the mean gap around the node, weighted as in the row.
+
+    With friction, the shear is the friction force along the tangent (−n_y, n_x),
+    divided by the same length; in space, it is the norm of the friction force, divided
+    by the area. A node with a row has one of the `states`; the state of a node without
+    a row is the empty string.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
     points, dim, u = bodies.mesh.points, bodies.mesh.dim, s.x * l
-    row = friction.row[friction.vectors[:, 0]]  # of each state
+    row = friction.row[friction.vectors[:, 0]]  # contact row of each state
     slack = (primal.h - B @ s.x) * l
     sides = []
     for name, pair, rows in zip(
@@ -101,8 +104,9 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
 
     A vector of an inactive row is open, or `SLIDING` if its shear is nonzero, which
     Tresca's law allows and Coulomb's does not. A vector of an active row sticks if its
-    slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ. This is the slip that the unused part of
-    the bound would cause if only the nodes of the row could move.
+    slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, with the bound g, the shear λ_t and the
+    rows T. This is the slip that the unused part of the bound would cause if only the
+    nodes of the row could move.
     """
     vectors = friction.vectors
     if not vectors.size:
@@ -127,7 +131,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
 
 
 def pair_names(bodies: Bodies | ContactSides) -> list[str]:
-    """Return pair names "SLAVE on MASTER", numbered if a name is repeated."""
+    """Return the names "SLAVE on MASTER" of all pairs; repeated names are numbered."""
     names: list[str] = []
     for pair in bodies.pairs:
         slave, master = bodies_of(bodies, pair)
@@ -170,7 +174,7 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
 def slave_places(
     B: csr_array, slave: Nodes, dim: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the slave node of each row, the node with the largest entries of B.
+    """Return the slave node of each row: the node of `slave` with the largest entries.
 
     Returns
     -------

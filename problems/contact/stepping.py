@@ -1,10 +1,10 @@
-"""Load steps with re-linearised contact, and Coulomb's law in each (paper, Section 2).
+"""Load steps with re-linearised contact (paper, Section 2) and Coulomb's law.
 
 A load step starts from the solution of its predecessor. Contact is linearised at that
 solution, and `relin` − 1 more times at the solution of the preceding linearisation;
 each linearisation is a `Stage`. The QP of a stage is that of undivided bodies on one
 process (`problems.duality.monolithic`), or of subdomains on MPI ranks
-(`problems.duality.decomposed`). The scheme of the paper is relin = 1, of first order in
+(`problems.duality.decomposed`). The paper uses `relin` = 1, a scheme of first order in
 1/steps.
 
 With friction, slip is measured from the solution of the preceding load step
@@ -35,7 +35,7 @@ class Forces(NamedTuple):
     """Non-dimensional nodal forces at some components; zero at all others."""
 
     component: Nodes  #: (k,) distinct components
-    value: Vector  #: (k,)
+    value: Vector  #: (k,) force at each component
 
 
 class State(NamedTuple):
@@ -53,7 +53,7 @@ def continue_slip(end: State) -> State:
 
 
 def restart_slip(end: State) -> State:
-    """Return the final state of the preceding stage as the new slip origin."""
+    """Return the final state of the preceding stage, with the slip origin at its u."""
     return end._replace(slip_origin=end.u)
 
 
@@ -99,7 +99,8 @@ def load_steps(
 ) -> tuple[Stage, ...]:
     """Return the stages of a load that grows in equal steps, `relin` stages per step.
 
-    quasi_static : measure slip from the preceding load step, instead of from rest
+    quasi_static : measure slip from the end of the preceding load step; if False, from
+        the undeformed state
     """
     return tuple(
         Stage(
@@ -133,7 +134,7 @@ class LinearisedProblem(Protocol):
         """Return the multipliers λ_n (m,) of the contact rows."""
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) and the normal forces (places,) of a solution."""
+        """Return u (w,) and the normal forces (places,) of all slave nodes."""
 
 
 P = TypeVar("P", bound=LinearisedProblem)
@@ -149,12 +150,12 @@ class Iterate(NamedTuple, Generic[P]):
 
 @dataclass(frozen=True, eq=False)
 class LoadPath(Generic[P]):
-    """Load path: the stages of one analysis, solved once and on demand.
+    """Load path: the stages of one analysis, each solved once and on demand.
 
     Raises
     ------
     ArithmeticError
-        If a reference solve is not accurate.
+        If a reference solution is not accurate enough.
     InputError
         If the fixed-point iteration for Coulomb's law does not converge, has fewer
         iterates than requested, or reaches bounds for which no equilibrium exists.
@@ -184,7 +185,7 @@ class LoadPath(Generic[P]):
         return max(i for i, stage in enumerate(self.stages) if stage.step == step)
 
     def problems(self, i: int) -> list[Iterate[P]]:
-        """Return the iterates of stage i (0, 1, …); solves preceding stages first."""
+        """Return the iterates of stage i (0, 1, …), after solving preceding stages."""
         while len(self._history) <= i:
             stage = self.stages[len(self._history)]
             state = stage.begin(self._end_state())

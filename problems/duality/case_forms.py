@@ -57,7 +57,10 @@ Factorise = Callable[[], GeneralisedInverse]
 def case_of(
     problem: ContactProblem, form: str, choice: Choice, reference: Reference
 ) -> Case:
-    """Return the case for the QP that `choice` selects, in one of FORMS."""
+    """Return the case for the QP that `choice` selects.
+
+    form : one of FORMS
+    """
     elastic = problem.bodies
     path, decomposed = monolithic_path(problem, reference), None
     whole, friction, _ = path.problem(choice.step, choice.iterate)
@@ -144,7 +147,7 @@ def contact_case(
     friction: Friction = NO_FRICTION,
     parts: DecomposedProblem | None = None,
 ) -> Case:
-    """Return the case of a primal QP of contact in one of FORMS.
+    """Return the case of a contact problem, given by its primal QP, in one of FORMS.
 
     Parameters
     ----------
@@ -152,10 +155,10 @@ def contact_case(
         for the form `dual`
     clamped : returns K⁺ with the fixed components eliminated; called only for the form
         `dual-bounds`
-    supported : like `clamped`, but also admits bodies that are supported by contact
-        alone; called to certify an answer
-    quantities : evaluates physical results from a solution of the primal problem,
-        whose z lists the multipliers of the contact rows, then those of friction
+    supported : like `clamped`, but also for bodies that are supported by contact alone;
+        called to certify a solution
+    quantities : evaluates physical results from a solution of the primal problem; the
+        z of this solution lists the multipliers of contact rows, then of friction rows
     friction : friction law with a prescribed bound; the objective includes its work
     parts : decomposed problem; if present, `form` is ignored and the case is its dual
 
@@ -179,7 +182,7 @@ def contact_case(
         start = perf_counter()
         transform = dualise if form == "dual" else dual_bounds
         transformed = transform(primal, inverse, friction=friction)
-        # the factorisation counts even if it was computed for an earlier load step
+        # include the factorisation even if an earlier load step computed it
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length

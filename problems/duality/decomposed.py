@@ -1,7 +1,7 @@
 """Load steps of decomposed elastic bodies in contact, on one process or several ranks.
 
-No array of global size is allocated: the linearisation of contact only requires the
-positions and displacements of the nodes on the contact sides.
+No array of global size is allocated, because the linearisation of contact only requires
+the positions and displacements of the nodes on the contact sides.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 class DecomposedLinearisation:
     """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
-    All ranks must call its methods together; each rank receives the same values.
+    All ranks must call its methods together; the results are equal on all ranks.
     """
 
     stage: Stage
@@ -100,13 +100,14 @@ class DecomposedLinearisation:
         return z[: self.sides.place.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) on the contact sides and the normal nodal forces (places,).
+        """Return u (w,) on the contact sides and the normal forces (places,).
 
-        Both are nondimensional.
+        The normal forces are those of all slave nodes. Displacements and forces are
+        nondimensional.
         """
         dual, sides = self.dual, self.sides
         solution = local_solution(dual.subdomains, dual.halo, s)
-        vars(self).pop("_qp", None)  # explicit blocks are large and no longer needed
+        vars(self).pop("_qp", None)  # free the explicit blocks, which are large
         forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
         return solution.at(sides.component), forces
 
@@ -114,9 +115,11 @@ class DecomposedLinearisation:
 def decomposed_path(
     problem: ContactProblem, choice: Choice, ranks: Ranks, reference: ReferenceOverRanks
 ) -> LoadPath[DecomposedLinearisation]:
-    """Return the load path of a decomposed contact problem; called by all ranks.
+    """Return the load path of a decomposed contact problem.
 
-    reference : solver of a distributed dual, called by all ranks together
+    All ranks must call this function, and the methods of the path, together.
+
+    reference : solver of a distributed dual; all ranks call it together
     """
     layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
     previous = list[LocalDual]()
@@ -147,14 +150,16 @@ def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
 def distributed_qp_of(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
 ) -> DistributedQP:
-    """Return the selected dual QP, distributed over ranks; called by all of them.
+    """Return the selected dual QP, distributed over ranks.
+
+    All ranks must call this function together.
 
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, ranks have cut the bodies differently,
-        or the fixed point of Coulomb's law does not converge or has fewer iterates than
-        selected.
+        If there are fewer subdomains than ranks, if the ranks computed different
+        subdomains, or if the fixed-point iteration for Coulomb's law does not converge
+        or has fewer iterates than selected.
 
     """
     path = decomposed_path(problem, choice, ranks, reference)
@@ -345,7 +350,7 @@ class DistributedSolution:
 def _quantities(
     problem: ContactProblem, solution: DistributedSolution
 ) -> dict[str, Any]:
-    """Return the quantities of a distributed solution; called by all ranks."""
+    """Return the quantities of a distributed solution; all ranks call this together."""
     elastic, local = problem.bodies, solution.solution.subdomains
     layout = local.problem.layout
     cells = sum(len(layout.cells(int(s))) for s in local.number)
@@ -364,7 +369,10 @@ def _quantities(
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:
-    """Return C₁₁ / (C₁₁ + C₆₆), (k,), for elasticity matrices (k, v, v)."""
+    """Return C₁₁ / (C₁₁ + C₆₆), (k,), for elasticity matrices (k, v, v) with entries C.
+
+    In Voigt's notation, C₆₆ is the last diagonal entry, the shear modulus.
+    """
     return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
@@ -433,7 +441,10 @@ def local_meshes(
 
 
 def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
-    """Group subdomains of one body into batches of at most `BATCH_NODES` nodes."""
+    """Group subdomains into batches, each of one body and `BATCH_NODES` nodes at most.
+
+    A subdomain with more nodes is a batch of its own.
+    """
     sizes = np.diff(layout.subdomain_nodes(subdomains).start)
     first, nodes = [0], 0
     for s, size in enumerate(sizes):
@@ -449,7 +460,7 @@ class _Patch(NamedTuple):
     """Subdomains of one body with layers of neighbouring cells."""
 
     node: Nodes  #: (N,) global numbers
-    cells: Nodes  #: (E, 4) corners, as indices into `node`
+    cells: Nodes  #: (E, corners) indices into `node`
     inner: NDArray[np.bool_]  #: (N,) True for nodes of the subdomains
 
 
@@ -476,7 +487,7 @@ def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of subdomains, and their cells (E, 4) as indices into them."""
+    """Return the nodes of subdomains, and the cells as indices into these nodes."""
     torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [
@@ -487,7 +498,7 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
 
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
-    """Return the subdomains that contain a node of `node` shared by several."""
+    """Return the subdomains that contain any of the interface nodes among `node`."""
     multiplicity = layout.multiplicity(node)
     several = multiplicity > 1
     copies = range(int(multiplicity.max(initial=1)))

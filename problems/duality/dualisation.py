@@ -83,7 +83,7 @@ def dualise(
     ----------
     primal : QP with P = K and no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
-    free : K⁺f (n,), if already computed
+    free : K⁺f (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
@@ -120,16 +120,17 @@ def dual_bounds(
         min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,  RᵀB_Iᵀλ = Rᵀf
         F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The equations, which balance the rigid motions R that the supports leave, are absent
-    if there are none. The inverse map is  u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The
-    multipliers of the supports, the reactions, follow from stationarity.
+    The equations balance the forces on the rigid motions R that the supports allow; if
+    the supports exclude all rigid motions, there are no equations. The inverse map is
+    u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The multipliers of the supports (reactions)
+    follow from stationarity.
 
     Parameters
     ----------
     primal : QP whose equality rows are unit vectors with zero right-hand side
-    clamped : K⁺ that is zero at these components, with an orthonormal basis R of the
-        rigid motions that are zero there
-    free : K⁺f (n,), if already computed
+    clamped : K⁺ that is zero at the components these rows fix, with an orthonormal
+        basis R of the rigid motions that are zero there
+    free : K⁺f (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 
     """
@@ -155,7 +156,7 @@ def dual_bounds(
 
 
 def with_friction_bound(dual: QP, friction: Friction) -> QP:
-    """Return `dual` with the bounds of `friction`; the inverse map is unchanged."""
+    """Return `dual` with the bounds of `friction`; the same inverse map applies."""
     contact = dual.q.size - friction.bound.size
     free = int(np.isinf(dual.lb[:contact]).sum())
     sets = multiplier_sets(free, contact - free, friction.bound, friction.tangents)

@@ -83,14 +83,16 @@ def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
 
 
 def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
-    """Return the size of a decomposition, as quantities of a result.
+    """Return the quantities that describe the size of a decomposition.
 
-    The keys are `subdomains`; `kinds`, the number of classes of congruent subdomains,
-    each with one factor; `torn_dofs`, the number of unknowns including all copies;
-    `multipliers`, the number of rows of B; `coarse_unknowns`, the number of rigid
-    motions of all subdomains or clusters; `explicit_subdomains`, the number of
-    subdomains with explicit blocks (K⁺)_bb and S_bb (the others require a solve in
-    every product); and `explicit_mib`, the memory for these blocks in MiB.
+    * `subdomains`: number of subdomains
+    * `kinds`: number of classes of congruent subdomains; each class has one factor
+    * `torn_dofs`: number of displacement unknowns, including all copies
+    * `multipliers`: number of rows of B
+    * `coarse_unknowns`: number of rigid motions of all subdomains or clusters
+    * `explicit_subdomains`: number of subdomains with explicit blocks (K⁺)_bb and S_bb;
+      for all other subdomains, every product requires a solve
+    * `explicit_mib`: memory for these blocks, MiB
     """
     explicit = dual.P.arrays["explicit"]
     sizes = np.array(

@@ -1,8 +1,9 @@
 """Load steps of undivided bodies in contact, with one factor of K for all QPs.
 
-Contact rows are linearised at the displacements of the contact sides, which one small
-product yields from the dual solution of the previous step. Displacements elsewhere are
-recovered on demand, by one solve with the factor of K per step.
+Contact rows are linearised at the displacements of the contact sides, which are
+computed from the dual solution of the previous step by a product with a small matrix.
+Displacements of all other nodes are recovered on demand, by one solve with the factor
+of K per step.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class MonolithicLinearisation:
         Raises
         ------
         ArithmeticError
-            If the residual exceeds `MAX_REFERENCE_RESIDUAL`.
+            If the KKT residual of the solution exceeds `MAX_REFERENCE_RESIDUAL`.
 
         """
         qp = with_friction_bound(self.dual().qp, friction)
@@ -87,7 +88,10 @@ class MonolithicLinearisation:
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (n,), valid on the contact sides, and normal forces (places,)."""
+        """Return u (n,), valid on contact sides only, and normal forces (places,).
+
+        The normal forces are those of all slave nodes.
+        """
         places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces
@@ -165,8 +169,8 @@ def load_path(
 def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Return the load path of a contact problem on undivided bodies.
 
-    Only the contact rows are dualised: with the supports in the dual as well, its
-    dense matrix has several times as many rows in space.
+    Only the contact rows are dualised. If the support rows were included, the dense
+    matrix of the dual would have several times as many rows in space.
     """
     elastic, bodies = problem.bodies, problem.bodies.assembled
 
@@ -197,7 +201,7 @@ def _path(
     transform: Transform,
     initial_force: float,
 ) -> MonolithicPath:
-    # loads and supports recur in several stages; K⁺f is stored for the full load
+    # several stages have the same load and supports: K⁺f of the full load is stored
     bodies_by_stage = dict[tuple[int, int], Bodies]()
     inverses = dict[int, GeneralisedInverse]()
     free = dict[tuple[int, int], Vector]()

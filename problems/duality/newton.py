@@ -1,13 +1,15 @@
 """Load steps at finite strain with contact: each Newton iteration is one convex QP.
 
-Step k carries the load κf, κ = k/steps (dead loads), and seeks a minimiser of
+In step k, the bodies carry the dead load κf with κ = k/steps, and the displacement is a
+minimiser of
 
     Π(u) = ∫ W(I + ∇u) dX − κ fᵀu   subject to   u = 0 on the supports,  g(u) ≥ 0
 
-with the gaps g of the contact rows. At u^j, with r = Π'(u^j) and the rows
-B = −g'(u^j), c = g(u^j) + B u^j of `problems.contact.linearise`, Newton's iteration (a
-step of sequential quadratic programming: Nocedal and Wright 2006, ch. 18) is a QP in
-the total displacement, so that errors are relative to u and not to an increment:
+with the gaps g of the contact rows. Let r = Π'(u^j) at the iterate u^j, and let
+B = −g'(u^j) and c = g(u^j) + B u^j be the rows of `problems.contact.linearise`. An
+iteration of Newton's method (a step of sequential quadratic programming: Nocedal and
+Wright 2006, ch. 18) is a QP in the total displacement, so that errors are relative to
+u and not to an increment:
 
     min ½uᵀK u + (r − K u^j)ᵀu   subject to   B_D u = 0,   B u ≤ c.                (1)
 
@@ -15,11 +17,11 @@ the total displacement, so that errors are relative to u and not to an increment
 allow, which is tested by a Cholesky factorisation. Otherwise negative eigenvalues of
 the tangents of single cells are raised (`problems.fem.finite_strain.convex_tangent`).
 The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
-previous iteration ("geometric" contact stiffness), may be added to the tangent; without
-them convergence is linear if both sides deform. The term ρB_DᵀB_D is added to K. It
-vanishes where u = 0 on the supports and makes K definite on rotations, on which the
-tangent of a compressed body is indefinite rather than singular. The kernel that remains
-consists exactly of the translations that the supports allow.
+previous iteration ("geometric" contact stiffness), may be added to the tangent. Without
+these derivatives, convergence is linear if both sides deform. The term ρB_DᵀB_D is
+added to K. This term vanishes where u = 0 on the supports and makes K definite on
+rotations, on which the tangent of a compressed body is indefinite rather than singular.
+The remaining kernel of K consists of the translations that the supports allow.
 
 *Line search*: with the solution u of (1), d = u − u^j and a weight w above ‖λ‖∞, d is a
 descent direction of the exact penalty function (Nocedal and Wright, (18.27))
@@ -32,11 +34,14 @@ because curved constraints may increase φ near the solution (Maratos effect). E
 step halves the smallest residual, so that only finitely many occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
-segments. If the iteration does not converge, pressing nodes keep their closest segments
-and may slide slightly beyond them along their lines.
+segments. If the iteration does not converge, pressing nodes, those with multipliers
+λ_i > 0, are assigned to their closest segments. They keep these segments and may slide
+slightly beyond their ends, along the straight lines through the segments.
 
-*Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new u
-with the multipliers of the QP, is at most TOLERANCE plus a bound of its rounding error.
+*Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new
+iterate with the multipliers of the QP, is at most TOLERANCE plus a bound of its
+rounding error.
+
 *Load*: if the iteration fails, the load increment is halved, down to the fraction
 2^−MAX_HALVINGS of the load step.
 """
@@ -99,10 +104,10 @@ MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
 ARMIJO_FRACTION = 1e-4  #: required share of the decrease predicted by the slope
 #: weight of the penalty relative to the largest multiplier; above 1 it is exact
 PENALTY_FACTOR = 1.5
-MAX_ROTATION = 1e-8  #: rotational share of a rigid motion that counts as rounding
+MAX_ROTATION = 1e-8  #: largest rotational share of a motion that counts as rounding
 
-#: displacement (n,) in m, multipliers (m,) in N/m → blocks (m, k, k) in Pa of
-#: −Σ λ_i g_i''(u), and their components (m, k)
+#: maps a displacement (n,) in m and multipliers (m,) in N/m to blocks −λ_i g_i''(u),
+#: (m, k, k) in Pa, and their displacement components (m, k)
 Curvature = Callable[[Vector, Vector], tuple[NDArray[np.float64], NDArray[np.int64]]]
 
 
@@ -112,7 +117,8 @@ class Gaps(NamedTuple):
     linearise: Linearise
     curvature: Curvature | None = None  #: None if contact stiffness is neglected
     #: returns, for a displacement (n,) in m and a mask (places,) of slave nodes, gaps
-    #: with these nodes kept on their closest segments; None if there are no segments
+    #: with these nodes kept on their closest segments; None if the method of contact
+    #: has no segments, or if nodes already keep their segments
     keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
@@ -144,10 +150,10 @@ class Configuration(NamedTuple):
 
     u: Vector
     rows: ContactRows
-    gap: Vector  #: (m,) nondimensional
+    gap: Vector  #: (m,) gaps of the contact rows, nondimensional
     cells: EnergyDerivatives
-    energy: float  #: Π
-    r: Vector  #: (n,) Π'
+    energy: float  #: Π(u), nondimensional
+    r: Vector  #: (n,) gradient Π'(u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +195,7 @@ class NewtonPath:
         return self._steps[k - 1]
 
     def parts(self, k: int) -> int:
-        """Return the number of increments of load step k; 1 if it was not halved."""
+        """Return the number of load increments of step k; 1 if none was halved."""
         self.iterations(k)
         return self._parts[k - 1]
 
@@ -212,7 +218,13 @@ class NewtonPath:
         return reached.energy, self.residual(reached, lam, at.load_factor), penetration
 
     def _load_step(self, k: int) -> tuple[list[Iteration], int]:
-        """Solve step k from the end of step k − 1; halve the increment on failure."""
+        """Solve step k from the end of step k − 1; halve increments that fail.
+
+        Returns
+        -------
+        iterations at the full load of the step, and the number of load increments
+
+        """
         if self._kernel_defect:
             raise InputError(self._kernel_defect)
         reached, target = (k - 1) / self.steps, k / self.steps
@@ -243,8 +255,8 @@ class NewtonPath:
         """Return advice for a load at which the iteration did not converge.
 
         The entries of F = I + ∂u/∂X have rounding errors of about eps. In cells of size
-        h these cause forces of about eps·h|K|·1 at any load. Relative to a tiny load,
-        such forces exceed TOLERANCE.
+        h, these errors cause forces of about eps·h|K|·1 at any load, where 1 is the
+        vector of ones. Relative to a tiny load, such forces exceed TOLERANCE.
         """
         h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
         rounded = h * self._free_norm(
@@ -277,7 +289,7 @@ class NewtonPath:
         return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
 
     def _at_places(self, at: Iteration) -> Vector:
-        """Return multipliers (places,) of all slave nodes; zero where no row exists."""
+        """Return multipliers (places,) of slave nodes; zero for nodes without a row."""
         force = np.zeros(self._places)
         force[at.rows.place] = np.maximum(at.answer.z, 0.0)
         return force
@@ -285,10 +297,16 @@ class NewtonPath:
     def _solve_load(
         self, load_factor: float, u: Vector, lam: Vector
     ) -> list[Iteration]:
-        """Return the iterations at one load, from u and the multipliers (places,).
+        """Return the iterations at one load, starting from u and the multipliers `lam`.
 
-        If the iteration stalls or takes KEEP_AFTER iterations, pressing nodes keep
-        their segments from then on.
+        If a line search fails, or after KEEP_AFTER iterations, pressing nodes keep
+        their closest segments in all further iterations.
+
+        Parameters
+        ----------
+        u : (n,) initial displacement, nondimensional
+        lam : (places,) initial multipliers of the slave nodes
+
         """
         gaps = self.gaps
         at = self._configuration(u, load_factor, gaps)
@@ -341,12 +359,14 @@ class NewtonPath:
         )
 
     def residual(self, at: Configuration, lam: Vector, load_factor: float) -> float:
-        """Return the residual of equilibrium and contact for multipliers (places,).
+        """Return the residual of equilibrium and contact at a configuration.
 
         The residual is the maximum of three terms: ‖r + Bᵀλ‖ on the free components,
         relative to the larger of the norms of the load and of Bᵀλ; the largest
         penetration; and the largest |g_i| λ_i / max λ (complementarity). Gaps are
         divided by the unit of length of the bodies.
+
+        lam : (places,) multipliers λ of the slave nodes
         """
         pressing = lam[at.rows.place]
         contact = at.rows.B.T @ pressing
@@ -357,13 +377,13 @@ class NewtonPath:
         return max(imbalance, penetration, complementarity)
 
     def _forces(self, at: Configuration, lam: Vector, load_factor: float) -> float:
-        """Return the larger norm of the load and of Bᵀλ; 1 if both are zero."""
+        """Return the larger of the norms of the load and of Bᵀλ; 1 if both are zero."""
         contact = at.rows.B.T @ lam[at.rows.place]
         load = self._free_norm(load_factor * self.bodies.f)
         return max(load, self._free_norm(contact)) or 1.0
 
     def _free_norm(self, force: Vector) -> float:
-        """Return the norm of a force (n,) on the unsupported components."""
+        """Return the Euclidean norm of a force (n,) on the unsupported components."""
         free = np.ones(force.size, dtype=bool)
         free[self.bodies.B_D.indices] = False
         return float(np.linalg.norm(force[free]))
@@ -400,10 +420,12 @@ class NewtonPath:
     def _convex(
         self, at: Configuration, lam: Vector, curvature: Curvature | None
     ) -> tuple[csc_array, GeneralisedInverse, int]:
-        """Return a positive definite tangent, its factor and `Iteration.clipped`.
+        """Return a tangent, its inverse and the number of clipped cell tangents.
 
-        If the tangent is indefinite, negative eigenvalues of the contact stiffness are
-        removed first. If that does not suffice, those of the cell tangents follow.
+        The tangent is positive definite on the motions that the supports allow, except
+        for translations. If the exact tangent is indefinite, negative eigenvalues of
+        the contact stiffness are removed first, and those of cell tangents only if this
+        does not suffice.
         """
         supports = self.bodies.B_D
         factorised: list[tuple[csc_array, GeneralisedInverse]] = []
@@ -473,9 +495,9 @@ class NewtonPath:
             return str(e)
         if self.gaps.curvature is not None and not self._is_supported:
             return (
-                "contact_stiffness=geometric where contact alone holds a body is not "
-                "built: its translations change the contact forces; expected "
-                "contact_stiffness=none, or supports that hold every body"
+                "contact_stiffness=geometric is not built for bodies supported by "
+                "contact alone, because their translations change the contact forces; "
+                "expected contact_stiffness=none, or supports that fix every body"
             )
         return ""
 
@@ -541,7 +563,8 @@ def _merit(at: Configuration, weight: float) -> float:
 def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
     """Return an orthonormal basis (n, r) of the rigid motions that the supports allow.
 
-    Rotations are those of the undeformed bodies; translations hold for any deformation.
+    Rotations refer to the undeformed bodies; translations do not depend on the
+    deformation.
     """
     rigid = bodies.rigid
     fixed = rigid[bodies.B_D.indices]
@@ -577,7 +600,7 @@ def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
 
 
 def sliding_inverse(tangent: Bodies) -> GeneralisedInverse:
-    """Factorise K for the form `dual`; the kernel consists of free translations."""
+    """Factorise K for the form `dual`, with the free translations as kernel."""
     kernels = free_translations(tangent)
     owner, points = tangent.body_of_node, tangent.mesh.points
     dim, none = tangent.mesh.dim, np.zeros(0, dtype=np.int64)

@@ -50,7 +50,7 @@ def newton_path(
 ) -> NewtonPath:
     """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
-    linearise : linearisation of contact by the method in `params`
+    linearise : linearises contact by the method that `params` select
     params : keys of the case; `material` is required, `contact` and
         `contact_stiffness` are optional
     """
@@ -82,7 +82,7 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Return the nondimensional cells of bodies, in the units l and F₀ of their K."""
+    """Return the cells of bodies, nondimensional in the same units l and F₀ as K."""
     l, F = bodies.length, bodies.force
     mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
     laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
@@ -99,8 +99,8 @@ def newton_case(
     """Return the case of a Newton iteration in one of the FORMS of `case_forms`.
 
     The objective is the quadratic model of the potential Π at the iterate, whereas the
-    quantity `energy` is Π itself. All forms have the same K, whose kernel consists of
-    translations, so that they describe the same QP.
+    quantity `energy` is Π itself. K, whose kernel consists of translations, is the same
+    in all forms, so that all forms describe the same QP.
 
     Parameters
     ----------
@@ -156,10 +156,11 @@ def newton_case(
 
 
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
-    """Evaluate the nonlinear problem at an answer; NaN if a cell is inverted.
+    """Evaluate the nonlinear problem at a solution of its QP.
 
     The keys are `energy`, Π in J/m; `residual`, see `NewtonPath.residual`; and
-    `penetration`, the largest penetration in m.
+    `penetration`, the largest penetration in m. All values are NaN if a cell is
+    inverted.
     """
     try:
         energy, residual, penetration = path.state(at, s)

@@ -1,7 +1,8 @@
 """Description of a contact problem, returned by its family, before assembly.
 
-The QPs of undivided bodies (`problems.duality.monolithic`) and of decomposed bodies on
-one or several processes (`problems.duality.decomposed`) are derived from it.
+From this description, `problems.duality.monolithic` derives the QPs of undivided
+bodies, and `problems.duality.decomposed` those of decomposed bodies on one or several
+processes.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ from mortarbench.problems.feti.tearing import (
     grid_positions,
 )
 
-Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m → rows
+#: function that linearises contact at a displacement (n,) in m
+Linearise: TypeAlias = Callable[[Vector], ContactRows]
 
 
 class Shape(Protocol):
@@ -75,7 +77,7 @@ class Shape(Protocol):
     def sides(self) -> Mapping[str, Nodes]:
         """Contact sides by name: chains of nodes in the plane, faces in space.
 
-        In the plane they are available without generating the mesh.
+        In the plane, this property does not generate the mesh.
         """
 
     def layout(self, size: int) -> Subdivision:
@@ -87,7 +89,7 @@ B = TypeVar("B", StructuredGrid, HalfDisc)
 
 @dataclass(frozen=True, eq=False)
 class _Joined(Generic[B]):
-    """Plane bodies of parametric shape, with consecutive numbers of nodes."""
+    """Plane bodies of parametric shape; their nodes are numbered body by body."""
 
     parts: tuple[B, ...]
     dim = 2
@@ -220,7 +222,7 @@ class ElasticBodies:
     length: float  #: l, m: unit of length of the QPs
     force: float  #: F₀, N/m in the plane, N in space: unit of force of the QPs
     fixed: Nodes  #: components with u = 0
-    forces: Forces
+    forces: Forces  #: full load
     pairs: tuple[ContactPair, ...]
 
     @cached_property
@@ -260,7 +262,14 @@ class ElasticBodies:
 
     @cached_property
     def clamped(self) -> GeneralisedInverse:
-        """K⁺, zero at fixed components; InputError if a rigid motion remains."""
+        """K⁺ with zeros at fixed components.
+
+        Raises
+        ------
+        InputError
+            If the supports allow a rigid motion of some body.
+
+        """
         return factorise_clamped(self.assembled)
 
     @cached_property
@@ -291,10 +300,10 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
 
 
 class InterfaceState(NamedTuple):
-    """Data and solution of contact, restricted to the contact sides or complete."""
+    """Data and solution of contact, at all nodes or at those of the contact sides."""
 
     bodies: Bodies | ContactSides
-    #: QP at the nodes of `bodies`; of P only the diagonal is used, only for friction
+    #: QP at the nodes of `bodies`; of P, only the diagonal is used, only with friction
     primal: QP
     solution: Solution
     friction: Friction
@@ -307,8 +316,8 @@ class DisplacedMesh(NamedTuple):
     mesh: Mesh  #: N nodes
     inner: NDArray[
         np.bool_
-    ]  #: (N,) False for nodes of the layers of neighbouring cells
-    u: Vector  #: (2N,) m
+    ]  #: (N,) False for nodes that belong only to added layers of neighbouring cells
+    u: Vector  #: (dim·N,) displacement, m
 
 
 class ContactSolution(Protocol):
@@ -326,7 +335,7 @@ class ContactSolution(Protocol):
         """Return the nondimensional displacement at global components (k,)."""
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Yield the displaced meshes that together form all bodies."""
+        """Yield displaced meshes; those of all ranks together form all bodies."""
 
     def largest(self, value: float) -> float:
         """Return the maximum of a value over all ranks."""
@@ -343,8 +352,8 @@ class ContactProblem:
 
     bodies: ElasticBodies
     stages: tuple[Stage, ...]
-    #: returns the function that maps a displacement in m to contact rows, for bodies
-    #: (or their contact sides) and the friction laws of their contact pairs
+    #: given bodies (or their contact sides) and the friction laws of their contact
+    #: pairs, returns the function that maps a displacement in m to contact rows
     linearise: Callable[
         [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
     ]
@@ -371,7 +380,7 @@ CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
-    """Return the choice of a QP by the keys of a case.
+    """Return the selection of a QP from the keys of a case.
 
     Raises
     ------

@@ -26,8 +26,8 @@ enum {
     DEPTH = 256 /* rows of X per pass: DEPTH * WIDTH doubles (24 KiB) fit the L1 cache */
 };
 
-/* Y += M X for ROWS rows of M, or one, and w <= 3 vectors of four columns; X is packed by
-   rows. `some` <= 4w is the number of columns that exist. */
+/* Y += M X for `rows` rows of M (ROWS or 1) and `some` columns. Each row of the packed X
+   consists of w <= 3 vectors of four columns, padded with zeros: some <= 4w. */
 INLINE void
 add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y,
          Py_ssize_t columns, Py_ssize_t some)
@@ -53,7 +53,7 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
                 Y[r * columns + c] += sum[r][c / 4][c % 4];
 }
 
-/* Y += M X for all rows of M (rows, n) and `some` <= 4w columns; X is packed by rows. */
+/* Y += M X for all rows of M (rows, n); `X`, `w` and `some` as in add_tile. */
 INLINE void
 add_strip(in M, Py_ssize_t rows, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y,
           Py_ssize_t columns, Py_ssize_t some)

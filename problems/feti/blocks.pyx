@@ -2,8 +2,8 @@
 """Products of dense blocks with the columns of all subdomains of a class.
 
 BLAS copies (packs) the block in every product, which takes a third of the time of a
-product with two dozen columns; this module does not copy it. It is compiled when the
-package is installed; `blocks.pyi` declares its types.
+product with two dozen columns; this module avoids that copy. The module is compiled
+when the package is installed; `blocks.pyi` declares its types.
 """
 
 from libc.stdlib cimport calloc, free
@@ -22,17 +22,18 @@ cdef extern from "blocks.h" nogil:
 
 ctypedef struct block:
     Py_ssize_t rows, n, members
-    const double *entries  # NULL for an object of Python
+    const double *entries  # NULL if the block is an object with `@`
     bint is_triangle
 
 
 cdef class BlockDiagonal(LinearMap):
     """Block diagonal map of packed vectors; block M_g (r_g, n_g) acts on S_g subdomains.
 
-    The part of a vector that belongs to a block is a matrix (n_g, S_g), row-major.
+    The entries of a vector for one block form a matrix (n_g, S_g), stored by rows.
 
-    blocks : for each g an array (r_g, n_g), or an object with `@`; for S_g = 1 and a
-        symmetric block also its upper triangle, column by column, (n_g (n_g + 1)/2,)
+    blocks : for each g an array (r_g, n_g) or an object with `@`. If S_g = 1, a
+        symmetric block may be replaced by its upper triangle (n_g (n_g + 1)/2,),
+        stored by columns
     sizes : n_g for each g
     members : S_g for each g
 

@@ -1,16 +1,18 @@
 """The dual of decomposed bodies, distributed over MPI ranks.
 
-Each rank stores some of the subdomains and, for every vector of multipliers, the rows
-that it *owns*. A row of B that touches subdomains of several ranks is owned by one of
-them, round-robin, and is a *ghost* row of the others. The other ranks receive its
-multiplier before a product with B_pᵀ, and send back their contributions afterwards:
+Each rank p stores some of the subdomains, with stiffness K_p and columns B_p of B, and
+for every vector of multipliers the entries of the rows that it *owns*. A row of B that
+touches subdomains of several ranks is owned by one of these ranks, chosen round-robin,
+and is a *ghost* row of the others. Before a product with B_pᵀ, the owner sends the
+multiplier of the row to the other ranks; afterwards, these ranks send back their
+contributions to
 
-    F λ = Σ_ranks B_p K_p⁺ B_pᵀ λ
+    F λ = Σ_p B_p K_p⁺ B_pᵀ λ
 
 No rank stores an array of global size, only the columns of B and the rows of vectors
 that its subdomains touch. Graph partitioning (METIS) distributes the subdomains so
 that the work is balanced and few rows are shared. If a class occurs on several ranks,
-one of them computes its explicit blocks and sends them to the others.
+one of these ranks computes the explicit blocks and sends them to the other ranks.
 """
 
 from __future__ import annotations
@@ -64,8 +66,8 @@ from mortarbench.problems.feti.subdomain_classes import (
     Subdomains,
 )
 
-#: share of the work on a class spent after the factorisation of its stiffness matrix;
-#: an estimate, used only to balance the load of the ranks
+#: estimated share of the work on a class that follows the factorisation of its
+#: stiffness matrix; used only to balance the load of the ranks
 BLOCK_SHARE = 0.25
 
 
@@ -86,7 +88,8 @@ def partition(
 ) -> Partition:
     """Distribute the subdomains and the rows of B (m, N) over ranks.
 
-    discs : the rows of a disc reach the same ranks, those that any of them touches
+    discs : sets of friction multipliers; if a rank touches one row of a disc, all rows
+        of the disc reach this rank
 
     Raises
     ------
@@ -118,18 +121,19 @@ def partition(
 
 
 def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return an owner for each of some rows (t,), round-robin among those it touches.
+    """Return the owner (t,) of each row, round-robin among the ranks it touches.
 
-    group : number of the first row of the same disc, or of the row itself; the rows of
-        a disc have one owner, since they reach the same ranks
-    reach : (t, ranks) the ranks that touch them, ascending
+    group : (t,) number of the first row of the disc that contains the row, or of the
+        row itself; all rows of a disc have the same owner, because they reach the same
+        ranks
+    reach : (t, ranks) nonzero where a rank touches a row, with ascending indices
     """
     turn = group % np.diff(reach.indptr)
     return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work (S,) of a product per subdomain: the size of its dense block."""
+    """Return the work (S,) per subdomain of a product: the size of its dense block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 
@@ -155,12 +159,18 @@ def balanced_partition(
 
     Parameters
     ----------
-    graph : (S, S) number of rows shared by two subdomains
+    graph : (S, S) number of rows shared by each pair of subdomains
+    work, size : (S,) work and size of each subdomain, each in an arbitrary unit
     cluster : (S,) cluster of each subdomain; clusters are not split between ranks
 
     Returns
     -------
     rank of each subdomain, (S,)
+
+    Raises
+    ------
+    InputError
+        If there are fewer subdomains (or clusters) than ranks.
 
     """
     name = "subdomain"
@@ -198,7 +208,7 @@ def balanced_partition(
 def _partitioned(
     graph: csr_array, weight: NDArray[np.int64], ranks: int, seed: int | None = None
 ) -> NDArray[np.int64]:
-    """Partition a graph with weights (S,) of its vertices by METIS."""
+    """Partition a graph with vertex weights (S,); return the rank of each vertex."""
     from pymetis import CSRAdjacency, Options, part_graph  # not needed on one rank
 
     _, labels = part_graph(
@@ -219,24 +229,27 @@ def _partitioned(
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """Rows of B that a rank touches: its owned rows, and ghosts owned by neighbours.
+    """Rows of B that touch a rank: its owned rows, and ghost rows of other ranks.
 
-    A message contains the values of all rows shared with one neighbour, sorted by row.
+    A message to another rank contains the values of all rows shared with that rank,
+    sorted by row.
     """
 
     ranks: Ranks
     rows: Nodes  #: (t,) all rows that this rank touches or owns, ascending
-    owned: Nodes  #: (o,) places of the owned rows in `rows`
-    #: (l,) places in `owned` of the rows that are ghosts elsewhere, ordered by rank
+    owned: Nodes  #: (o,) indices of the owned rows in `rows`
+    #: (l,) indices in `owned` of the ghost rows of other ranks, ordered by these ranks
     exported: Nodes
-    #: (t − o,) places in `rows` of the ghosts, ordered by their owners
+    #: (t − o,) indices in `rows` of the ghost rows, ordered by their owners
     ghosts: Nodes
-    export_counts: NDArray[np.int64]  #: (ranks,) values sent to each rank, l in all
-    ghost_counts: NDArray[np.int64]  #: (ranks,) values received from each rank
+    #: (ranks,) number of values sent to each rank by `start_gather`, l in all
+    export_counts: NDArray[np.int64]
+    #: (ranks,) number of values received from each rank by `start_gather`
+    ghost_counts: NDArray[np.int64]
 
     @property
     def is_shared(self) -> NDArray[np.bool_]:
-        """Mask (t,) of the rows that other ranks touch as well."""
+        """Mask (t,) of the rows that several ranks store."""
         shared = np.zeros(self.rows.size, dtype=bool)
         shared[self.ghosts] = shared[self.owned[self.exported]] = True
         return shared
@@ -246,7 +259,8 @@ class Halo:
 
         Returns
         -------
-        function that waits for the values (t − o,) of the ghosts of this rank
+        function that waits for the values (t − o,) of the ghost rows of this rank and
+        returns them
         """
         with self.ranks.clocked("exchange"):
             return self.ranks.exchange(
@@ -258,8 +272,8 @@ class Halo:
 
         Returns
         -------
-        function that waits for the contributions of other ranks, adds them to its
-        argument, the values (o,) of the owned rows, in place, and returns it
+        function of the values (o,) of the owned rows; it waits for the contributions of
+        other ranks, adds them to these values in place, and returns the sum
 
         """
         with self.ranks.clocked("exchange"):
@@ -287,7 +301,7 @@ class Halo:
 def build_halo(
     ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]
 ) -> Halo:
-    """Return the owned and ghost rows of this rank, and its neighbours.
+    """Return the owned rows and ghost rows of this rank.
 
     Parameters
     ----------
@@ -319,8 +333,9 @@ def build_halo(
 class RowsOverRanks:
     """Local rows of B for the products Bᵀx and By with distributed vectors.
 
-    Messages are posted first and completed after the products with owned rows, so that
-    communication and computation overlap.
+    M is the number of columns of the local rows. Messages are posted first and
+    completed after the products with owned rows, so that communication and computation
+    overlap.
     """
 
     halo: Halo
@@ -329,7 +344,7 @@ class RowsOverRanks:
     ghosts: CompressedRows  #: (t − o, M) ghost rows
     #: (k, t − o) nonzero rows of the transpose of `ghosts`
     ghosts_transposed: CompressedRows
-    reached: Nodes  #: (k,) numbers of these rows in the transpose
+    reached: Nodes  #: (k,) indices of these nonzero rows in the transpose
 
     @classmethod
     def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
@@ -346,7 +361,7 @@ class RowsOverRanks:
         )
 
     def transposed_times(self, x: Vector) -> Vector:
-        """Return Bᵀx (M,) on this rank, from its slice x (o,)."""
+        """Return Bᵀx (M,) on this rank, given the owned slice of x, (o,)."""
         arrived = self.halo.start_gather(x)
         with self.halo.ranks.clocked("products"):
             X = self.transposed @ x
@@ -354,7 +369,7 @@ class RowsOverRanks:
         return X
 
     def times(self, X: Vector) -> Vector:
-        """Return the owned slice (o,) of Σ_ranks B X, with X (M,) on each rank."""
+        """Return the owned slice (o,) of Σ_p B_p X_p, given X_p (M,) of this rank p."""
         with self.halo.ranks.clocked("products"):
             added = self.halo.start_accumulate(self.ghosts @ X)
             return added(self.owned @ X)
@@ -364,12 +379,12 @@ class RowsOverRanks:
 class RankOperator:
     """F distributed over ranks; acts on the owned slices of vectors of multipliers."""
 
-    local: DualOperator  #: part of F from the local subdomains, on all touched rows
+    local: DualOperator  #: contribution of the local subdomains, on all touched rows
     halo: Halo
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Shape of the owned slice, (o, o)."""
+        """Shape (o, o) of the operator on owned slices."""
         return (self.halo.owned.size,) * 2
 
     def __call__(self, x: Dense) -> DistributedVector:
@@ -401,10 +416,10 @@ class RankOperator:
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
     def average_forces(self) -> DistributedColumns:
-        """Return a basis, as rows (c, o), of the multipliers with Fλ = 0.
+        """Return a basis of the multipliers with Fλ = 0 as rows (c, o).
 
-        They satisfy Bᵀλ = Cᵀμ for some μ, with C of `Clusters`: their forces are
-        orthogonal to all displacements with Cv = 0. Without clusters, c = 0.
+        These multipliers satisfy Bᵀλ = Cᵀμ for some μ, with C of `Clusters`: the forces
+        Bᵀλ do no work on displacements v with Cv = 0. Without clusters, c = 0.
         """
         halo, packed, clusters = self.halo, self.local.packed, self.local.clusters
         touched = csr_array((0, halo.rows.size))
@@ -438,7 +453,7 @@ class RankOperator:
         return product
 
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
-        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows.
+        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, with a diagonal matrix W of weights.
 
         Most equality rows (all of them if gluing is orthonormal) are uncoupled and only
         require a division. The system of the coupled equality rows is solved
@@ -446,7 +461,8 @@ class RankOperator:
         their system is factorised in distributed form, or redundantly if ranks share
         many of these rows.
 
-        part : (t, t) contribution of the local subdomains to B W Bᵀ, summed over ranks
+        part : (t, t) contribution of the local subdomains to B W Bᵀ, which is the sum
+            of the contributions of all ranks
         """
         halo, equalities = self.halo, self.local.equalities
         diagonal = halo.accumulate(part.diagonal())
@@ -475,8 +491,9 @@ class RankOperator:
 def _coupled(
     part: csr_array, halo: Halo, diagonal: Vector, selected: NDArray[np.bool_]
 ) -> Nodes:
-    """Return the selected rows that the sum of `part` over all ranks couples.
+    """Return the numbers of the selected rows that are coupled to each other.
 
+    Two rows are coupled if their entry in the sum of `part` over all ranks is nonzero.
     Entries below `COUPLING_ROUNDING`, relative to the diagonal, count as zero.
     """
     row, column = part.tocoo().coords
@@ -509,7 +526,7 @@ def _distributed_inverse(
 
     Returns
     -------
-    places of the factorised rows among the owned ones, and the inverse on these rows
+    indices of the factorised rows among the owned rows, and the inverse on these rows
 
     """
     size = 1 / np.sqrt(halo.gather(diagonal)[np.searchsorted(halo.rows, rows.rows)])
@@ -537,7 +554,7 @@ def _replicated_inverse(
 
     Returns
     -------
-    places of the selected rows among the owned ones, and the inverse on these rows
+    indices of the selected rows among the owned rows, and the inverse on these rows
 
     """
     ranks, entries = halo.ranks, part.tocoo()
@@ -570,7 +587,7 @@ class Assignment(NamedTuple):
     work: int  #: estimated work, in one arbitrary unit for all classes
     ranks: list[int]  #: ranks with subdomains of the class
     factor_rank: int  #: rank that factorises the stiffness matrix
-    block_rank: int  #: rank that computes the blocks and sends them to the others
+    block_rank: int  #: rank that computes the blocks and sends them to other ranks
 
 
 def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
@@ -578,8 +595,8 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
 
     In order of decreasing work, each class is assigned to the rank with the smallest
     load so far (longest processing time first, Graham 1969). The computation of blocks,
-    which follows the factorisation, is then moved from ranks with higher loads to
-    others.
+    which follows the factorisation, is then reassigned from ranks with high loads to
+    ranks with low loads.
 
     work : for each rank, a map from the names of its classes to their work
     """
@@ -595,7 +612,7 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
         tasks[name] = Assignment(size[name], have[name], rank, rank)
     for name, task in tasks.items():
         rank, part = min(task.ranks, key=loads.__getitem__), BLOCK_SHARE * task.work
-        # after the move both loads are at most the larger one before, less `part`
+        # move only if the larger of the two loads decreases by at least `part`
         if loads[rank] + 2 * part <= loads[task.factor_rank]:
             loads[rank] += part
             loads[task.factor_rank] -= part
@@ -607,7 +624,8 @@ def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
     """Return the number of blocks that a rank computes before factors are exchanged.
 
     Such blocks only require factors of this rank, and are computed while slower ranks
-    still factorise. If no factors are exchanged, all blocks are computed at once.
+    are still factorising. If no factors are exchanged, the result is the number of all
+    blocks of the rank.
     """
     factors: dict[int, float] = {}
     for task in tasks.values():
@@ -631,9 +649,9 @@ def condense_over_ranks(
     """Yield the blocks of all groups; equal groups are condensed on one rank only.
 
     For classes that occur on several ranks, each rank computes the factors assigned to
-    it, then some blocks while slower ranks factorise. Next, factors are exchanged, the
-    remaining blocks are computed, and blocks are exchanged. Blocks of a class that
-    occurs on this rank alone are yielded immediately and not stored.
+    it, then some blocks while slower ranks are still factorising. Next, factors are
+    exchanged, the remaining blocks are computed, and blocks are exchanged. Blocks of a
+    class that occurs on this rank alone are yielded immediately and not stored.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     groups_by_name = dict(zip(names, groups, strict=True))
@@ -719,7 +737,7 @@ def _name(group: Group) -> str:
 
 
 def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
-    """Return the share of this rank in a dual of decomposed bodies.
+    """Return the part of a dual QP of decomposed bodies that this rank stores.
 
     Raises
     ------
@@ -768,7 +786,7 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
 def gather_on_rank_0(halo: Halo, count: int) -> Callable[[Solution], Solution | None]:
     """Return a function that gathers a solution of `count` multipliers on rank 0.
 
-    It returns None on all other ranks.
+    On all other ranks, this function returns None.
     """
 
     def whole(s: Solution) -> Solution | None:

@@ -3,9 +3,12 @@
 Each rank assembles the rows that it owns from its local subdomains
 (`problems.feti.subdomains`). Contact rows are linearised from the contact sides alone.
 
-Ranks exchange the points of one subdomain of each class that may occur on several
-ranks, so that congruent subdomains have the same frame on all of them; contributions to
-rows of q and RᵀBᵀ that other ranks own; and contributions to Rᵀf.
+The ranks exchange
+
+* the points of one subdomain of each class that may occur on several ranks, so that
+  all ranks use the same frame for congruent subdomains,
+* contributions to entries of q and columns of RᵀBᵀ for rows of B owned by other ranks,
+* contributions to Rᵀf.
 """
 
 from __future__ import annotations
@@ -57,25 +60,28 @@ from mortarbench.problems.feti.subdomains import (
 
 @dataclass(frozen=True, eq=False)
 class LocalDual:
-    """Rows of a dual that a rank owns; all ranks must evaluate members together."""
+    """Dual QP on the rows owned by one rank.
+
+    All ranks must evaluate each member together.
+    """
 
     subdomains: LocalSubdomains
 
     @cached_property
     def halo(self) -> Halo:
-        """Owned rows and ghosts of this rank."""
+        """Owned rows and ghost rows of this rank."""
         rows = self.subdomains.rows
         owner = assign_owners(rows.group, rows.reach)
         return build_halo(self.subdomains.ranks, rows.number, rows.reach, owner)
 
     @cached_property
     def explicit(self) -> NDArray[np.bool_]:
-        """Flags of the classes with explicit blocks."""
+        """Mask (classes,) of the local subdomain classes with explicit blocks."""
         return explicit_classes(self.subdomains.rows.B, self.subdomains.domains)
 
     @cached_property
     def q(self) -> Vector:
-        """The linear term −d = c − BK⁺f (o,) at owned rows."""
+        """Linear term −d = c − BK⁺f of the dual at the owned rows, (o,)."""
         local = self.subdomains
         return np.asarray(
             local.rows.c[self.halo.owned]
@@ -84,16 +90,16 @@ class LocalDual:
 
     @cached_property
     def G(self) -> csr_array:
-        """Columns of RᵀBᵀ (r, o) for owned rows."""
+        """Columns of the equality matrix RᵀBᵀ for the owned rows of B, (r, o)."""
         return _coarse_rows(self.subdomains, self.halo.rows[self.halo.owned])
 
     @cached_property
     def b(self) -> Vector:
-        """Right-hand side Rᵀf (r,), on every rank."""
+        """Right-hand side Rᵀf of the equalities, (r,), equal on every rank."""
         return _resultants(self.subdomains)
 
     def share(self) -> Share:
-        """Return the share of this rank in the dual QP, without factorising yet."""
+        """Return the dual QP on this rank; matrices are factorised on first use."""
         rows, domains, ranks = (
             self.subdomains.rows,
             self.subdomains.domains,
@@ -124,7 +130,7 @@ class LocalDual:
     def sets(self, bound: Vector) -> tuple[Box, DistributedDiscs]:
         """Return the sets of the multipliers of owned rows: λ_n ≥ 0 and ‖λ_t‖ ≤ g.
 
-        bound : (k,) friction bounds
+        bound : (k,) friction bounds g
         """
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
         contact = self.subdomains.problem.contact
@@ -147,7 +153,7 @@ class LocalDual:
 
 
 def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
-    """Distribute the subdomains of a problem over ranks; called by all of them.
+    """Distribute the subdomains of a problem; all ranks must call this together.
 
     Raises
     ------
@@ -169,13 +175,15 @@ def distributed_qp(
 ) -> DistributedQP:
     """Return the distributed dual QP; all ranks must call this function together.
 
-    If the QP depends on solutions of previous problems, its data differ by rounding
-    between numbers of ranks. Its digest is then computed from the first of these
-    problems and their number, so that it does not depend on the number of ranks.
+    If the QP depends on solutions of previous problems, runs with different numbers of
+    ranks have different rounding errors in its data. In this case, the digest of the QP
+    is computed from the first of these problems and their number, so that it is
+    independent of the number of ranks.
 
     Parameters
     ----------
-    results : evaluates physical results; None if they require the undivided bodies
+    results : function that evaluates physical results; None if they require the
+        undivided bodies
     first : first of the previous problems; None if there are no previous problems
     others : number of previous problems
 
@@ -207,10 +215,11 @@ def distributed_qp(
 def _decomposition(
     local: LocalSubdomains, explicit: NDArray[np.bool_]
 ) -> dict[str, Any]:
-    """Return the quantities of `decomposition_quantities` for all ranks together.
+    """Return the quantities of the decomposition for all ranks together.
 
+    The keys are those of `problems.duality.feti_dual.decomposition_quantities`.
     `explicit_mib` is the sum over ranks: if a class occurs on several ranks, each of
-    them stores its blocks.
+    these ranks stores its blocks.
     """
     domains, rows, ranks = local.domains, local.rows, local.ranks
     sizes = np.array([part.size for part in touched_components(rows.B, domains)])
@@ -232,8 +241,9 @@ def _decomposition(
 def _digest(local: LocalSubdomains) -> str:
     """Return a digest of the QP that does not depend on the distribution over ranks.
 
-    It combines the digests of all subdomains in order (class, load and columns of B)
-    and the contact data, which are replicated.
+    It is computed from the digests of the class, load and columns of B of every
+    subdomain, in the order of the subdomains, and from the contact data and clusters,
+    which are equal on all ranks.
     """
     domains, rows, contact = local.domains, local.rows, local.problem.contact
     names = [kind.name.encode() for kind in domains.classes]
@@ -258,7 +268,7 @@ def _digest(local: LocalSubdomains) -> str:
 def _replicated_partition(
     problem: DecomposedProblem, ranks: Ranks
 ) -> NDArray[np.int64]:
-    """Return the rank of each subdomain (S,), identical on all ranks.
+    """Return the rank of each subdomain (S,); check that all ranks agree.
 
     Every rank partitions the graph with its own METIS library, and different versions
     may compute different partitions.
@@ -266,7 +276,8 @@ def _replicated_partition(
     Raises
     ------
     InputError
-        If the partitions differ, or if there are fewer subdomains than ranks.
+        If the subdomains or their ranks differ between ranks, or if there are fewer
+        subdomains than ranks.
 
     """
     ranks_of = subdomains_of(problem, ranks.size)
@@ -275,14 +286,17 @@ def _replicated_partition(
     )
     if len(set(ranks.comm.allgather(digest))) > 1:
         raise InputError(
-            "ranks have cut the bodies into different subdomains; expected the same "
-            "version of METIS on all nodes"
+            "the subdomains of the bodies differ between ranks; expected the same "
+            "version of METIS on all computers"
         )
     return ranks_of
 
 
 def _coarse_rows(local: LocalSubdomains, mine: Nodes) -> csr_array:
-    """Return the columns (r, o) of RᵀBᵀ for the owned rows, numbered `mine`."""
+    """Return the columns (r, o) of RᵀBᵀ for the rows of B that this rank owns.
+
+    mine : (o,) global numbers of these rows, ascending
+    """
     ranks, rows = local.ranks, local.rows
     B, t = rows.B, rows.number.size
     unknown, place = np.unique(B.indices, return_inverse=True)
@@ -303,7 +317,7 @@ def _coarse_rows(local: LocalSubdomains, mine: Nodes) -> csr_array:
 
 
 def _resultants(local: LocalSubdomains) -> Vector:
-    """Return Rᵀf (r,) of all subdomains, on every rank."""
+    """Return Rᵀf (r,) of all subdomains; the result is equal on every rank."""
     loaded = np.flatnonzero(local.f)
     resultants = local.resultants(loaded, local.f[loaded])
     total = np.zeros(local.unit_motions)

@@ -1,4 +1,4 @@
-"""Local bodies and solutions of a rank, for certificates and physical results."""
+"""Data of bodies and solutions on one rank, for certificates and physical results."""
 
 from __future__ import annotations
 
@@ -36,20 +36,23 @@ from mortarbench.problems.feti.substructures import LocalProblems
 class LocalSolution:
     """Local part of a displacement, with contact multipliers replicated on all ranks.
 
-    All ranks must call its methods together; each rank receives the same values.
+    All ranks must call its methods together; the results are equal on all ranks.
     """
 
     subdomains: LocalSubdomains
     bodies: LocalBodies
-    u: Vector  #: (n,) at `bodies.components`; equal on ranks that share a component
+    u: Vector  #: (n,) at `bodies.components`; equal on ranks that store a component
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
-        """Return the displacement at global components (w,)."""
+        """Return the nondimensional displacement (w,) at global components."""
         return np.asarray(self.bodies.reduction.values_at(self.u, component))
 
     def diagonal(self, component: Nodes) -> Vector:
-        """Return the diagonal of K at global components (w,)."""
+        """Return diagonal entries (w,) of the undivided stiffness matrix K.
+
+        component : (w,) global components
+        """
         reduction = self.bodies.reduction
         places, here = reduction.places(component)
         local = np.unique(places[here])
@@ -59,22 +62,22 @@ class LocalSolution:
 
     @cached_property
     def energy(self) -> float:
-        """½uᵀKu − fᵀu, summed over all ranks."""
+        """Nondimensional potential energy ½uᵀKu − fᵀu of all bodies on all ranks."""
         v = self.bodies.parts.spread @ self.u
         work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
         return self.bodies.reduction.total(float(work))[0]
 
 
-#: solution → physical results in SI units, the same on all ranks
+#: function that evaluates physical results in SI units, equal on all ranks
 Results = Callable[[LocalSolution], Mapping[str, Any]]
 
 
 def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
     """Recover the local displacement from the multipliers of the dual.
 
-    v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of RᵀBᵀλ = Rᵀf, is averaged over
-    the copies of each node on all ranks (see `problems.duality.feti_dual`). Components
-    that supports eliminate are zero.
+    The torn displacement is v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of
+    RᵀBᵀλ = Rᵀf. The result is the average of v over the copies of each node on all
+    ranks (see `problems.duality.feti_dual`). Eliminated components are zero.
     """
     bodies, multiplicity = _local_bodies(local.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_unit_motions]
@@ -107,8 +110,9 @@ def evaluation(
 
     Parameters
     ----------
-    decomposition : result of `decomposition_quantities`
-    reported : evaluates physical results; None if they require the undivided bodies
+    decomposition : quantities of the decomposition, added to the physical results
+    reported : function that evaluates physical results; None if they require the
+        undivided bodies
 
     """
     problem = local.problem
@@ -130,21 +134,24 @@ def evaluation(
 def certifier(
     local: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
-    """Return a function that bounds the error of a displacement and its multipliers.
+    """Return a function that certifies solutions on a single process.
 
-    K : (n, n) stiffness matrix of the undivided bodies, stored on this one process
+    Its arguments are a displacement and contact multipliers; the certificate bounds the
+    error of the displacement.
+
+    K : (n, n) stiffness matrix of the undivided bodies
     """
     bodies = cache(lambda: replace(local_bodies(local), stored=csr_array(K)))
     return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
 
 
 def local_bodies(local: LocalSubdomains) -> LocalBodies:
-    """Return the local data of certificates, with supports as rows of B."""
+    """Return the data for certificates on this rank; supports are rows of B."""
     return _local_bodies(local.floating)[0]
 
 
 def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
-    """Return the local data of certificates, and the multiplicities (n,).
+    """Return the data for certificates, and the number of copies of each component.
 
     local : floating subdomains, with supports as rows of B
     """
@@ -173,13 +180,13 @@ def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
 
 
 def _force_rows(problem: DecomposedProblem) -> Nodes:
-    """Return the indices of contact rows and of friction rows with positive bounds."""
+    """Return the indices of all contact rows, and of friction rows with bounds > 0."""
     m, bound = problem.contact.rows.shape[0], problem.contact.bound
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
 def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """Return the indices of bodies with a rigid motion that the supports allow."""
+    """Return the indices of the bodies that the supports allow to move rigidly."""
     layout, d = problem.layout, problem.components
     node, axis = np.divmod(problem.fixed, d)
     body = layout.body[layout.holder(node)]
@@ -197,11 +204,14 @@ def floating_bodies(problem: DecomposedProblem) -> list[int]:
 
 
 def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-    """Return the rigid motions (k, r) at components of points, r = d (d + 1) / 2.
+    """Return the r = d (d + 1) / 2 rigid motions (k, r) at k displacement components.
 
-    The modes are those of `problems.fem.elasticity.rigid_motions`, about the origin.
+    The modes are those of `problems.fem.elasticity.rigid_motions`, with rotations about
+    the origin.
 
+    points : (k, dim) point of each component
     axis : (k,) axis of each component, 0 … d − 1
+    d : number of components per node
     """
     columns = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
     for k, l in combinations(range(d), 2):
@@ -220,9 +230,9 @@ class _Extent(NamedTuple):
     turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-        """Return the rigid motions at some points.
+        """Return rigid motions (k, r) that are orthonormal over all nodes of the body.
 
-        They are orthonormal over all nodes of the body.
+        points, axis, d : see `_motions`
         """
         motions = _motions((points - self.centre) / self.radius, axis, d)
         if self.turn is not None:
@@ -232,7 +242,7 @@ class _Extent(NamedTuple):
 
 def _floating_bodies(local: LocalSubdomains) -> FloatingBodies:
     """Return the rigid motions of all floating bodies at the local components."""
-    #: one copy of each local node among the local torn nodes
+    # index of one copy of each local node among the local torn nodes
     copy = np.unique(local.nodes.number, return_index=True)[1]
     problem, layout, d = local.problem, local.problem.layout, local.problem.components
     components = d * copy.size
@@ -277,7 +287,8 @@ def _extent(local: LocalSubdomains, points: Points, share: Vector) -> _Extent:
     Parameters
     ----------
     points : (M, dim) points of the local torn nodes
-    share : (M,) weights, whose sum over all copies of a node of the body is one
+    share : (M,) weights: the reciprocal number of copies at nodes of the body, zero at
+        all other nodes
 
     """
     total = local.ranks.total

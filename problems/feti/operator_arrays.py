@@ -34,7 +34,7 @@ class StoredOperator(DualOperator):
         return int(self.domains.class_of.size)
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Return the share of this rank in a dual with this F."""
+        """Return the part of a dual QP with this F that the rank stores."""
         return local_share(qp, self, ranks)
 
 
@@ -44,12 +44,12 @@ def dual_operator(
     equalities: int,
     clusters: Clusters | None = None,
 ) -> SerialisableOperator:
-    """Return F as a serialisable operator with B and one copy of each class.
+    """Return F = BK⁺Bᵀ as a serialisable operator; each class is stored once.
 
     Parameters
     ----------
     equalities : number of equality rows of B, which come first
-    clusters : if not None, F = B K̃⁺Bᵀ
+    clusters : clusters whose K̃⁺ replaces K⁺; None if averages join no subdomains
 
     """
     classes = domains.classes

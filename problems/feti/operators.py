@@ -1,7 +1,8 @@
 """The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners.
 
-Only the components b with nonzero columns in B matter. With B_b these columns, packed
-group by group, a product with F is a sparse, a dense and another sparse product:
+Only the components b with nonzero columns in B contribute. Let B_b be these columns,
+packed group by group. A product with F consists of a sparse, a dense and another sparse
+product:
 
     F λ = B_b diag((K⁺)_bb) B_bᵀ λ
 
@@ -10,7 +11,7 @@ columns of one matrix, so that each group requires one product of two dense matr
 For a single subdomain only one triangle of the block is stored, because memory
 bandwidth limits the product. As many blocks (K⁺)_bb and S_bb as fit into memory are
 computed in advance (*explicit*), which pays off after about ten products. For all other
-classes, each product solves with their factors.
+classes, each product requires a solve with the factor of the class.
 
 Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel and Roux
 1994, Dirichlet; Rixen and Farhat 1999, scaling):
@@ -19,15 +20,16 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel
 
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
 condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
-or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its part for
-the equality rows is block diagonal, with one block per node, and is inverted in the
-sense of Moore and Penrose, so that λ stays free of components in ker Bᵀ.
+or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its diagonal
+block for the equality rows is itself block diagonal, with one block per node; its
+Moore-Penrose inverse is used, so that λ stays free of components in ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
 only where contact touches supports. There they would weight the equality rows for
-contact rows that are mostly inactive: κ in the final face of
-beam-ring/Nr=8/Nh=5/steps=1/feti=8 is 58 with them and 3.7 without, the same value as if
-B contained only the rows of that face.
+contact rows that are mostly inactive. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
+condition number on the final face, the multipliers that are free at the solution, is 58
+with these entries and 3.7 without them. It is also 3.7 if B contains only the rows of
+that face.
 """
 
 from __future__ import annotations
@@ -88,7 +90,7 @@ COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """Subdomains of one class, with the components that B touches in any of them."""
+    """Subdomains of one class, with the union of the components that B touches."""
 
     template: SubdomainClass
     explicit: bool  #: True if (K⁺)_bb is computed in advance
@@ -107,8 +109,9 @@ def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
 class Packed:
     """Rows of B on the components that they touch, numbered group by group.
 
-    Within a group components come before subdomains, so that the packed vector of a
-    group is a matrix (n_g, S_g) stored by rows.
+    Within a group, numbers increase with the subdomain first and then with the
+    component, so that the packed vector of a group is a matrix (n_g, S_g) stored by
+    rows.
     """
 
     groups: tuple[Group, ...]
@@ -139,7 +142,7 @@ class Packed:
         within = B.indices - (np.cumsum(sizes) - sizes)[group]
         component, subdomain = np.divmod(within, np.array(members)[group])
 
-        # all pairs of entries in the same row, then those within one subdomain
+        # first all pairs of entries in the same row, then only those in one subdomain
         entries = np.diff(B.indptr)
         row = np.repeat(np.arange(entries.size), entries)
         left = np.repeat(np.arange(B.nnz), entries[row])
@@ -159,7 +162,10 @@ class Packed:
 
 
 def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
-    """Pack the nonzero columns of B (m, N) by classes; flags `explicit` (classes,)."""
+    """Pack the nonzero columns of B (m, N) class by class.
+
+    explicit : (classes,) True for classes with explicit blocks
+    """
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
     parts = touched_components(B, domains)
     for k, (template, members) in enumerate(
@@ -175,7 +181,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
 
 
 def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """Return, for each class, the components that B touches in any of its members."""
+    """Return, per class, the components that B touches in any of its subdomains."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)
@@ -195,11 +201,12 @@ def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
 class DualOperator:
     """The operator F of decomposed bodies, applied to arrays (m,) or (m, k)."""
 
-    B: csr_array  #: (m, N)
+    B: csr_array  #: (m, N) rows on all torn unknowns
     domains: Subdomains
-    explicit: NDArray[np.bool_]  #: (kinds,) True for classes with explicit blocks
+    explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
-    #: yields (K⁺)_bb and S_bb of explicit groups with their positions, in any order
+    #: yields (K⁺)_bb and S_bb of explicit groups in any order, each with the index of
+    #: its group in the argument
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
@@ -211,7 +218,7 @@ class DualOperator:
 
     @cached_property
     def linear_map(self) -> Composition:
-        """F as a linear map of compiled code."""
+        """F as a composition of compiled linear maps."""
         return self.packed.congruence(self.inverse_map)
 
     def diagonal(self) -> Vector:
@@ -219,7 +226,7 @@ class DualOperator:
         return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Composition:
-        """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
+        """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for x (m,) or (m, k).
 
         Parameters
         ----------
@@ -257,7 +264,7 @@ class DualOperator:
         return {}
 
     def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
-        """Return the blocks D of the groups, and weights W (M,) of packed components.
+        """Return the block D of each group, and weights W (M,) of packed components.
 
         Raises
         ------
@@ -287,7 +294,7 @@ class DualOperator:
         return blocks, weights
 
     def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
-        """Return D, or (I − Π)D(I − Π)ᵀ with clusters, as a map on packed components.
+        """Return diag(D) on packed components; with clusters, see `average_free`.
 
         blocks, weights : from `weighted_blocks`
         """
@@ -316,8 +323,8 @@ class DualOperator:
         diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
         if joints is None:
             return diagonal
-        # if C implies a row of B, its diagonal entry of F is zero up to rounding of the
-        # terms; residuals scaled by that entry would be errors of order one
+        # if Cv = 0 implies that a row of Bv is zero, the diagonal entry of F for this
+        # row is rounding of its terms; residuals scaled by it would be of order one
         joined = diagonal + joints.diagonal(self.packed.B)
         return np.maximum(joined, LEAST_DIAGONAL * diagonal)
 
@@ -352,13 +359,14 @@ class _Blocks(NamedTuple):
 class _Joints:
     """The term −V M⁺Vᵀ of `Clusters` on packed components.
 
-    The columns of V for a subdomain combine those of its class, [(K⁺Φ)_b, R_b].
+    The columns of V for a subdomain are linear combinations of the columns
+    [(K⁺Φ)_b, R_b] of its class.
     """
 
     groups: tuple[Group, ...]
-    columns: list[Dense]  #: (n_g, p_g) for each group
-    #: (k, p) combinations that yield (μ_1, α_1, μ_2, α_2, …), the unknowns of clusters;
-    #: columns are packed as components are
+    columns: list[Dense]  #: [(K⁺Φ)_b, R_b] (n_g, p_g) of each group
+    #: (k, p) combinations for the unknowns (μ_1, α_1, μ_2, α_2, …) of clusters; columns
+    #: are packed like components
     combine: csr_array
     saddle_inverses: list[Vector]  #: upper triangle of M⁺ for each cluster
     sizes: list[int]  #: number of unknowns of each cluster
@@ -404,9 +412,9 @@ def average_free(
 
     F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding errors would let the
     iterates of preconditioned conjugate gradients drift along these multipliers. The
-    range of B_DΠ consists of them, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 because C = LᵀB for
-    some L. The factors I − Π hence change the preconditioner by such multipliers only,
-    and its images have no component along them.
+    range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 because
+    C = LᵀB for some L. Hence the factors I − Π change the image of the preconditioner
+    only by such multipliers, and remove its component along them.
 
     weights : (M,) diagonal of W, equal for all subdomains of a class
     """
@@ -445,9 +453,9 @@ def average_free(
 def _column_places(
     clusters: Clusters, packed: Packed, sizes: Sequence[int]
 ) -> NDArray[np.int64]:
-    """Return the places of the coordinates (Σq,) of `Clusters`, packed by groups.
+    """Return the indices (Σq,) of the coordinates of `Clusters`, packed by groups.
 
-    sizes : number of columns of each group; the coordinates come first in each group
+    sizes : number of columns of each group, of which the coordinates come first
     """
     first = clusters.coordinates
     place, end = np.empty(first[-1], dtype=np.int64), 0
@@ -464,7 +472,7 @@ def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joi
     columns, compliance, end = list[Dense](), list[Dense](), 0
     modes = clusters.domains.modes
     first_motion = np.cumsum(modes) - modes
-    motion = np.empty(modes.sum(), dtype=np.int64)  # places among packed columns
+    motion = np.empty(modes.sum(), dtype=np.int64)  # indices of packed columns
     for group, inverse, faces in zip(
         packed.groups, inverses, clusters.faces, strict=True
     ):
@@ -514,7 +522,7 @@ def _implicit(group: Group) -> tuple[Any, Any]:
 
 
 class _Part(NamedTuple):
-    """The block M_bb of a matrix M (n, n) that is available only as a product."""
+    """The block M_bb of a matrix M (n, n), given by a function that multiplies by M."""
 
     n: int
     b: Nodes
@@ -547,7 +555,7 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop rounding, and the coupling of contact and equality rows, from B W Bᵀ."""
+    """Drop entries of B W Bᵀ that are rounding, or couple contact and equality rows."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])
@@ -605,7 +613,11 @@ def block_pseudoinverse(M: csr_array) -> csr_array:
 
 
 def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
-    """Flag the classes with explicit blocks: the smallest that fit into memory."""
+    """Return a mask of the classes with explicit blocks.
+
+    These are the classes with the smallest blocks, as many as fit into
+    `MAX_EXPLICIT_MIB`.
+    """
     sizes = np.array([part.size for part in touched_components(B, domains)])
     order = np.argsort(sizes, kind="stable")
     fits = np.zeros(sizes.size, dtype=bool)
@@ -616,6 +628,9 @@ def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
 
 
 def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
-    """Return the memory (bytes) of both blocks of each class on `sizes` components."""
+    """Return the memory (bytes) for the blocks (K⁺)_bb and S_bb of each class.
+
+    sizes : (classes,) number of components of the blocks
+    """
     alone = np.array([members.size == 1 for members in domains.members])
     return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

@@ -1,12 +1,13 @@
 """Partition of unstructured bodies into connected subdomains, by the graph of cells.
 
-Two cells are neighbours if they share a facet: an edge in the plane, a face in space.
-METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) partitions the graph of each
-body into parts of about equal size with small facets between them. Facets are measured
-relative to the adjacent cells, so that parts are compact even where the cells of graded
-meshes are long and thin. A part must be connected by facets: cells that share only a
-node (or, in space, an edge) can rotate against each other, and the kernel of the
-stiffness matrix would be larger than the rigid motions.
+In this graph, two cells are neighbours if they share a facet: an edge in the plane, a
+face in space. METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) partitions the
+graph of each body into parts of about equal size, and minimises the total weight of the
+facets between parts. The weight of a facet is its size relative to the adjacent cells,
+so that parts are compact even where the cells of graded meshes are long and thin. The
+cells of a part must be connected through facets: cells that share only a node (or, in
+space, an edge) can rotate relative to each other, so that the kernel of the stiffness
+matrix would contain more than the rigid motions of the part.
 """
 
 from __future__ import annotations
@@ -23,18 +24,19 @@ from mortarbench.problems.fem.mesh import Nodes
 Labels = NDArray[np.int64]
 
 UNIT_WEIGHT = 100  #: weight of the facet between two squares, or two cubes
-MAX_WEIGHT = 10_000  #: largest weight of a facet; METIS sums in 32-bit integers
-#: imbalance allowed to METIS, in thousandths; smaller values leave more pieces that are
-#: disconnected from their part
+MAX_WEIGHT = 10_000  #: largest weight of a facet; METIS adds weights in 32-bit integers
+#: largest imbalance of the parts that METIS may return, in thousandths; with smaller
+#: values, parts consist of several disconnected pieces more often
 MAX_IMBALANCE = 300
 
 
 def graph_partition(
     points: NDArray[np.float64], cells: Nodes, body: Labels, parts: int
 ) -> Labels:
-    """Label the cells of bodies by parts, each connected and within one body.
+    """Partition bodies into connected parts; return the part of each cell.
 
-    The number of parts of a body is at least one, and proportional to its cells.
+    Each part belongs to one body. Each body has at least one part, and larger bodies
+    have more parts, in proportion to their numbers of cells.
 
     Parameters
     ----------
@@ -50,15 +52,16 @@ def graph_partition(
     Raises
     ------
     InputError
-        If there are more bodies than parts, fewer than two cells per part, or a body
-        is not connected.
+        If there are more bodies than parts or fewer than two cells per part, if the
+        cells of a body are not connected through facets, or if METIS finds no partition
+        into connected parts.
 
     """
     counts = np.bincount(body)
     if not counts.size <= parts <= max(counts.size, len(cells) // 2):
         raise InputError(
             f"parts={parts} for {counts.size} bodies with {len(cells)} cells; expected "
-            f"{counts.size} to {len(cells) // 2}, or 0 for one piece per body"
+            f"{counts.size} to {len(cells) // 2}, or 0 for undivided bodies"
         )
     label, first = np.empty(len(cells), dtype=np.int64), 0
     for b, of_body in enumerate(_parts_by_body(counts, parts)):
@@ -81,10 +84,10 @@ def _parts_by_body(counts: Labels, parts: int) -> Labels:
 def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     """Return the graph of cells (E, E), with an integer weight for each shared facet.
 
-    With d the distance between the centres of both cells, the weight is `UNIT_WEIGHT`
-    times √(L/d) for an edge of length L, and times (L/d)^⅔ for a face of area L². If
-    both cells have unit area (volume), the factor is the length of the edge (area of
-    the face).
+    Let d be the distance between the centres of the two cells. The weight is
+    `UNIT_WEIGHT` times √(L/d) for an edge of length L, or times (L/d)^⅔ for a face of
+    area L². Between rectangles of unit area the factor is the length of the edge;
+    between boxes of unit volume, the area of the face.
     """
     dim = points.shape[1]
     facets, names, cell = cell_facets(cells, dim)
@@ -117,11 +120,11 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
     if connected_components(graph)[0] > 1:
         raise InputError(
             "the cells of a body are not all connected by edges (faces in space); "
-            "expected a body for each of its pieces"
+            "expected each connected piece to be a body of its own"
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    from pymetis import CSRAdjacency, Options, part_graph  # late: few cases need it
+    from pymetis import CSRAdjacency, Options, part_graph  # here: few cases need it
 
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
     # k-way partitions are better, but may contain empty parts if parts have few cells
@@ -140,7 +143,11 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
 
 
 def _reconnect(graph: csr_array, label: Labels) -> Labels:
-    """Assign each piece of a part, except the largest, to the part it touches most."""
+    """Merge all but the largest piece of each part into adjacent parts.
+
+    A piece is a connected component of a part. It is merged into the part with which
+    it shares most facets.
+    """
     cell, other = graph.nonzero()
     while True:
         same = label[cell] == label[other]

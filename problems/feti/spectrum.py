@@ -1,19 +1,22 @@
-"""Extreme eigenvalues of F on the null space of its equations, with error bounds.
+"""Extreme eigenvalues of F on the null space of the equalities, with error bounds.
 
-Let P be the orthogonal projector onto ker G ∩ range B, or onto the complement of ker F
-in this space if averages join subdomains. The spectra are those of
+Let G = RᵀBᵀ be the matrix of the equalities of the dual, and P the orthogonal projector
+onto ker G ∩ range B. If averages join subdomains into clusters, F is singular on this
+subspace, and P projects onto the part of the subspace that is orthogonal to ker F. The
+spectra are those of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
 
 without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
 of P, so that the same Lanczos process applies (Parlett 1998, Chapter 13). Each vector
-is orthogonalised against the last two, as in the recurrence, then against all previous
-ones, which excludes spurious copies of eigenvalues. Each vector is also projected
-again, because components in the kernel that stem from rounding grow.
+is orthogonalised against its two predecessors, as in the recurrence, then against all
+previous vectors, which excludes spurious copies of eigenvalues. Each vector is also
+projected by P, because components in ker P due to rounding would grow.
 
-The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue,
-and ‖r‖ follows from the last component of its eigenvector of the tridiagonal matrix.
+The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue.
+The norm ‖r‖ is computed from the last component of the eigenvector of the tridiagonal
+matrix for θ.
 """
 
 from __future__ import annotations
@@ -33,8 +36,8 @@ from mortarbench.problems.feti.distributed import RankOperator
 
 Product = Callable[[Vector], Vector]
 
-#: a new vector below this share of the largest Ritz value ends the Lanczos process: the
-#: Krylov space is invariant up to rounding
+#: norm of a new vector, relative to the largest diagonal entry of the tridiagonal
+#: matrix, at which the Krylov space counts as invariant and the Lanczos process ends
 BREAKDOWN = 1e-10
 CHECK_INTERVAL = 5  #: steps between evaluations of the Ritz values
 _CHUNK = 64  #: vectors per allocation
@@ -46,7 +49,7 @@ class Spectrum(NamedTuple):
     smallest: float
     largest: float
     smallest_error: float  #: bound of the distance from `smallest` to an eigenvalue
-    largest_error: float
+    largest_error: float  #: bound of the distance from `largest` to an eigenvalue
     steps: int  #: products with F
 
     @property
@@ -95,7 +98,8 @@ def spectrum(
     def dot(x: Vector, y: Vector) -> float:
         return float(total(np.atleast_1d(x @ y))[0])
 
-    #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
+    # with the inner product xᵀWy: `metric` maps x to Wx, and `image` maps Wx to the
+    # image of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
     v = P(np.sin(1.0 + local**2))  # arbitrary, with a component on each eigenvector
@@ -134,7 +138,7 @@ def spectra_over_ranks(
     """Compute the extreme eigenvalues of F, once for each preconditioner.
 
     F acts on the multipliers of supports and gluing. All ranks must call this function
-    together; each receives the same spectra.
+    together; the results are equal on all ranks.
 
     Parameters
     ----------
@@ -168,7 +172,7 @@ def spectra_over_ranks(
 
 
 def projector(F: RankOperator, G: DistributedColumns) -> Product:
-    """Return the orthogonal projector P of this module.
+    """Return the orthogonal projector P, see the module docstring.
 
     All ranks must call this function together.
 

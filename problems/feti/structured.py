@@ -1,21 +1,21 @@
 """Structured grids cut into blocks, numbered without a global mesh.
 
 All global numbers of torn nodes and of gluing rows are computed from tables as long as
-the sides of the grids. Let aᵢ = 2 for a column of nodes where two blocks meet and
-aᵢ = 1 elsewhere, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ copies,
-numbered like their blocks from left to right and from bottom to top.
+the sides of the grids. Let aᵢ = 2 if column i of nodes separates two blocks and aᵢ = 1
+otherwise, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ copies, which are
+numbered like their blocks, from left to right and from bottom to top.
 
 The stiffest mode of an interface is a saw tooth along it, that is, alternating tension
-and compression, and it gets stiffer as the cells get thinner. Between half planes of
-cells with sides hₜ along the interface and hₙ across, its stiffness is
+and compression, and its stiffness increases as the cells become thinner. Between half
+planes of cells with sides hₜ along the interface and hₙ across it, this stiffness is
 
     s(r) = √((C₆₆ + C₁₁r²) / (C₆₆ + C₁₁)),    r = hₙ/hₜ
 
-relative to square cells. Derivation: the energy of a saw tooth along a row of cells is
-a quadratic form across the row, with 4C₁₁/hₜ times the mass matrix plus hₜC₆₆/3 times
-the stiffness matrix of linear elements; s is its Schur complement on a half line. With
-rows scaled by √s, the smallest eigenvalue of the dual is the same as on squares
-(`shape_factors`).
+relative to square cells, with the entries C₁₁ and C₆₆ of the elasticity matrix.
+Derivation: the energy of a saw tooth along a row of cells is a quadratic form across
+the row, with 4C₁₁/hₜ times the mass matrix plus hₜC₆₆/3 times the stiffness matrix of
+linear elements; s is its Schur complement on a half line. If rows of B are scaled by
+√s, the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from mortarbench.problems.feti.tearing import blocks
 
 
 class Places(NamedTuple):
-    """Positions of nodes, or blocks, in the grids."""
+    """Positions of nodes, or of blocks, in the grids."""
 
-    body: Integers  #: (k,)
-    column: Integers  #: (k,) i
-    row: Integers  #: (k,) j
+    body: Integers  #: (k,) number of the grid
+    column: Integers  #: (k,) column i
+    row: Integers  #: (k,) row j
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class Layout:
 
     @cached_property
     def block(self) -> Places:
-        """Grid of each block (S,), with its column and row of blocks in the grid."""
+        """Grid, column and row of each block; columns and rows count blocks, (S,)."""
         body = np.repeat(np.arange(len(self.grids)), np.diff(self.block_start))
         row, column = np.divmod(
             np.arange(self.count) - self.block_start[body], self._blocks_per_row[body]
@@ -137,9 +137,11 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return the first column, first row, and numbers of columns and rows of nodes.
+        """Return the first column, first row, number of columns and number of rows.
 
-        block : (k,) numbers of blocks; each result is (k,)
+        Columns and rows are those of the nodes of each block; each result is (k,).
+
+        block : (k,) numbers of blocks
         """
         at = Places(*(x[block] for x in self.block))
         first, last = (
@@ -181,12 +183,12 @@ class Layout:
         )
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
-        """Return the numbers of columns and rows of nodes of some blocks."""
+        """Return the numbers of columns and rows of nodes of each block."""
         _, _, columns, rows = self.corner(subdomains)
         return list(zip(columns.tolist(), rows.tolist(), strict=True))
 
     def points(self, subdomains: Nodes) -> Sequence[Points]:
-        """Return the points (n, 2) of the nodes of some blocks."""
+        """Return the points (n, 2) of the nodes of each block."""
         body = self.body[subdomains]
         return [
             self.grids[b].block(slice(i, i + k), slice(j, j + n))
@@ -229,7 +231,7 @@ class Layout:
         )
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
-        """Return the block (k,) of one copy of each node.
+        """Return the block (k,) that contains the given copy of each node.
 
         copy : (k,) number of the copy, from 0
         """
@@ -245,7 +247,7 @@ class Layout:
         )
 
     def lines(self, at: Places, *, ends: bool) -> NDArray[np.bool_]:
-        """Return a mask (k, 2) of nodes whose row, or column, separates blocks.
+        """Return masks (k, 2) of nodes whose row, and whose column, separates blocks.
 
         ends : also mark the sides of the grid, as required for rows of supports
         """
@@ -263,8 +265,9 @@ class Layout:
     ) -> Callable[[Nodes, Nodes, bool], Vector]:
         """Return a function that evaluates `shape_factors` at torn nodes of blocks.
 
-        The arguments of this function are places (k,) in the list of torn nodes, the
-        global numbers of these nodes, and True for rows of supports.
+        The arguments of this function are indices (k,) in the list of torn nodes, the
+        global numbers (k,) of these nodes, and True for support rows or False for
+        gluing rows.
 
         share : (grids,) C₁₁/(C₁₁ + C₆₆) of each grid
         """
@@ -277,7 +280,7 @@ class Layout:
         return factors
 
     def spacings(self, block: Nodes) -> NDArray[np.float64]:
-        """Return the `spacings` at the torn nodes (M, 2) of some blocks."""
+        """Return mean edge lengths (M, 2) at torn nodes of blocks; see `spacings`."""
         lengths = [np.empty((0, 2))]
         body = self.block.body[block]
         for b, left, low, wide, high in zip(body, *self.corner(block), strict=True):
@@ -291,7 +294,7 @@ class Layout:
         return np.concatenate(lengths)
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Return, for each node, the number of nodes before it with as many copies."""
+        """Count, for each node, the preceding nodes of equal multiplicity, (k,)."""
         columns, rows, at = self._columns, self._rows, self.places(node)
         column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
         m = columns.multiplicity[column] * rows.multiplicity[row]
@@ -309,7 +312,7 @@ class Layout:
 
     @cached_property
     def _counts(self) -> dict[int, tuple[NDArray[np.int64], int]]:
-        """For each m, numbers of nodes with m copies: before each row, and in total."""
+        """Numbers of nodes with m copies, by m: before each row, and in total."""
         columns, rows = self._columns, self._rows
         body = np.repeat(np.arange(len(self.grids)), np.diff(rows.start))
         of_columns = [
@@ -328,9 +331,9 @@ class Layout:
         }
 
     def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of adjacent blocks with their numbers of shared nodes, all (k,).
+        """Return pairs of blocks and the number of nodes they share, all (k,).
 
-        Only blocks with a common side count.
+        Blocks that share only a corner are omitted.
         """
         body, column, row = self.block
         all_ = np.arange(self.count)
@@ -345,7 +348,7 @@ class Layout:
         )
 
     def glued(self) -> NDArray[np.int64]:
-        """Return, for each block (S,), the number of its nodes with several copies."""
+        """Return, for each block (S,), the number of its nodes on interfaces."""
         left, low, columns, rows = self.corner(np.arange(self.count))
         alone = []
         for lines, first, count in (
@@ -361,7 +364,9 @@ class Layout:
 
 
 def spacings(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return mean edge lengths (l·k, 2) at each node, along its row and its column.
+    """Return, for each node, the mean lengths of its edges along its row and column.
+
+    The result is (l·k, 2).
 
     points : (l, k, 2) points of l rows and k columns of nodes
     """
@@ -403,10 +408,10 @@ class _Lines(NamedTuple):
     ]  #: (grids + 1,) first line of each grid, then their number k
     multiplicity: NDArray[np.int64]  #: (k,) number of blocks that meet there, 1 or 2
     first: NDArray[np.int64]  #: (k,) first block that contains the line
-    #: (2, k) numbers of preceding lines in its grid, of multiplicity 1 and 2
+    #: (2, k) numbers of preceding lines of multiplicity 1 and 2 in the same grid
     before: NDArray[np.int64]
     cut: NDArray[np.int64]  #: (c,) lines where blocks begin and end
-    cut_start: NDArray[np.int64]  #: (grids + 1,) first cut of each grid, and c
+    cut_start: NDArray[np.int64]  #: (grids + 1,) first cut of each grid, then c
 
 
 def _lines(cuts: list[Nodes]) -> _Lines:

@@ -1,9 +1,10 @@
 """Subdivision of bodies into subdomains, replicated on every rank.
 
-Global numbers of torn nodes and of gluing rows follow from the subdomains that contain
-each node. For blocks of structured grids, tables as long as the sides of the grids
-suffice (`problems.feti.structured.Layout`). Otherwise the nodes shared by several
-subdomains, the nodes of the interfaces, are listed (`ListedSubdivision`).
+The global numbers of torn nodes and of gluing rows are determined by the subdomains
+that contain each node. For blocks of structured grids, these subdomains are computed
+from tables as long as the sides of the grids (`problems.feti.structured.Layout`).
+Otherwise the interface nodes, which belong to several subdomains, are listed
+(`ListedSubdivision`).
 """
 
 from __future__ import annotations
@@ -26,19 +27,21 @@ Points = NDArray[np.float64]
 
 
 class SubdomainNodes(NamedTuple):
-    """Nodes of some subdomains, subdomain by subdomain, ascending within each."""
+    """Nodes of some subdomains, sorted by subdomain and then by number."""
 
-    subdomain: Integers  #: (M,) place in the list of subdomains
+    subdomain: Integers  #: (M,) index in the list of subdomains
     number: Nodes  #: (M,) global numbers
-    multiplicity: Integers  #: (M,) number of copies in all subdomains
-    copy: Integers  #: (M,) number of this copy, from 0
-    start: NDArray[np.int64]  #: (subdomains + 1,) first node of each, then M
+    multiplicity: Integers  #: (M,) number of copies of the node in all subdomains
+    copy: Integers  #: (M,) number of this copy among all copies of the node, from 0
+    #: (subdomains + 1,) index of the first node of each subdomain, followed by M
+    start: NDArray[np.int64]
 
 
 class Subdivision(Protocol):
-    """S subdomains of one or more bodies; arguments `node` are global numbers (k,).
+    """Subdivision of one or more bodies into S subdomains.
 
-    Copies of a node are numbered in the order of their subdomains.
+    Copies of a node are numbered in the order of their subdomains. Arguments `node` are
+    global numbers (k,); arguments `subdomains` are lists of subdomain numbers.
     """
 
     @property
@@ -55,7 +58,10 @@ class Subdivision(Protocol):
 
     @property
     def positions(self) -> NDArray[np.int64] | None:
-        """Positions (S, dim) in a grid of subdomains per body; None without grids."""
+        """Positions (S, dim) of subdomains in the grid of their body.
+
+        None if the subdomains of a body do not form a grid.
+        """
 
     @property
     def sizes(self) -> NDArray[np.int64]:
@@ -65,13 +71,16 @@ class Subdivision(Protocol):
         """Return the nodes of some subdomains."""
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
-        """Return keys that are equal for subdomains with equally numbered cells."""
+        """Return a key per subdomain; subdomains with the same cells have equal keys.
+
+        Cells are compared as indices into the nodes of their subdomain.
+        """
 
     def points(self, subdomains: Nodes) -> Sequence[Points]:
-        """Return the points (n, 2) of the nodes of some subdomains."""
+        """Return the points (n, dim) of the nodes of each subdomain."""
 
     def cells(self, subdomain: int) -> Nodes:
-        """Return the cells (E, 4) of a subdomain, as indices into its nodes."""
+        """Return the cells (E, corners) of a subdomain, as indices into its nodes."""
 
     @property
     def label(self) -> NDArray[np.int64]:
@@ -81,43 +90,44 @@ class Subdivision(Protocol):
         """Return the number of copies of each node, (k,)."""
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
-        """Return the subdomain (k,) of one copy of each node.
+        """Return the subdomain (k,) that contains the given copy of each node.
 
         copy : (k,) number of the copy, from 0
         """
 
     def position(self, node: Nodes) -> Points:
-        """Return the points of some nodes, (k, 2)."""
+        """Return the points of some nodes, (k, dim)."""
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Return, for each node, the number before it of equal multiplicity, (k,)."""
+        """Count, for each node, the preceding nodes of equal multiplicity, (k,)."""
 
     @property
     def nodes_by_multiplicity(self) -> Mapping[int, int]:
         """Number of nodes with m copies, for each m > 1."""
 
     def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of subdomains with their numbers of shared nodes, all (k,)."""
+        """Return pairs of subdomains and the number of nodes they share, all (k,)."""
 
     def glued(self) -> NDArray[np.int64]:
-        """Return the number of nodes with several copies in each subdomain, (S,)."""
+        """Return, for each subdomain (S,), the number of its nodes on interfaces."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ListedSubdivision:
     """Subdivision with a list of the nodes that subdomains share; see `Subdivision`.
 
-    Copies, holders and points are available for listed nodes only.
+    `holder` and `before` accept listed nodes only.
     """
 
-    nodes: int
-    body: Integers  #: (S,)
-    sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
+    nodes: int  #: number of nodes of all bodies
+    body: Integers  #: (S,) body of each subdomain
+    sizes: NDArray[np.int64]  #: (S,) number of nodes of each subdomain
     node: Nodes  #: (k,) listed nodes, ascending
-    start: NDArray[np.int64]  #: (k + 1,) first holder of each, then l
-    holders: Nodes  #: (l,) subdomains of each node, ascending
-    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, 4) as indices
-    #: into these nodes
+    #: (k + 1,) index of the first holder of each node, followed by l
+    start: NDArray[np.int64]
+    holders: Nodes  #: (l,) subdomains that contain each node, ascending
+    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, corners) as
+    #: indices into these nodes
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
     labelling: Callable[[], NDArray[np.int64]]  #: computes `label`
@@ -142,7 +152,7 @@ class ListedSubdivision:
         subdomain = np.repeat(np.arange(sizes.size, dtype=np.int32), sizes)
         copy = np.zeros(number.size, dtype=np.int32)
         listed = np.flatnonzero(self.node[place] == number)
-        # holders of each listed node are ascending, so that the pairs are sorted
+        # `searchsorted` applies because the holders of each listed node are ascending
         pairs = np.repeat(np.arange(self.node.size), np.diff(self.start))
         position = np.searchsorted(
             pairs * self.count + self.holders,
@@ -163,15 +173,15 @@ class ListedSubdivision:
         return [hex_digest((c.tobytes(),), 32) for c in cells]
 
     def points(self, subdomains: Nodes) -> Sequence[Points]:
-        """Return the points (n, 2) of the nodes of some subdomains."""
+        """Return the points (n, dim) of the nodes of each subdomain."""
         return [self.position(self.part(int(s))[0]) for s in subdomains]
 
     def cells(self, subdomain: int) -> Nodes:
-        """Return the cells (E, 4) of a subdomain, as indices into its nodes."""
+        """Return the cells (E, corners) of a subdomain, as indices into its nodes."""
         return self.part(subdomain)[1]
 
     def _place(self, node: Nodes) -> Nodes:
-        """Return the places of listed nodes."""
+        """Return the indices of listed nodes in the list."""
         return np.searchsorted(self.node, node)
 
     def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
@@ -180,11 +190,14 @@ class ListedSubdivision:
         return np.where(self.node[place] == node, np.diff(self.start)[place], 1)
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
-        """Return the subdomain (k,) of one copy of each listed node."""
+        """Return the subdomain (k,) that contains the given copy of each listed node.
+
+        copy : (k,) number of the copy, from 0
+        """
         return np.asarray(self.holders[self.start[self._place(node)] + copy])
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Return, for listed nodes, the number before them of equal multiplicity."""
+        """Count, for listed nodes, the preceding listed nodes of equal multiplicity."""
         return np.asarray(self._before[self._place(node)])
 
     @cached_property
@@ -205,7 +218,7 @@ class ListedSubdivision:
         }
 
     def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of subdomains with their numbers of shared nodes, all (k,)."""
+        """Return pairs of subdomains and the number of nodes they share, all (k,)."""
         shape = (self.node.size, self.count)
         ones = np.ones(self.holders.size, dtype=np.int64)
         has = csr_array((ones, self.holders, self.start), shape=shape)
@@ -213,7 +226,7 @@ class ListedSubdivision:
         return pairs.row, pairs.col, pairs.data
 
     def glued(self) -> NDArray[np.int64]:
-        """Return the number of nodes with several copies in each subdomain, (S,)."""
+        """Return, for each subdomain (S,), the number of its nodes on interfaces."""
         multiplicity = np.diff(self.start)
         several = np.repeat(multiplicity > 1, multiplicity)
         return np.bincount(self.holders[several], minlength=self.count)
@@ -222,9 +235,10 @@ class ListedSubdivision:
 def sort_holders(
     number: Nodes, subdomain: Nodes, subdomains: int
 ) -> tuple[Nodes, NDArray[np.int64], Nodes]:
-    """Sort pairs of a node and a subdomain that contains it, dropping duplicates.
+    """Sort pairs of a node and a subdomain that contains it, without duplicates.
 
     number, subdomain : (e,) node and subdomain of each pair
+    subdomains : total number of subdomains
 
     Returns
     -------
@@ -239,9 +253,9 @@ def sort_holders(
 def half_discs_in_blocks(
     discs: Sequence[HalfDisc], blocks: Sequence[Sequence[Block]]
 ) -> ListedSubdivision:
-    """Return the subdivision of half discs into blocks; nodes of perimeters are listed.
+    """Return the subdivision of half discs into blocks; perimeter nodes are listed.
 
-    blocks : for each disc, the rings and sectors of cells of each block
+    blocks : for each disc, the ranges of rings and sectors of cells of each block
     """
     first = np.cumsum([0, *(disc.nodes for disc in discs)])
     body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])
@@ -286,14 +300,14 @@ def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
 
 
 def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
-    """Return the number of nodes of a block of cells; the centre counts as one."""
+    """Return the number of nodes of a block; the centre of a disc is a single node."""
     has_centre = rings.stop == disc.radii.size
     lines = rings.stop - rings.start + (not has_centre)
     return int((angles.stop - angles.start + 1) * lines + has_centre)
 
 
 def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
-    """Return the nodes on the sides of a block of cells; some are repeated."""
+    """Return the nodes on the sides of a block of cells, with repetitions."""
     a, r = disc.angles.size, disc.radii.size
     has_centre = rings.stop == r
     i = np.arange(angles.start, angles.stop + 1)
@@ -310,7 +324,7 @@ def mesh_in_subdomains(
     named: Nodes,
     positions: NDArray[np.int64] | None = None,
 ) -> ListedSubdivision:
-    """Return the subdivision of a mesh by labels of its cells; the mesh is stored.
+    """Return the subdivision of a stored mesh by the labels of its cells.
 
     Parameters
     ----------

@@ -4,11 +4,11 @@ In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22)
 subdomain floats; supports, gluing and contact are rows of one matrix B. So the kernel
 of every stiffness matrix is known in advance: the rigid motions.
 
-Torn unknowns v (N,), which count every copy of a node, are numbered subdomain by
-subdomain and node by node, with components in the frame of the subdomain. Subdomains
-that differ only by a rigid motion, such as those in one layer of a ring, are congruent:
-they share one stiffness matrix, one factor and one explicit operator, and B contains
-the rotations. A displacement u (n,) of the undivided bodies gives v = T u, with one d×d
+The torn unknowns v (N,) are the displacement components of all copies of all nodes, in
+the frames of their subdomains, numbered by subdomain and then by node. Subdomains that
+differ only by a rigid motion, such as those in one layer of a ring, are congruent. They
+have the same stiffness matrix, factor and explicit blocks; their rotations enter B. A
+displacement u (n,) of the undivided bodies corresponds to v = T u, where T has one d×d
 block per copy of a node.
 
 In hybrid FETI (Klawonn and Rheinbach 2010, Comput. Methods Appl. Mech. Eng. 199),
@@ -44,14 +44,15 @@ _STRIP = 256  #: right-hand sides per solve; bounds the memory for the solutions
 class SubdomainClass:
     """Data shared by all congruent subdomains of a class.
 
-    K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
-    components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). A
-    single solve treats all subdomains of a class, as columns of one right-hand side.
+    K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where ρ is the largest diagonal entry of K, and R*
+    consists of the rows of R at the fixing components, orthonormalised, and zeros
+    elsewhere (see `problems.fem.inverse`). All subdomains of a class are solved at
+    once, as columns of one right-hand side.
     """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
-    fixing: Nodes  #: components of a few nodes that exclude every motion of R
+    fixing: Nodes  #: components of a few nodes; fixing them excludes all rigid motions
     #: ascending components of all nodes, glued or free, on the boundary of the
     #: subdomain, onto which Dirichlet preconditioners condense
     boundary: Nodes
@@ -82,24 +83,25 @@ class SubdomainClass:
         return np.asarray(self._factor(b))
 
     def block(self, b: Nodes) -> csr_array:
-        """Return K_bb."""
+        """Return the block K_bb of K for the components b."""
         return csr_array(self.K[b][:, b])
 
     def condense(self, b: Nodes) -> Condensed:
-        """Return both local blocks on components b, by one elimination of the interior.
+        """Return (K⁺)_bb and S_bb, both from one elimination of the interior.
 
         ::
 
             (K⁺)_bb = (S_ρ⁻¹)_bb,    S_ρ = S_h + ρR*R*ᵀ,   S_h = K_hh − K_hi K_ii⁻¹K_ih
 
         where h is the union of the boundary, b and the fixing components, and i denotes
-        the other components. With h ordered last, the trailing block L of the Cholesky
-        factor of K_ρ satisfies S_ρ = LLᵀ.
+        the other components. If the components h are ordered last, the trailing block L
+        of the Cholesky factor of K_ρ satisfies S_ρ = LLᵀ. S is the Schur complement on
+        the union of the boundary and b, see `Condensed`.
         """
         return self.blocks(b, self.border_factor(b))
 
     def border(self, b: Nodes) -> Nodes:
-        """Return h, ascending."""
+        """Return the components h of `condense`, ascending."""
         return np.union1d(np.union1d(self.boundary, b), self.fixing)
 
     def border_factor(self, b: Nodes) -> Dense:
@@ -108,7 +110,7 @@ class SubdomainClass:
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         if (
             i.size
-        ):  # reduce fill inside; h stays last, so that its block is a trailing one
+        ):  # order i to reduce fill; h stays last, so that its block is trailing
             i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
         order = np.concatenate([i, h])
         K_rho = with_int32(self._fixed[order][:, order])
@@ -121,7 +123,7 @@ class SubdomainClass:
         g, h = np.union1d(self.boundary, b), self.border(b)
         places_b, places_fixing = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, places_b])[places_b]
-        S = L @ L.T  # S_ρ; without ρR*R*ᵀ it is the Schur complement S_h of K itself
+        S = L @ L.T  # S_ρ; the next line subtracts ρR*R*ᵀ, which leaves S_h
         S[np.ix_(places_fixing, places_fixing)] -= self._fixing_term
         S_bb, inner = S[np.ix_(places_b, places_b)], ~np.isin(h, g)
         if inner.any():  # S_bb excludes interior fixing components: eliminate them
@@ -130,7 +132,7 @@ class SubdomainClass:
         return Condensed(_symmetric(C), _symmetric(S_bb))
 
     def elimination(self, h: Nodes) -> Elimination:
-        """Eliminate all components except h; return S as an operator on columns."""
+        """Eliminate all components except h; return the Schur complement of K on h."""
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         order = np.concatenate([h, i])
         K = csc_array(csc_array(self.K[:, order])[order])
@@ -243,8 +245,9 @@ class Subdomains:
         return v
 
 
-#: eigenvalues of C_cC_cᵀ below this share of the largest indicate dependent rows of C.
-#: The modes of faces are orthonormal, so that all other eigenvalues are much larger
+#: eigenvalues of C_cC_cᵀ below this share of the largest indicate dependent rows, where
+#: C_c are the rows of C of one cluster. The modes of faces are orthonormal, so that all
+#: other eigenvalues are much larger
 DEPENDENT_SHARE = 1e-10
 
 
@@ -262,14 +265,16 @@ class Clusters:
         v = K̃⁺b − RNβ,   K̃⁺ = K⁺ − V M⁺Vᵀ,   M = ⎡CK⁺Cᵀ  CR⎤
                                                   ⎣RᵀCᵀ    0⎦
 
-    with arbitrary β. The columns of N are an orthonormal basis of ker CR, the motions
-    of clusters as rigid bodies, and RN spans the kernel. The Moore-Penrose inverse M⁺
-    admits linearly dependent rows of C, and K̃⁺ ≥ 0. M is block diagonal, with one block
-    per cluster.
+    with arbitrary β. The columns of N are an orthonormal basis of ker CR. They describe
+    the motions of clusters as rigid bodies, and the columns of RN span the kernel of K
+    on {v : Cv = 0}. M is block diagonal, with one block per cluster. Its Moore-Penrose
+    inverse M⁺ exists even if rows of C are linearly dependent. K̃⁺ is positive
+    semidefinite.
 
     The modes of a face are its rigid motions, orthonormal over its nodes. The columns
-    of Φ_k are the modes of all faces at which some member of class k is joined. C
-    applies to the coordinates Φ_kᵀv_s, which are numbered subdomain by subdomain.
+    of Φ_k are the modes of all faces at which some member of class k is joined. C is
+    stored as a matrix that acts on the coordinates Φ_kᵀv_s of all subdomains s, in the
+    order of the subdomains.
     """
 
     domains: Subdomains  #: floating subdomains
@@ -306,7 +311,10 @@ class Clusters:
 
     @cached_property
     def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
-        """Places (c + r,) of (μ_1, α_1, μ_2, α_2, …) in (μ, α); size per cluster."""
+        """Unknowns (μ, α) ordered by clusters: (μ_1, α_1, μ_2, α_2, …).
+
+        Indices (c + r,) of these unknowns in (μ, α), and their number per cluster.
+        """
         start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
         parts = [
             np.concatenate(
@@ -334,7 +342,7 @@ class Clusters:
             gram += J @ (modes.T @ modes).toarray() @ J.T
             motions.append(J @ (modes.T @ domains.classes[k].R))
         CR = np.concatenate(motions, axis=1)
-        # floating subdomains joined by faces: a cluster has the motions of one of them
+        # subdomains joined by faces move as one body: as many motions as one of them
         last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
         N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
         size, modes = np.linalg.eigh(gram)
@@ -343,7 +351,7 @@ class Clusters:
 
     @cached_property
     def motions(self) -> csr_array:
-        """N, in the order of the rigid motions of subdomains: (r, r̃)."""
+        """N (r, r̃), with rows in the order of the rigid motions of all subdomains."""
         order, rows = self.unknowns[0], self.rows[-1]
         N = block_diag([part.N for part in self._joined], format="csr")
         return csr_array(N[np.argsort(order[order >= rows])])
@@ -370,7 +378,7 @@ class Clusters:
     def gram_inverses(self, grams: Sequence[Dense]) -> list[Vector]:
         """Return the upper triangle of (CWCᵀ)⁺ for each cluster, column by column.
 
-        grams : ΦᵀWΦ (q_k, q_k) of each class
+        grams : ΦᵀWΦ (q_k, q_k) of each class, with a diagonal matrix W of weights
         """
         return [upper_triangle(one.gram_inverse(grams)) for one in self._joined]
 
@@ -416,7 +424,7 @@ class Clusters:
 
 
 class _Joined(NamedTuple):
-    """Joints of one cluster, with c rows of C."""
+    """The c rows of C that belong to one cluster, with their kernels and ranges."""
 
     parts: list[tuple[int, Dense]]  #: class and columns of C (c, q_k) of each subdomain
     CR: Dense  #: (c, r)
@@ -425,7 +433,7 @@ class _Joined(NamedTuple):
     dependent: Dense  #: (c, c − c') orthonormal basis of ker Cᵀ
 
     def product(self, coordinates: Sequence[Dense]) -> Dense:
-        """Return CACᵀ (c, c) from the blocks ΦᵀAΦ of all classes."""
+        """Return CACᵀ (c, c) of a block diagonal A from the blocks ΦᵀAΦ of classes."""
         total = np.zeros((self.CR.shape[0],) * 2)
         for k, J in self.parts:
             total += J @ coordinates[k] @ J.T
@@ -473,12 +481,12 @@ class DecomposedBodies:
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """Floating units that B glues: clusters, or else subdomains."""
+        """Floating units that B glues: clusters if there are any, else subdomains."""
         return self.clusters or self.domains
 
     @property
     def start(self) -> NDArray[np.int64]:
-        """Number of the first unknown of each subdomain, and their total: (S + 1,)."""
+        """First torn unknown of each subdomain, then their total number, (S + 1,)."""
         return self.domains.start
 
     @cached_property

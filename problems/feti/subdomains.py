@@ -1,28 +1,29 @@
 """The local subdomains of one rank, and their rows of B.
 
-Each rank assembles its local subdomains only: meshes, stiffness matrices, loads and
-the rows of B that touch them. A single process assembles all subdomains. Global numbers
-follow from the subdivision (`problems.feti.subdivision`), which is replicated on all
-ranks: tables as long as the sides of structured grids, or a list of the nodes on
-interfaces. In addition, a rank stores a few numbers per subdomain of all ranks; the
-coarse problem is of the same size.
+Each rank assembles only its local subdomains: their meshes, stiffness matrices and
+loads, and the rows of B with entries at their nodes (the rows that *touch* them). A
+single process assembles all subdomains. Global numbers are determined by the
+subdivision (`problems.feti.subdivision`), which is replicated on all ranks: tables as
+long as the sides of structured grids, or a list of the nodes on interfaces. In
+addition, each rank stores a few numbers for every subdomain of every rank; these data
+are of about the same size as a vector of the coarse problem.
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
-and Kučera 2006). Every copy of a fixed component has a support row. The m copies of a
-free component are glued by one of
+and Kučera 2006). Every copy of a fixed component has a support row. The m copies
+v_1 … v_m of a free component are glued by one of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
 * ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
 Contact rows act on the average of the copies, which are all equal at the solution.
-Therefore even a node of several subdomains has a single contact row, which is
-orthogonal to the gluing rows.
+Therefore a contact condition at a node of several subdomains is a single row. This row
+is orthogonal to the gluing rows.
 
-Support and gluing rows are scaled by √E of their body. Contact rows are normalised,
-then scaled by √E of the softest body they touch. If each body is homogeneous, F is
-hence independent of E. A factor for the shape of the cells may multiply E
-(`problems.feti.structured`).
+Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
+rows are normalised, then scaled by √E of the softest body they touch. If each body is
+homogeneous, F = BK⁺Bᵀ is hence independent of E. In support and gluing rows, E may be
+multiplied by a factor for the shape of the cells (`problems.feti.structured`).
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: functions by name of the gluing; they return the weights (rows, m) of m copies
+#: by name of the gluing, functions that return the weights (rows, m) of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
@@ -90,13 +91,16 @@ class Contact(NamedTuple):
     """Global contact rows followed by friction rows, replicated on every rank."""
 
     rows: csr_array  #: (m_I, n) in components of the undivided bodies
-    c: Vector  #: (m_I,)
+    c: Vector  #: (m_I,) right-hand side
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
 
     @property
     def groups(self) -> Nodes:
-        """First row of the tangential vector of each row (m_I,), or the row itself."""
+        """First row (m_I,) of the tangential vector that contains each row.
+
+        For a contact row, this is the row itself.
+        """
         group = np.arange(self.rows.shape[0])
         first = group.size - self.bound.size
         group[first:] = np.repeat(group[first :: self.tangents], self.tangents)
@@ -115,8 +119,8 @@ class DecomposedProblem:
     ]  #: assembles the class of a floating subdomain
     E: Vector  #: (bodies,) moduli for the scaling of rows
     names: tuple[str, ...]  #: names of the bodies
-    #: returns the factors of E in rows at torn nodes of some subdomains, see
-    #: `problems.feti.structured.Layout.shaping`; None means the factor 1
+    #: maps numbers of subdomains to a function that evaluates the factors of E at their
+    #: torn nodes, see `problems.feti.structured.Layout.shaping`; None for the factor 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: maps global components (k,) to forces (k,)
     fixed: Nodes  #: global components that are zero, in the order of their rows
@@ -149,7 +153,10 @@ class DecomposedProblem:
         return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
 
     def joined_pairs(self) -> tuple[Nodes, Nodes]:
-        """Return the pairs (k,) of subdomains of one cluster with a common face."""
+        """Return the pairs of subdomains in one cluster that share a face.
+
+        The result consists of two arrays (k,).
+        """
         one, other, _ = self.layout.shared_node_counts()
         clusters, positions = self.clusters, self.layout.positions
         assert clusters is not None
@@ -160,10 +167,11 @@ class DecomposedProblem:
 
     @cached_property
     def contact_scale(self) -> Vector:
-        """√(E/‖B_i‖²) of each contact row (m,), with E of the softest body it touches.
+        """Scale √E/‖B_i‖ of each contact row (m,), with E of the softest body touched.
 
-        All rows of a tangential vector have the factor of the first one, because their
-        factors are equal in exact arithmetic.
+        B_i is the row on the torn unknowns before scaling. The scales of all rows of a
+        tangential vector are equal in exact arithmetic and are set to that of its first
+        row.
         """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
@@ -180,11 +188,11 @@ class DecomposedProblem:
 
 
 class Entries(NamedTuple):
-    """Entries of B in local columns, and the ranks that touch the same rows."""
+    """Entries of B in the columns of this rank, and the ranks that touch their rows."""
 
     row: NDArray[np.int64]  #: (e,) global rows
     column: NDArray[np.int64]  #: (e,) local torn unknowns
-    value: Vector  #: (e,)
+    value: Vector  #: (e,) values of the entries
     reached: NDArray[np.int64]  #: (k, 2) pairs of a row and a rank that touches it
 
 
@@ -207,7 +215,14 @@ class LocalSubdomains:
         return self.problem.layout.subdomain_nodes(self.number)
 
     def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Return the local torn nodes (k,) of pairs of subdomain and global node."""
+        """Return the index in `nodes` (k,) of the copy of each node in a subdomain.
+
+        Parameters
+        ----------
+        subdomain : (k,) global numbers of local subdomains
+        node : (k,) global numbers of nodes
+
+        """
         nodes, N = self.nodes, self.problem.layout.nodes
         keys = nodes.subdomain * np.int64(N) + nodes.number
         return np.searchsorted(
@@ -246,8 +261,9 @@ class LocalSubdomains:
 
     @cached_property
     def spread(self) -> csr_array:
-        """T (N_p, n_p) with a block Qᵀ per torn node, which rotates to subdomain axes.
+        """T (N_p, n_p), which maps `components` to torn unknowns in subdomain axes.
 
+        Each torn node has a block Qᵀ, the transpose of the rotation of its subdomain.
         Eliminated components have no rows.
         """
         d, place = self.problem.components, self._distinct[1]
@@ -269,14 +285,14 @@ class LocalSubdomains:
 
     @cached_property
     def free(self) -> slice | Nodes:
-        """Places of the torn unknowns among all components of all torn nodes."""
+        """Indices of the torn unknowns among all components of all torn nodes."""
         if not self.problem.eliminated:
             return slice(None)
         return np.flatnonzero(~np.isin(self._component, self.problem.fixed))
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
-        """Local subdomains by class, and their rotations from the frame of the class.
+        """Local subdomains in classes, and rotations from the frames of their classes.
 
         All ranks use the same frame for a class.
         """
@@ -335,7 +351,7 @@ class LocalSubdomains:
         Returns
         -------
         map from the number of the first local subdomain of a class to the number and
-        points of its first subdomain on all ranks
+        points of the first subdomain of this class on all ranks
 
         """
         comm = self.ranks.comm
@@ -347,7 +363,7 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # `classify` allows 2
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # more than in `classify`
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         candidates = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -371,7 +387,10 @@ class LocalSubdomains:
 
     @cached_property
     def motions(self) -> NDArray[np.int64]:
-        """(S + 1,) first rigid motion of each subdomain on any rank, then the total."""
+        """Number of the first rigid motion of each subdomain, then the total, (S + 1,).
+
+        The subdomains of all ranks are included.
+        """
         modes = np.array([kind.R.shape[1] for kind in self.domains.classes])
         counts = np.zeros(self.rank.size, dtype=np.int64)
         local = self.number, modes[self.domains.class_of]
@@ -386,7 +405,7 @@ class LocalSubdomains:
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """Local floating units: clusters, or else subdomains."""
+        """Local floating units: clusters if there are any, otherwise subdomains."""
         return self.clusters or self.domains
 
     @property
@@ -419,7 +438,10 @@ class LocalSubdomains:
 
     @cached_property
     def f(self) -> Vector:
-        """Local load (N_p,) in subdomain axes; copies of a node share its load."""
+        """Local load (N_p,) in subdomain axes.
+
+        The load of a node is divided equally among its copies.
+        """
         d = self.problem.components
         multiplicity = np.repeat(self.nodes.multiplicity, d)
         load = self.problem.load(self._component) / multiplicity
@@ -431,7 +453,7 @@ class LocalSubdomains:
         return np.asarray(load[self.free])
 
     def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return the work (k, r) of single forces on the rigid motions of all units.
+        """Return the work (k, r) of k single forces on the rigid motions of all units.
 
         unknown : (k,) torn unknowns
         value : (k,) a force at each of these unknowns
@@ -462,7 +484,7 @@ class LocalSubdomains:
         return None if shaping is None else shaping(self.number)
 
     def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
-        """Return the stiffness at torn nodes (k,); its square root scales the rows.
+        """Return the factors (k,) at torn nodes whose square roots scale rows of B.
 
         supports : True for rows of supports, False for rows of gluing
         """
@@ -497,14 +519,15 @@ class LocalSubdomains:
         """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
         copy = replace(self, problem=replace(self.problem, contact=contact))
-        # no cached property depends on the bound
+        # cached properties remain valid, because none depends on the bound
         vars(copy).update({**vars(self), "problem": copy.problem})
         return copy
 
     def with_problem(self, problem: DecomposedProblem) -> LocalSubdomains:
-        """Return the same bodies with another load, contact or treatment of supports.
+        """Return the subdomains of a problem that has the same bodies.
 
-        The classes of subdomains, which are expensive, are kept.
+        Load, contact and treatment of supports may differ. The classes of subdomains
+        are reused because their assembly is expensive.
         """
         copy = replace(self, problem=problem)
         same = ("number", "nodes", "_classified", "_distinct", "clusters")
@@ -516,18 +539,18 @@ class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
 
     number: Nodes  #: (t,) global numbers, ascending
-    B: csr_array  #: (t, N_p)
-    #: (t,) first row of the same tangential vector, or the row itself; rows of one
-    #: group have one owner
+    B: csr_array  #: (t, N_p) in local torn unknowns
+    #: (t,) number of the first row of the tangential vector that contains the row, or
+    #: of the row itself; all rows of such a group have the same owner
     group: Nodes
     reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
-    c: Vector  #: (t,)
+    c: Vector  #: (t,) right-hand side
     equalities: int  #: number of equality rows on all ranks
     total: int  #: number of rows on all ranks
 
 
 def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
-    """Return a rank for each subdomain (S,), balancing work and memory.
+    """Return a rank for each subdomain (S,) so that work and memory are balanced.
 
     Raises
     ------
@@ -563,9 +586,10 @@ def _local_clusters(local: LocalSubdomains) -> Clusters:
     """Return the local clusters, with averages over the faces inside them.
 
     A face consists of all common nodes of two adjacent subdomains, including clamped
-    nodes. Its modes are the orthonormalised rigid motions of a subdomain, restricted to
-    these nodes. In global axes, the modes of both subdomains span the same space,
-    Q_1Φ_1 = Q_2Φ_2Tᵀ, so that Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0 equates the averages.
+    nodes. The modes Φ_s of subdomain s are its rigid motions, restricted to these nodes
+    and orthonormalised. After rotation to global axes by Q_s, the modes of both
+    subdomains span the same space: Q_1Φ_1 = Q_2Φ_2Tᵀ with an orthogonal matrix T. The
+    averages are hence equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
     """
     nodes, domains, d = local.nodes, local.domains, local.problem.components
     r = domains.classes[0].R.shape[1]
@@ -646,7 +670,8 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
         np.concatenate(p) for p in list(zip(*entries, strict=True))[:3]
     )
     pairs = np.concatenate([part.reached for part in entries])
-    # rows that only other rows of their vector touch here have no entries
+    # a row is listed if any row of its tangential vector touches this rank; it may have
+    # no entries here
     number = np.unique(pairs[pairs[:, 1] == ranks.rank, 0])
     place = np.searchsorted(number, row)
     unknowns = problem.components * local.nodes.number.size
@@ -695,12 +720,12 @@ def _support_rows(local: LocalSubdomains) -> Entries:
 
 
 class _Copies(NamedTuple):
-    """Copies of some nodes on all ranks, node by node."""
+    """Copies of some nodes on all ranks, in the order of the nodes."""
 
-    node: NDArray[np.int64]  #: (k,) place in the list of nodes
+    node: NDArray[np.int64]  #: (k,) index in the list of nodes
     copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
     rank: NDArray[np.int64]  #: (k,) rank of the copy
-    local: NDArray[np.int64]  #: (l,) places of the copies on this rank
+    local: NDArray[np.int64]  #: (l,) indices of those of the k copies on this rank
     local_node: NDArray[np.int64]  #: (l,) local torn node of each of these copies
 
 
@@ -768,7 +793,7 @@ def _contact_rows(local: LocalSubdomains) -> Entries:
     copies = _local_copies(local, node)
     E, group = _equality_count(problem), problem.contact.groups
     row = E + entries.row.astype(np.int64)
-    # a disc has one owner: each rank that one of its rows touches holds all of them
+    # a disc has one owner, so a rank that one of its rows touches stores all its rows
     pairs = np.stack([group[entries.row][copies.node], copies.rank], axis=1)
     pairs = np.unique(pairs, axis=0)
     members = np.bincount(group, minlength=1)[pairs[:, 0]]
@@ -820,6 +845,6 @@ def _equality_count(problem: DecomposedProblem) -> int:
 
 
 def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
-    """Return all subdomains as local subdomains of this process."""
+    """Return all subdomains as the local subdomains of a single process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
     return LocalSubdomains(problem, single_process(), every)

@@ -19,7 +19,7 @@ from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, Subdom
 class LocalProblems:
     """Local problems of decomposed bodies; see `harness.mechanics.Substructures`.
 
-    Factors are computed on first use.
+    Stiffness matrices are factorised on first use.
     """
 
     torn: DecomposedBodies
@@ -62,7 +62,10 @@ class LocalProblems:
         return np.asarray(T.multiply(K @ T).sum(axis=0))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,) in the precision of v; P removes rigid motions."""
+        """Apply PKP to v (N,) in the precision of v.
+
+        P is the orthogonal projector that removes rigid motions.
+        """
         image, domains = np.zeros_like(v), self.torn.domains
         for template, members in zip(domains.classes, domains.members, strict=True):
             K, R = template.K, np.ascontiguousarray(template.R)
@@ -81,13 +84,16 @@ class LocalProblems:
         return image
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P to b (N,), with one solve for all subdomains of a class."""
+        """Apply PK⁺P, with P of `product`, to b (N,).
+
+        All subdomains of a class are solved at once, as columns of one right-hand side.
+        """
         solution, domains = np.zeros_like(b), self.torn.domains
         acting = np.logical_or.reduceat(b != 0, domains.start[:-1])
         for (template, place), members in zip(
             self._classes(), domains.members, strict=True
         ):
-            place = place[:, acting[members]]  # the image of 0 is 0 elsewhere
+            place = place[:, acting[members]]  # where b = 0, the solution is zero
             columns, R = b[place], template.R
             columns -= R @ (R.T @ columns)
             image = template.inverse(columns)

@@ -1,12 +1,12 @@
-"""Partition of meshes into subdomains, and their classes up to rigid motions.
+"""Partition of meshes into subdomains, and classes of congruent subdomains.
 
-Each cell has the label of its subdomain: a block of a structured mesh, or a part from
-graph partitioning. A node on the boundary of several subdomains has a copy in each of
-them (tearing).
+Each cell is labelled with the number of its subdomain, which is a block of a structured
+mesh or a part from graph partitioning. A node on the boundary of several subdomains has
+a copy in each of these subdomains (tearing).
 
-Subdomains that are images of one another under a rigid motion form a class. They have
-equally numbered cells, equal materials and congruent points. Rotations are fitted by
-least squares (Kabsch 1976, Acta Cryst. A32).
+Subdomains that are images of one another under rigid motions form a class. Their cells
+are numbered equally, their materials are equal and their points are congruent. The
+rotations are fitted by least squares (Kabsch 1976, Acta Cryst. A32).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ CONGRUENCE_TOL = 1e-11
 class SubdomainMesh(NamedTuple):
     """Mesh of one subdomain, with nodes 0 … n_k − 1."""
 
-    points: NDArray[np.float64]  #: (n_k, dim)
-    cells: Nodes  #: (E_k, corners)
-    material: NDArray[np.int64]  #: (E_k,)
+    points: NDArray[np.float64]  #: (n_k, dim) positions of the nodes
+    cells: Nodes  #: (E_k, corners) nodes of each cell
+    material: NDArray[np.int64]  #: (E_k,) material of each cell
 
 
 def blocks(
@@ -42,11 +42,11 @@ def blocks(
     Parameters
     ----------
     divisions : cells along each direction; the first direction varies fastest
-    most : H/h for all directions, or one value per direction
+    most : largest number H/h of cells along a side, for all directions or for each
 
     Returns
     -------
-    (Π divisions,) block of each cell; blocks are numbered in the same order as cells
+    block of each cell, (Π divisions,); blocks are numbered in the same order as cells
 
     """
     label = np.zeros(1, dtype=np.int64)
@@ -61,7 +61,7 @@ def blocks(
 def grid_positions(
     label: NDArray[np.int64], divisions: tuple[int, ...]
 ) -> NDArray[np.int64] | None:
-    """Return the positions (blocks, dim) of blocks in a grid; None if they form none.
+    """Return the positions of blocks in a grid, (blocks, dim); None without a grid.
 
     label, divisions : see `blocks`
     """
@@ -69,7 +69,7 @@ def grid_positions(
     starts = np.unravel_index(first, divisions[::-1])
     along = [np.unique(start, return_inverse=True)[1] for start in starts[::-1]]
     positions = np.stack(along, axis=1)
-    # blocks that are cut at different places leave gaps in the grid of all cuts
+    # if rows of blocks are cut at different places, the grid of all cuts has gaps
     return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
 
 
@@ -83,15 +83,15 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
     """Cut a graded structured mesh into blocks of cells with aspect ratios near one.
 
     A block of more than most² cells is cut across its longer side, at the grid line
-    nearest to its middle (the first one if two are equally near up to rounding).
-    Blocks with equal numbers of cells along both sides (`blocks`) would have the aspect
-    ratio of the cells, and the bending modes of long subdomains would dominate the
-    condition number of the dual.
+    nearest to its middle (the first one if two are equally near up to rounding). With
+    equal numbers of cells along both sides, as in `blocks`, a block would have the
+    aspect ratio of its cells, and the bending modes of long subdomains would dominate
+    the condition number of the dual.
 
     Parameters
     ----------
-    sides : side lengths of the cells in ny rows and nx columns
-    most : H/h of a square block
+    sides : side lengths of the cells
+    most : number H/h of cells along a side of a square block
 
     """
     (deep, deep_of), (wide_of, wide) = sides
@@ -118,14 +118,15 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
 
 
 def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Label the cells of a mesh numbered as a box by blocks of compact shape.
+    """Label the cells of a structured mesh in space by blocks of compact shape.
 
-    With hₐ the mean edge length of a block along direction a, the limit on its cells
-    along a is most · min h / hₐ, rounded, and at least 1. Larger blocks are cut across
-    their longest side, after half of the equal parts that the limit requires. Boxes of
-    cubes are cut as by `blocks`. For slender cells, equal numbers of cells would result
-    in slender subdomains: κ of PFP is 439 with 4 × 4 × 4 cells of 1 : 1 : 4 in
-    beam-ring/Nr=4/Nh=2/depth=4.
+    Let hₐ be the mean edge length of a block along direction a. The block may have
+    most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
+    across its longest side: the limit requires several equal parts, and half of them
+    (rounded down) precede the cut. Boxes of cubic cells are cut as in `blocks`. With
+    equal numbers of cells along all directions, slender cells would result in slender
+    subdomains: the condition number of PFP (see `problems.feti.spectrum`) is 439 with
+    4 × 4 × 4 cells of 1 : 1 : 4 in beam-ring/Nr=4/Nh=2/depth=4.
 
     Parameters
     ----------
@@ -185,7 +186,7 @@ def label_blocks(cut: Sequence[Block]) -> NDArray[np.int64]:
 def classify(
     keys: Iterable[Hashable], points: Sequence[NDArray[np.float64]]
 ) -> tuple[list[int], NDArray[np.int64], NDArray[np.float64]]:
-    """Group S subdomains into classes of images under rigid motions.
+    """Group S subdomains into classes that are congruent under rigid motions.
 
     Parameters
     ----------
@@ -194,8 +195,8 @@ def classify(
 
     Returns
     -------
-    first subdomain of each class, class (S,) of each subdomain, and its rotation
-    (S, dim, dim) relative to the first one
+    first subdomain of each class; class (S,) of each subdomain; rotation (S, dim, dim)
+    of each subdomain relative to the first subdomain of its class
 
     """
     alike: dict[Hashable, list[int]] = {}
@@ -207,8 +208,8 @@ def classify(
     for group in alike.values():
         remaining = np.array(group)
         spread = np.array([spread_of(points[s]) for s in group])
-        # norms ‖x − x̄‖ of images differ by at most √size times the distance of points:
-        # a necessary condition that saves most comparisons
+        # necessary condition that saves most comparisons: the norms ‖x − x̄‖ of two
+        # images differ by at most √size times the largest distance of their points
         off = 2 * CONGRUENCE_TOL * np.sqrt(points[group[0]].size)
         while remaining.size:
             near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
@@ -231,13 +232,14 @@ def spread_of(points: NDArray[np.float64]) -> float:
 def congruent(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Identify images of the first of g point sets under rigid motions.
+    """Find the images of the first of g point sets under rigid motions.
 
     points : (g, n, dim)
 
     Returns
     -------
-    (g,) True for images, and rotations Q (g, dim, dim) with x − x̄ = Q (x₁ − x̄₁)
+    mask (g,) of the images, and rotations Q (g, dim, dim) with x − x̄ = Q (x₁ − x̄₁),
+    where x₁ is the first point set
 
     """
     x = points - points.mean(axis=1, keepdims=True)

@@ -62,8 +62,9 @@ SINGULAR = 1e-10
 ON_LINE = 1e-14
 #: pairs of triangles clipped at a time; limits memory to about 100 MB
 CHUNK = 2**16
-#: distance from a master face at which the search along a ray ends, in units of the
-#: radii of both faces; smaller values cost steps, larger values candidates
+#: distance from a master face at which the search along a ray ends, in units of the sum
+#: of the radii of both faces. Smaller values require more steps, larger values yield
+#: more candidate faces
 CLOSE = 1.5
 #: largest number of steps of this search. Each step covers at least half the remaining
 #: distance to a side that is inclined by at most 60° (`Reach.cosine`)
@@ -193,7 +194,8 @@ def _facing(
             moves[moves] = (step > 0) & (t[moves] <= limit[moves])
             if not moves.any():
                 break
-        # if the first direction ended at its start, the second finds the same faces
+        # skip faces whose search in the first direction ended at its start: the search
+        # in the second direction would return the same candidates
         start = np.flatnonzero(~moves & (t <= limit) & ((sign > 0) | (t > 0)))
         found = tree.query_ball_point(at[start], MAX_SPREAD * near[start])
         e.append(np.repeat(start, np.array([len(k) for k in found], dtype=int)))
@@ -221,7 +223,7 @@ def _integrals(
     """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
     t_s, pair = slave.of_faces(e)
     t_m, place = master.of_faces(m[pair])
-    # all triangles of one face with all of the other
+    # pair all triangles of one face with all triangles of the other
     t_s, pair = t_s[place], pair[place]
     # coordinates in the auxiliary plane, and height above it
     frame = np.concatenate(

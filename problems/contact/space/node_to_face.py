@@ -33,7 +33,7 @@ SAME_POINT = 1e-9
 class ClosestPoints(NamedTuple):
     """Closest points of s positions on faces."""
 
-    face: Nodes  #: (s,)
+    face: Nodes  #: (s,) face that contains the closest point
     N: NDArray[np.float64]  #: (s, 4) shape functions of the face at the closest point
     normal: Points  #: (s, 3) outward unit normal of the master at the closest point
 

@@ -35,10 +35,13 @@ class FaceTriangles(NamedTuple):
     number: Nodes  #: (f,) number of triangles of each face, 1 or 4
     face: Nodes  #: (t,) face of each triangle, ascending
     shape: NDArray[np.float64]  #: (t, 3, 4) shape functions of the face at its vertices
-    vertices: Points  #: (t, 3, 3) m
+    vertices: Points  #: (t, 3, 3) positions of the vertices, m
 
     def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:
-        """Return the triangles (k,) of faces (p,), and the place (k,) of their face."""
+        """Return the triangles (k,) of faces (p,), and the index (k,) of their face.
+
+        The index refers to the list `faces`.
+        """
         count = self.number[faces]
         place = np.repeat(np.arange(len(faces)), count)
         offset = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)

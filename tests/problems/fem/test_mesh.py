@@ -122,7 +122,7 @@ def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
     shuffle = np.random.default_rng(271828).permutation(len(bodies.mesh.points))
     mesh = replace(bodies.mesh, cells=shuffle[bodies.mesh.cells])
 
-    with pytest.raises(ValueError, match="one body after another"):
+    with pytest.raises(ValueError, match="in the order of their bodies"):
         replace(bodies, mesh=mesh)
 
 

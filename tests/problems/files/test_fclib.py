@@ -176,7 +176,7 @@ def changed(**arrays):
     [
         (
             local_arrays(np.eye(3) + np.diag([0, 1e-3], 1), np.ones(3), np.ones(1)),
-            "W is unsymmetric by 0.001 of its largest entry",
+            "the largest entry of W − Wᵀ is 0.001 of the largest entry of W",
         ),
         (
             local_arrays(np.diag([1.0, -0.1, 1]), np.ones(3), np.ones(1)),
