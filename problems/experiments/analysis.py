@@ -119,7 +119,7 @@ def _laps(run: partial[Analysis]) -> Laps:
 
 
 def states(plan: Plan, solve: Reference) -> dict[str, Fields]:
-    """Return results on the meshes of Figure 7 and Figure 2 (two ring meshes)."""
+    """Return the fields of Figure 2 (for two ring meshes) and Figure 7, by name."""
     Nr, Nh = plan.example
     largest = plan.scaling[-1], plan.Nh, 2 * plan.Nh
     problems = {

@@ -35,7 +35,7 @@ from dataclasses import dataclass
 from math import ceil, log2, prod, sqrt
 
 BYTES = 8  #: bytes of a floating-point number
-REPLICATED = 20_000  #: most unknowns of a coarse problem with an explicit inverse
+REPLICATED = 20_000  #: largest coarse problem whose inverse may be explicit
 ENTRY = 12  #: bytes of an entry of a sparse matrix, including its index
 #: global reductions per product with F; 4.4 to 6.8 were counted for cube-wall, n = 32
 REDUCTIONS = 6.5
@@ -110,10 +110,10 @@ class Distribution:
 
     @property
     def sent(self) -> float:
-        """Amount of numbers that an inner core sends in a product.
+        """Number of values that an inner core sends in a product.
 
         A node with one copy in each of c subdomains on k cores has c − 1 rows per
-        component, for which each of these cores sends 2(1 − 1/k)(c − 1) numbers on
+        component, for which each of these cores sends 2(1 − 1/k)(c − 1) values on
         average. Both c and k are products of one factor per axis; the factor of k is 2
         on the faces between bricks, otherwise 1. Hence, the sums of 1, c, 1/k and c/k
         over the nodes of a brick are also products of one factor per axis.
@@ -167,7 +167,7 @@ class Prediction:
     sent: float  #: data sent to all other cores, B
     blocks: float  #: memory of the blocks (K⁺)_bb of a core's subdomains, B
     factors: float  #: memory of the factors of the stiffness of these subdomains, B
-    coarse_memory: float  #: memory of the coarse problem on a core or its only node, B
+    coarse_memory: float  #: memory of the coarse problem, per core or on one node, B
     steps: float  #: number of iterations relative to that without clusters
 
     @property
@@ -187,9 +187,9 @@ def factor_entries(unknowns: float, modes: int) -> float:
 
     The graph is a cube of S³ subdomains, each coupled with up to 26 others. Nested
     dissection leads to O(n^(4/3)) entries for n unknowns (George 1973, SIAM J. Numer.
-    Anal. 10). With the constant `ENTRIES` and the boundary correction `EDGE`, the
-    number agrees within 2 % with CHOLMOD and METIS for S = 8, 12 and 16, where factors
-    have 8.52e5, 5.33e6 and 1.79e7 entries.
+    Anal. 10). The constant `ENTRIES` and the boundary correction `EDGE` were fitted to
+    factors of CHOLMOD with METIS for S = 8, 12 and 16, which have 8.52e5, 5.33e6 and
+    1.79e7 entries; the fit is within 2 %.
     """
     dense: float = unknowns * (unknowns + 1) / 2
     side: float = (unknowns / modes) ** (1 / 3)

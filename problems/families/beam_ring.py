@@ -28,7 +28,7 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_NODES = 50_000_000  #: limit because entries of K are indexed by 32-bit integers
+MAX_NODES = 50_000_000  #: limit due to the 32-bit indices of the entries of K
 
 
 class BeamRing(ContactFamily):
@@ -85,9 +85,10 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size, linearised on its own.
+        """Return the keys with half the mesh size; raise InputError with friction.
 
-        Friction raises InputError, because refinement changes the polygons of the arcs.
+        The load steps of the refined case are solved on the refined mesh. Friction is
+        not supported, because refinement changes the polygons of the arcs.
         """
         refuse_friction(self.name, params)
         return super().refined(params)

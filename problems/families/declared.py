@@ -108,7 +108,7 @@ class DeclaredFamily(Family):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return this rank's share of the dual; collective."""
+        """Return the local part of the dual on this rank; collective."""
         from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
         del reference
@@ -118,7 +118,7 @@ class DeclaredFamily(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case in one form."""
+        """Return the case in the form `form`."""
         params = self.complete(params)
         self.check(params)
         emit = _model(self.model)
@@ -152,7 +152,7 @@ class ContactFamily(DeclaredFamily):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case in one form."""
+        """Return the case in the form `form`."""
         params = self.complete(params)
         if params.get("kinematics") == "finite":
             return super().build(form, params, reference)
@@ -166,7 +166,7 @@ class ContactFamily(DeclaredFamily):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return this rank's share of the dual; collective."""
+        """Return the local part of the dual on this rank; collective."""
         from mortarbench.problems.duality.decomposed import distributed_qp_of
         from mortarbench.problems.duality.problem import qp_choice
 

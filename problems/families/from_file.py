@@ -72,7 +72,7 @@ class FromFile(Family):
         return [] if self.copies is None else self.copies.paths()
 
     def _located(self, params: Mapping[str, Value]) -> Path:
-        """Return the path of the file, or of a copy, whose digest is as in `params`."""
+        """Return the path of the file, or of a copy, with the digest in `params`."""
         source = self.source_file(params)
         if self.copies is not None:
             return self.copies.locate(source)

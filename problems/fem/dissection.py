@@ -40,10 +40,10 @@ class Fronts:
     fronts before s that are not children of an earlier front.
     """
 
-    start: Ints  #: (F + 1,)
-    first: Ints  #: (F + 1,)
-    border: Ints
-    children: Ints  #: (F,)
+    start: Ints  #: (F + 1,) first position of each front
+    first: Ints  #: (F + 1,) start of the border of each front in `border`
+    border: Ints  #: borders of all fronts
+    children: Ints  #: (F,) number of children of each front
     roots: Marks  #: (F,) True for fronts of the nodes that are eliminated last
 
 

@@ -73,7 +73,7 @@ class Element:
 
     @property
     def weights(self) -> Vector:
-        """Weights of the quadrature points, (q,), with the reference volume as sum."""
+        """Weights (q,) of the quadrature points; their sum is the reference volume."""
         volume = np.prod(
             [
                 abs(np.linalg.det(s[1:] - s[0])) / factorial(s.shape[1])

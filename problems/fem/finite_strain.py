@@ -68,7 +68,7 @@ class InvertedCellError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Data of the cells of hyperelastic bodies; none of them depends on u."""
+    """Data of the cells of hyperelastic bodies, independent of the displacement u."""
 
     mesh: Mesh
     materials: tuple[Hyperelastic, ...]  #: material of each body

@@ -22,8 +22,8 @@ from mortarbench.problems.fem.mesh import Nodes
 PARTS = 4
 #: fixing nodes in space count as collinear if their distances from the line of best fit
 #: are smaller than this multiple of the largest distance of a node of the last part
-#: from the line. The ratio is at least 0.35 for blocks, and may be 0 for bars that are
-#: one cell wide
+#: from the line. The ratio of these distances is at least 0.35 for blocks, and may be 0
+#: for bars that are one cell wide
 MIN_DISTANCE = 0.25
 
 

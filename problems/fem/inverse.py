@@ -55,7 +55,7 @@ class GeneralisedInverse(Protocol):
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time in s of the factorisation, which is shared by load steps."""
+        """Wall-clock time in s of the factorisation, which serves all load steps."""
 
     @property
     def kernel(self) -> NDArray[np.float64]:

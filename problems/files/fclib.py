@@ -51,7 +51,7 @@ Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """A contact problem, with the solution and description stored in its file."""
+    """A contact problem, with the solution that its file contains."""
 
     contact: FrictionalContact
     is_local: bool
@@ -177,7 +177,7 @@ def _local(part: _Group, n: int, mu: Vector) -> FrictionalContact:
 
 
 def _global(part: _Group, n: int, mu: Vector) -> FrictionalContact:
-    """Return a global problem in r alone, without v and the multipliers l."""
+    """Return the local form of a global problem, with v and l eliminated."""
     f, w = part.vector("vectors/f"), part.vector("vectors/w", n)
     M, H = part.matrix("M", f.size, f.size), part.matrix("H", f.size, n)
     check_size("W, a dense matrix", 8 * (n + f.size) * n)

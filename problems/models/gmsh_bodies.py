@@ -146,7 +146,7 @@ def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None
 def overlap_remark(params: Mapping[str, Value]) -> tuple[str, ...]:
     """Return a remark if a slave node is inside its master before any load acts.
 
-    Overlaps of at most `MAX_OVERLAP` times the smallest body cause no remark.
+    Overlaps of up to `MAX_OVERLAP` times the extent of the smallest body cause none.
     """
     p: Any = params
     whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole

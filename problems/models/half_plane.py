@@ -110,8 +110,9 @@ def _hertz_case(n: int) -> Case:
     exact_energy = self_energy(((1.0, 1.0),)) - approach
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Hertz; errors are relative, that of p in the l² norm.
+        """Compare with Hertz's solution.
 
+        Errors are relative; that of p is in the l² norm.
         `energy` is the elastic energy minus P·approach in J/m; the approach is measured
         from the level u = 0.
         """
@@ -172,8 +173,9 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     exact_energy = self_energy(exact.semicircles) - exact.Q * exact_displacement
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Cattaneo and Mindlin; errors are relative, that of q in l² norm.
+        """Compare with Cattaneo and Mindlin's solution.
 
+        Errors are relative; that of q is in the l² norm.
         `energy` is the elastic energy minus Q·displacement in J/m; `dissipation` is
         Σg|slip| of this loading or unloading in J/m, with the slip bounds g;
         `stick_half_width` is that of the exact traction with the same ∫x²q;

@@ -278,7 +278,8 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineConta
     """Return the cylinders in contact under P alone, and Hertz's solution.
 
     With a tangential force, the supports only exclude rigid motions and have no
-    reactions. Without it, they also enforce the symmetry about the axis.
+    reactions. Without a tangential force, the supports also enforce the symmetry about
+    the axis.
     """
     p: Any = params
     halves = half_cylinders(params)
@@ -346,7 +347,7 @@ def _summed(forces: Sequence[Forces]) -> Forces:
 
 
 def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
-    """Return pairs of forces, over P and over μP, for each step with friction."""
+    """Return the forces of each step with friction, as fractions of P and of μP."""
     p: Any = params
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
@@ -365,7 +366,7 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
     """Return the half disc around (0, 0) of a cylinder with centre (0, `centre`).
 
     Cells have size h at (0, 0) and grow along the arc and inwards. All cells are then
-    halved `halvings` times.
+    bisected in both directions `halvings` times.
     """
     radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
     arc = (
@@ -404,7 +405,7 @@ def insert_midpoints(x: Vector, times: int) -> Vector:
 
 
 def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
-    """Return nodal forces of a load P in −y, distributed uniformly over a flat side."""
+    """Return the nodal forces of a load P along −y, uniform over the side `flat`."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
     return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())

@@ -190,7 +190,7 @@ class Membranes:
         return np.kron(np.eye(2), np.full((half, 1), half**-0.5))
 
     def factorise(self) -> GeneralisedInverse:
-        """Factorise K without the prescribed components, with a floating right body."""
+        """Factorise K on the free components; the right membrane may move rigidly."""
         free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
         return supported_inverse(self.qp.P, free, self.rigid)
 

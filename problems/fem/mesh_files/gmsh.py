@@ -152,7 +152,8 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
     version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
     if kind != b"0":
         return None
-    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]  # without the count
+    # skip the end of the section's title and the line with the counts
+    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]
     numbers: list[int] = []
     remaining = 0  # cells of the current block, in format 4
     for fields in (list(map(int, line.split())) for line in lines):

@@ -84,7 +84,8 @@ def read_med(path: Path) -> FileMesh:
     with opened(path, _EXPECTED) as stream:
         with parsing(path, "not a .med file (HDF5), or damaged", 0):
             file = h5py.File(stream, "r")
-            # visits neither soft nor external links, which may lead to other files
+            # visititems follows neither soft nor external links, which may lead to
+            # other files
             file.visititems(nodes.__setitem__)
             arrays = {k: v for k, v in nodes.items() if isinstance(v, h5py.Dataset)}
             sizes = [v.size * v.dtype.itemsize for v in arrays.values()]

@@ -409,9 +409,15 @@ def _directed(
     boundary: Mapping[Any, list[int]],
     words: Words,
 ) -> Nodes:
-    """Return facets on the boundary of the bodies, with corners ordered as there.
+    """Return `facets` with their corners in the order that they have in `boundary`.
 
-    boundary : facets of the boundary by their sorted corners
+    boundary : facets on the boundary of the bodies, by sorted corners
+
+    Raises
+    ------
+    InputError
+        If a facet is not on the boundary of the bodies.
+
     """
     where = f"{words.boundary} {name!r}"
     facet = "an edge" if facets.shape[1] == 2 else "a face"

@@ -333,7 +333,7 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
 def _curves(
     exact: PointContact, sheared: ShearedPointContact | None = None
 ) -> NDArray[np.float64]:
-    """Return exact tractions along a radius: columns r, m, pressure and shear, Pa."""
+    """Return columns r (m), exact pressure and exact shear (Pa) along a radius."""
     r = exact.a * np.linspace(0, 1 / CONTACT_SHARE, _CURVE_POINTS)
     shear = np.zeros(r.size) if sheared is None else sheared.traction(r)
     return np.column_stack([r, exact.pressure(r), shear])
