@@ -72,7 +72,7 @@ class BeamRing(ContactFamily):
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
         if nodes > MAX_NODES:
             raise InputError(
-                f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
+                f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} result in {nodes:.2g} nodes; "
                 f"expected at most {MAX_NODES:.2g}"
             )
         check_memory(self.name, (3 * (p["depth"] + 1) if p["depth"] else 2) * nodes)

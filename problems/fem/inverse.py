@@ -122,7 +122,7 @@ class CondensedInverse:
         ptr, idx = index_arrays(B)
         F, within = congruence(ptr, idx, B.data, number, self.compliance)
         if not within:
-            raise ValueError("rows touch components outside the condensed interface")
+            raise ValueError("rows have entries outside the condensed interface")
         return F
 
     def at_constraints(self, b: Vector) -> Vector:

@@ -255,7 +255,9 @@ def _bound(model: _QPSModel, words: list[str]) -> None:
     kind, *rest = words
     kind = kind.upper()
     if kind in ("BV", "LI", "UI", "SC", "SI"):
-        raise InputError(f"bound {kind} makes the variable discrete; expected none")
+        raise InputError(
+            f"bound {kind} makes the variable discrete; expected continuous variables"
+        )
     if kind not in ("LO", "UP", "FX", "FR", "MI", "PL"):
         raise unknown("bound type", words[0], ("LO", "UP", "FX", "FR", "MI", "PL"))
     if kind in ("FR", "MI", "PL"):

@@ -435,7 +435,9 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
         clamped = np.unique(slave)[np.isin(components, held).all(axis=1)]
         return ContactPair(slave, slave[:0], rigid, clamped)
     if np.intersect1d(slave, sides["master"]).size:
-        raise InputError("slave and master share nodes; expected sides that are apart")
+        raise InputError(
+            "slave and master share nodes; expected sides without common nodes"
+        )
     return ContactPair(slave, sides["master"])
 
 
