@@ -113,8 +113,8 @@ class GmshBodies(ContactFamily):
         if not has_arcs(params):
             return ""
         return (
-            "of the bodies as they are meshed; corners between chords of an arc remain; "
-            "for pressures, generate a finer mesh"
+            "of the bodies as they are meshed; corners between chords of an arc "
+            "remain: for pressures, generate a finer mesh"
         )
 
     def build(
