@@ -1,4 +1,4 @@
-"""Registry of problem families; each returns a problem as QPs of several forms."""
+"""Registries of problem families and of functions that restore stored operators."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ PROBLEMS: Registry[Family] = Registry(
     }
 )
 
-#: functions that restore stored operators P of these families, see `harness.operators`
+#: functions that restore the Hessian P of a stored QP of these families if P is an
+#: operator, see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
     {
         "tfeti": entry(

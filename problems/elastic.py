@@ -4,7 +4,7 @@ Mesh the bodies, `join` them, `assemble` them with supports, load and contact pa
 obtain the QP from `one_step`. See docs/plugins.md for a complete family. Lengths are in
 m, moduli and tractions in Pa, forces in N per m of thickness.
 
-For example, a steel block is pressed onto another one::
+For example, one steel block is pressed onto another::
 
     lower = prefixed(rectangle((0.0, 0.0), (1.0, 0.5), (6, 3)), "lower_")
     upper = prefixed(rectangle((0.0, 0.5), (1.0, 0.5), (4, 2)), "upper_")
@@ -105,7 +105,7 @@ def one_step(
     parts: int = 0,
     glue: Literal["orthonormal", "chain", "redundant"] = "orthonormal",
 ) -> Case:
-    """Return the QP of bodies under their full load, linearised at the initial state.
+    """Return the case of `bodies` under their full load, linearised at u = 0.
 
     Parameters
     ----------
@@ -117,14 +117,14 @@ def one_step(
     reference : argument of `Family.build`; required by Coulomb's law
     parts : total number of subdomains (Total FETI), for form "dual" only; 0 for no
         decomposition
-    glue : kind of rows that join the copies of a node
+    glue : constraint rows that join the copies of a node of several subdomains
 
     Raises
     ------
     InputError
-        If the form is unknown, no slave node faces its master, the load of a body
-        cannot be balanced, the friction law is unknown or its parameter negative, the
-        fixed-point iteration does not converge, or `parts` or `glue` is invalid.
+        If the form is unknown, no slave node faces the master side, the load of a body
+        cannot be balanced, the friction law is unknown or its parameter is negative,
+        the fixed-point iteration does not converge, or `parts` or `glue` is invalid.
 
     """
     if form not in FORMS:
@@ -144,7 +144,8 @@ def one_step(
         bodies=elastic,
         linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
-        # the first bound of Coulomb's law must suffice to support bodies by friction
+        # the first slip bound of Coulomb's law must be large enough for friction to
+        # support bodies that nothing else supports
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )
     choice = Choice(size=parts, glue=glue)
@@ -152,7 +153,7 @@ def one_step(
 
 
 def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
-    """Return the law; raise InputError if it is unknown or lacks a parameter."""
+    """Check the name, the parameter and the reference of a law, and return the law."""
     if law.kind not in LAWS:
         raise InputError(
             f"friction {law.kind!r} is unknown; expected one of {', '.join(LAWS)}"
@@ -172,5 +173,5 @@ def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
 
 
 def _no_reference(qp: QP) -> Solution:
-    """Raise AssertionError; stands in for a reference solver that is never called."""
+    """Raise AssertionError; placeholder for a reference solver that is never called."""
     raise AssertionError("no reference solve was given")

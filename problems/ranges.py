@@ -24,7 +24,7 @@ MIN_STRETCH = 0.1  #: smallest stretch of a body under pressure
 #: neither overflow nor underflow
 MIN_SIZE, MAX_SIZE = 1e-30, 1e30
 MAX_STEPS = 10_000  #: largest number of load steps, and of linearisations per step
-#: lower bound of the memory per displacement component: K and its pattern
+#: lower bound of the memory that K and its pattern take per displacement component, MiB
 COMPONENT_MIB = 1 / 1024
 
 
@@ -33,13 +33,13 @@ class Key:
     """One key of a family: its default and its allowed values."""
 
     default: Value
-    least: int | None = None  #: smallest integer; None for no limit
-    most: int | None = None  #: largest integer; None for no limit
+    least: int | None = None  #: smallest allowed integer; None for no limit
+    most: int | None = None  #: largest allowed integer; None for no limit
     values: tuple[Value, ...] = ()  #: allowed values; empty if not a choice
     is_size: bool = False  #: True if the value must be between MIN_SIZE and MAX_SIZE
 
     def with_default(self, default: Value) -> Key:
-        """Return a copy of the key with another default."""
+        """Return a copy of the key with a different default."""
         return replace(self, default=default)
 
     def check(self, family: str, key: str, params: Mapping[str, Value]) -> None:
@@ -73,7 +73,7 @@ def size(default: float) -> Key:
 
 
 def schema(**keys: Key) -> Keys:
-    """Return the keys of a family, in the order of canonical names.
+    """Declare the keys of a family, in the order of canonical names.
 
     >>> defaults_of(schema(n=key(10, 1), law=choice("hertz", "cattaneo")))
     {'n': 10, 'law': 'hertz'}
@@ -95,12 +95,13 @@ PLANES = schema(plane=choice("strain", "stress"))
 GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
 #: key of clusters: number of subdomains per side of a cluster; 0 for no clusters
 CLUSTERS = schema(cluster=key(0, 0))
-#: keys of a decomposition into subdomains; `feti` is H/h, or 0 for undivided bodies
+#: keys of a decomposition into subdomains; `feti` is the largest number of cells along
+#: the side of a subdomain, H/h, or 0 for undivided bodies
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
 DIMENSION = schema(dim=choice(2, 3))
 #: keys that families in space do not support yet, with their only allowed value
 PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
-#: friction laws, each with the key of its parameter
+#: key of the parameter of each friction law; empty if the law has no parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
 #: parameters of the friction laws, with a description of their allowed values
 LAW_PARAMETERS = {
@@ -115,13 +116,15 @@ LAW_KEYS = schema(
     loading=choice("quasi-static", "static"),
 )
 FRICTION = schema(**LAW_KEYS, iterate=key(0, 0))
-#: keys of large deformation; newton=0 selects the last iteration
+#: keys of large deformation; `newton` is the Newton iteration whose QP is returned, 0
+#: for the last one
 KINEMATICS = schema(
     kinematics=choice("linear", "finite"),
     material=choice("neo-hooke", "svk"),
     newton=key(0, 0),
 )
-#: key that adds the second derivatives of the gaps to the tangent
+#: key of the contact stiffness: `geometric` adds the second derivatives of the gaps to
+#: the tangent
 CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
 #: keys that finite strain does not support, with their only allowed value
 LINEAR_ONLY: Mapping[str, Value] = {
@@ -196,10 +199,10 @@ def physical(where: str, value: Any) -> float:
 
 
 def check_memory(family: str, components: int) -> None:
-    """Raise InputError for a case that does not fit into memory, before building it.
+    """Raise InputError if a case of this size would not fit into memory.
 
     components : lower bound of the number of displacement components; each requires at
-        least 1 KiB (stiffness and its pattern), and about 4 KiB with a factor
+        least 1 KiB (stiffness and its pattern), and about 4 KiB including the factor
     """
     needed, limit = components * COMPONENT_MIB, case_limit_mib()
     if needed > limit:
@@ -287,15 +290,15 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
 
 
 def check_dimension(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for dim=3 with keys of plane problems."""
+    """Raise InputError if dim=3 is combined with keys of plane problems."""
     if params["dim"] == 3:
         check_plane_only(family, params, "dim=3")
 
 
 def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> None:
-    """Raise InputError for keys that families in space do not support.
+    """Raise InputError if a key has a value that families in space do not support.
 
-    space : the key and value that make the family three-dimensional
+    space : the key and value that make the family three-dimensional, for the message
     """
     for key, only in PLANE_ONLY.items():
         if params.get(key, only) != only:
@@ -306,7 +309,7 @@ def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> No
 
 
 def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for friction on arcs, whose polygons refinement changes."""
+    """Raise InputError for friction on arcs, as refinement changes their polygons."""
     if params["friction"] != "none":
         raise InputError(
             f"{family}: friction={params['friction']} on curved sides, whose slip "
@@ -317,8 +320,8 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
 def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError if the discretisation error is requested at finite strain.
 
-    The QP of the next finer mesh is linearised at another state, so that the distance
-    between both solutions is not the discretisation error of either mesh.
+    The QP of the next finer mesh is linearised at a different state, so that the
+    distance between the two solutions is not the discretisation error of either mesh.
     """
     if params["kinematics"] == "finite":
         raise InputError(
@@ -330,7 +333,7 @@ def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
 def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
     """Raise InputError if the discretisation error is requested with Coulomb's law.
 
-    The error is measured in the energy norm, and Coulomb's law has no energy.
+    The error is measured in the energy norm, and Coulomb's law minimises no energy.
 
     laws : kinds of the friction laws of all pairs
     meshes : description of cases to compare instead, for the message
@@ -343,7 +346,10 @@ def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
 
 
 def check_tangential(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak, in units of μP."""
+    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak.
+
+    Both tangential forces are relative to μP, the limit of friction.
+    """
     Q, peak = float(params["Q"]), float(params["peak"])
     if not 0 < peak < 1:
         key = "Q" if peak == Q else "peak"
@@ -369,12 +375,12 @@ def one_of(
 
 
 def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
-    """Return the integer `keys`, which are numbers of cells, with doubled values."""
+    """Return the `keys`, which are numbers of cells, with twice their values."""
     return {key: 2 * int(params[key]) for key in keys}
 
 
 def check_dense_memory(family: str, n: int) -> None:
-    """Raise InputError for a dense n × n matrix that does not fit into memory."""
+    """Raise InputError if a dense n × n matrix does not fit into memory."""
     needed, limit = 8 * n**2 / 2**20, case_limit_mib()
     if needed > limit:
         raise InputError(

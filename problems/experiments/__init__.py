@@ -36,7 +36,8 @@ def paper_experiment(
 
     Parameters
     ----------
-    solve, baseline : our solver of the dual QPs and that of the paper, both timed
+    solve : solver of this project for the dual QPs, timed
+    baseline : solver of the paper for the dual QPs, timed
     reference : solver for the experiments on accuracy, not timed
     environment : description of the environment, stored with the measurements
     say : callback that receives one line before each experiment

@@ -1,10 +1,10 @@
-"""The whole analysis, from mesh to displacement, timed by parts (Figure 6, Section 5).
+"""Times of the whole analysis and of its parts (paper, Figure 6 and Section 5).
 
-Two variants of the same ten load steps are compared, both with all Dirichlet rows in
-the dual. The variant ``per-row`` of the paper solves with the factor of K for each row
-of B in each step, and uses the textbook SMALBE for the dual QPs. Our variant
-``condensed`` computes K⁺ on the interface once, so that each step requires one small
-product, and uses our SMALBE.
+An analysis computes the displacement at every load step from the mesh. Two variants are
+compared, both with all Dirichlet conditions as rows of B. The variant ``per-row`` of
+the paper solves with the factor of K for each row of B in each step, and uses the
+textbook SMALBE for the dual QPs. The variant ``condensed`` computes K⁺ on the interface
+once, so that each step requires one small product, and uses the SMALBE of this project.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 
+#: variants by name; True if K⁺ is condensed onto the interface
 WAYS = {
     "per-row": False,
     "condensed": True,
-}  #: variants by name; True if K⁺ is condensed onto the interface
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,19 +38,19 @@ class Analysis:
     bodies: Bodies
     primal: QP  #: primal QP of the last step
     solution: Solution  #: solution of the last step
-    dual: QP
-    laps: Laps
+    dual: QP  #: dual QP of the last step
+    laps: Laps  #: seconds of each part, summed over all steps
 
 
 def analyse(
     Nr: int, Nh: int, *, solve: Reference, condense: bool, steps: int, radial: int = 0
 ) -> Analysis:
-    """Run all load steps; radial = 0 selects 2·Nh layers of the ring.
+    """Run and time all load steps; radial = 0 selects 2·Nh layers of the ring.
 
     Raises
     ------
     RuntimeError
-        If `solve` does not solve a dual QP.
+        If `solve` fails to solve a dual QP.
 
     """
     watch = Stopwatch()
@@ -90,7 +91,7 @@ def analyse(
 
 
 def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
-    """Time both variants for each size of the rectangle, Figure 6."""
+    """Time both variants for each mesh of the rectangle, Figure 6."""
     first = plan.scaling[0]
     for Nr in plan.scaling:
         run = partial(analyse, Nr, plan.Nh, steps=plan.steps)
@@ -118,7 +119,7 @@ def _laps(run: partial[Analysis]) -> Laps:
 
 
 def states(plan: Plan, solve: Reference) -> dict[str, Fields]:
-    """Return the deformed bodies of Figure 7, and of Figure 2 with either ring mesh."""
+    """Return the fields of Figure 2 (for two ring meshes) and Figure 7, by name."""
     Nr, Nh = plan.example
     largest = plan.scaling[-1], plan.Nh, 2 * plan.Nh
     problems = {

@@ -1,7 +1,7 @@
 """Timing of methods by alternating runs in one process.
 
-Alternation distributes a drift of the machine evenly over all methods. Every sample is
-stored; reports compute medians and intervals.
+Alternation distributes slow changes of the machine's speed evenly over all methods.
+Every measured time is stored; reports compute medians and intervals.
 """
 
 from __future__ import annotations
@@ -12,23 +12,22 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
-Laps = Mapping[str, float]  #: seconds by name of the part
-Contestant = Callable[[], Laps]
+Laps = Mapping[str, float]  #: seconds by name of the timed part
+Contestant = Callable[[], Laps]  #: method that runs once and returns its times
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """Number of rounds: `most`, or fewer, but at least `least`, if rounds are slow."""
+    """Number of rounds: `most`, or at least `least` if rounds take too long."""
 
     most: int
     least: int = 5
-    seconds: float = (
-        20.0  #: after this time, no round starts if `least` rounds are complete, s
-    )
+    #: time in s after which no further round starts if `least` rounds are complete
+    seconds: float = 20.0
 
 
 class Stopwatch:
-    """Stopwatch that accumulates seconds by name of the part."""
+    """Stopwatch that accumulates seconds by name of the timed part."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
@@ -55,7 +54,7 @@ def timed_as_one(work: Callable[[], object], part: str = "all") -> Contestant:
 def race(
     contestants: Mapping[str, Contestant], rounds: Rounds, *, warm: bool = True
 ) -> list[dict[str, str | int | float]]:
-    """Time methods alternately; return a row (method, part, repeat, seconds) per lap.
+    """Time methods alternately; return one row per method, timed part and repeat.
 
     warm : True to run each method once before timing, to exclude cold caches
 
@@ -79,7 +78,7 @@ def race(
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Disable the garbage collector of Python within the context."""
+    """Disable Python's garbage collector within the context."""
     enabled = gc.isenabled()
     gc.collect()
     gc.disable()

@@ -30,12 +30,12 @@ Rows = Iterator[dict[str, Value]]
 
 
 def beam(Nr: int) -> Mesh:
-    """Return the mesh of the rectangle alone, 8Nr × Nr cells."""
+    """Return the mesh of the rectangle without the ring, 8Nr × Nr cells."""
     return rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr))
 
 
 def counts(Nr: int, Nh: int) -> Rows:
-    """Yield the sizes of each body as in Table 1."""
+    """Yield the sizes of the mesh of each body, as in Table 1."""
     bodies = model(Nr, Nh, 2 * Nh, "strain")
     (pair,) = bodies.pairs
     for b, (name, N, chain) in enumerate(
@@ -73,9 +73,8 @@ def contact(plan: Plan) -> Rows:
     """Time one linearisation of contact at u = 0, Figure 4."""
     for Nr in plan.contact[0]:
         for Nh in plan.contact[1]:
-            bodies = model(
-                Nr, Nh, 2, "strain"
-            )  # the number of layers of the ring has no effect
+            # the number of layers of the ring (2) has no effect on contact
+            bodies = model(Nr, Nh, 2, "strain")
             (pair,) = bodies.pairs
             points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
             contestants = {
@@ -88,7 +87,7 @@ def contact(plan: Plan) -> Rows:
 
 
 def inverse(plan: Plan) -> Rows:
-    """Time the construction of K⁺ of the rectangle and a product with it, Figure 5."""
+    """Time the construction of K⁺ of the rectangle and the product K⁺v, Figure 5."""
     D = elasticity_matrix(BEAM, "strain") * (LENGTH / LOAD)
     random = np.random.default_rng(2024)
     for Nr in plan.inverse:
@@ -101,7 +100,8 @@ def inverse(plan: Plan) -> Rows:
         rows = race(contestants, plan.inverse_rounds)
         if mesh.dofs <= plan.dense:
             pinv = {"pinv": partial(_pinv, K, v)}
-            # timed separately, because its gigabytes would evict the caches of others
+            # timed separately, because its dense matrices would evict the data of the
+            # other methods from the caches
             rows += race(pinv, plan.inverse_rounds, warm=False)
         for row in rows:
             yield {"Nr": Nr, "n": mesh.dofs} | row

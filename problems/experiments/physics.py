@@ -1,4 +1,4 @@
-"""Accuracy of the load stepping and of the contact rows, beyond the paper."""
+"""Experiments beyond the paper: accuracy of load stepping and of contact rows."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
-#: (steps, linearisations per step) of a converged path; larger numbers do not change
-#: the result
+#: numbers of load steps and of linearisations per step for which the result is
+#: converged: larger numbers do not change it
 CONVERGED = (2, 8)
 
-#: keys of a case by the name of its contact rows in figures
+#: keys of a case by the name of its contact method in figures
 ROWS: Mapping[str, Mapping[str, Value]] = {
     "nts": {"contact": "nts"},
     "mortar": {"contact": "mortar", "basis": "dual"},
@@ -32,11 +32,13 @@ ROWS: Mapping[str, Mapping[str, Value]] = {
 
 
 def stepping(plan: Plan, solve: Reference) -> Rows:
-    """Yield results at the full load for several numbers of steps and of `relin`.
+    """Yield results at the full load for several numbers of steps and linearisations.
 
-    A row contains steps, relin, tip_x, tip_y in m, energy in J/m, and force_x, force_y
-    in N/m. The last row is the converged result, with contact linearised at the
-    solution itself; the other rows converge to it.
+    A row contains steps, relin (linearisations per step), the displacement tip_x, tip_y
+    of the loaded corner in m, the energy in J/m, and the contact force force_x, force_y
+    on the rectangle in N/m. The last row is the converged result, with contact
+    linearised at the solution itself; the other rows approach this result as steps or
+    relin increase.
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
     inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
@@ -65,10 +67,10 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     """Yield contact pressures along the arc for each load step and contact method.
 
     A row contains contact, step, node, angle in degrees, length in m, force in N/m and
-    pressure in Pa of one slave node. The angle is that of the undeformed node about the
-    centre of the ring, measured from the right foot; the length is the part ∫N_j of the
-    arc assigned to the node, the force is the normal force ‖(Bᵀλ)_j‖, and the pressure
-    is force per length.
+    pressure in Pa of one slave node j. The angle is that of the undeformed node about
+    the centre of the ring, measured from the right foot. The length is ∫N_j ds over the
+    arc, the force is the magnitude ‖(Bᵀλ)_j‖ of the contact force on the node, and the
+    pressure is force per length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
     inverse = factorise_clamped(bodies)
@@ -100,9 +102,9 @@ def verification(plan: Plan, solve: Reference) -> Rows:
     """Yield errors against exact solutions: the patch test and Hertz's pressure.
 
     A row contains problem, contact, n and error for one mesh. For the patch test, n is
-    the number of elements along the upper block, and the error is max|σ_y + p|/p. For
-    Hertz's pressure, n is the number of elements per half width of the contact, and the
-    error is the relative L2 error of the pressure.
+    the number of elements along the upper block, and the error is max|σ_y + p|/p, with
+    the applied pressure p. For Hertz's pressure, n is the number of elements per half
+    width of the contact, and the error is the relative L2 error of the pressure.
     """
     for contact, keys in ROWS.items():
         for upper in plan.patch:

@@ -9,7 +9,7 @@ from mortarbench.problems.experiments.clock import Rounds
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """Parameters of all experiments; the paper does not state most of its sizes."""
+    """Parameters of all experiments, most of which the paper does not state."""
 
     assembly: tuple[int, ...]  #: Nr of Figure 3
     assembly_rounds: Rounds

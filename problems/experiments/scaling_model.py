@@ -6,22 +6,27 @@ subsequent projection take
 
     t = local products + joints + rows + messages + reductions + coarse problem.
 
-- *Local products.* One triangle of the block (K⁺)_bb of every subdomain passes through
-  memory once. Congruent subdomains share a block, and the flops decide.
-- *Joints* of clusters: V M⁺Vᵀ in docs/feti-space.md. The columns V of every subdomain
-  are applied twice, and a triangle of the dense M⁺ of every cluster passes once.
-- *Rows.* The sparse B and G pass through memory twice each.
-- *Messages.* The grid of cores cuts the body into bricks of subdomains. A row that k
-  cores touch has one owner: its multiplier is sent to the others and their
-  contributions are returned, 2(k − 1) numbers in two rounds of messages.
-- *Reductions* cost a latency per level of a tree of cores.
-- *Coarse problem.* It has the rigid modes of every subdomain, or of every cluster of
-  m × m × m subdomains. Up to `REPLICATED` unknowns, the rows of its inverse are shared
-  by all cores, or each core solves with a sparse factor, whichever is faster; beyond,
-  one node solves with it. The factor (`factor_entries`) passes through memory twice.
+- *Local products.* One triangle of the block (K⁺)_bb of every subdomain is read from
+  memory once; b are the components on the surface of the subdomain. Congruent
+  subdomains share a block, so that the time is that of the floating-point operations.
+- *Joints* of clusters: the product with V M⁺Vᵀ (see docs/feti-space.md). The columns V
+  of every subdomain are applied twice, and one triangle of the dense matrix M⁺ of every
+  cluster is read once.
+- *Rows.* The sparse matrices B and G are read twice each.
+- *Messages.* The grid of cores cuts the cube into bricks of subdomains. A row with
+  entries on k cores is owned by one of them, which sends the multiplier to the other
+  k − 1 cores and receives their contributions: 2(k − 1) numbers in two rounds of
+  messages.
+- *Reductions* take one latency for each level of a binary tree of cores.
+- *Coarse problem.* Its unknowns are the rigid modes of every subdomain, or of every
+  cluster of m × m × m subdomains. With at most `REPLICATED` unknowns, the rows of the
+  explicit inverse are distributed over all cores, or each core solves with a sparse
+  factor, whichever is faster. With more unknowns, one node solves with the sparse
+  factor. A solve reads the factor (`factor_entries`) twice.
 
-Clusters of side m increase κ by a factor of about m, and the number of steps by √m. The
-time of a solve is hence proportional to t·√m (`Prediction.effective`).
+Clusters of side m increase the condition number by a factor of about m, and the number
+of iterations by √m. Hence, the time of a solve is proportional to t·√m
+(`Prediction.effective`).
 """
 
 from __future__ import annotations
@@ -29,16 +34,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import ceil, log2, prod, sqrt
 
-BYTES = 8  #: of a number
-REPLICATED = 20_000  #: most unknowns of a coarse problem with an explicit inverse
-ENTRY = 12  #: bytes of an entry of a sparse matrix and of its index
-REDUCTIONS = 6.5  #: per application; 4.4 to 6.8 were counted on cube-wall, n = 32
-ENTRIES, EDGE = 31.0, 3.0  #: of `factor_entries`
+BYTES = 8  #: bytes of a floating-point number
+REPLICATED = 20_000  #: largest coarse problem whose inverse may be explicit
+ENTRY = 12  #: bytes of an entry of a sparse matrix, including its index
+#: global reductions per product with F; 4.4 to 6.8 were counted for cube-wall, n = 32
+REDUCTIONS = 6.5
+ENTRIES, EDGE = 31.0, 3.0  #: fitted constants of `factor_entries`
 
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """Speed of a core while all cores of its node are busy, and of the network."""
+    """Speed of the network, and of a core while all cores of its node are busy."""
 
     bandwidth: float  #: memory bandwidth of a core, B/s
     rate: float  #: rate of dense matrix products, flop/s
@@ -48,7 +54,8 @@ class Machine:
 
 
 #: machine of the extrapolation in docs/scaling-model.md, with 3 GB/s per core. The
-#: bandwidth of the node reproduces an earlier prototype; the network is typical
+#: bandwidth of the node reproduces the results of an earlier prototype; the values of
+#: the network are typical
 PAPER = Machine(
     bandwidth=3e9,
     rate=float("inf"),
@@ -64,19 +71,19 @@ class Distribution:
 
     cores: int
     per_core: float = 8.0  #: subdomains per core
-    cells: int = 8  #: H/h
+    cells: int = 8  #: H/h, cells per side of a subdomain
     cluster: float = 1.0  #: m, subdomains per side of a cluster; 1 for no clusters
     components: int = 3  #: components per node: 3 in elasticity, 1 in heat transfer
     congruent: bool = False  #: True if all subdomains of a core share a block
 
     @property
     def modes(self) -> int:
-        """Rigid modes of a subdomain."""
+        """Number of rigid modes of a subdomain."""
         return 6 if self.components == 3 else 1
 
     @property
     def grid(self) -> tuple[int, int, int]:
-        """Cores along the edges of the cube, in the most cubic factorisation."""
+        """Numbers of cores along the edges of the cube: those with the smallest sum."""
         grids = (
             (p, q, self.cores // p // q)
             for p in _divisors(self.cores)
@@ -86,28 +93,30 @@ class Distribution:
 
     @property
     def side(self) -> float:
-        """Subdomains along an edge of the cube."""
+        """Number of subdomains along an edge of the cube, not rounded to an integer."""
         side: float = (self.cores * self.per_core) ** (1 / 3)
         return side
 
     @property
     def cuts(self) -> tuple[int, int, int]:
-        """Cuts of a brick that most cores share, along each edge: none to two."""
+        """Largest number of neighbouring bricks along each axis: 0, 1 or 2."""
         p, q, r = (min(2, cores - 1) for cores in self.grid)
         return p, q, r
 
     @property
     def neighbours(self) -> int:
-        """Other cores that share a face, an edge or a corner of a brick."""
+        """Number of other cores whose bricks share a face, an edge or a corner."""
         return prod(1 + cuts for cuts in self.cuts) - 1
 
     @property
     def sent(self) -> float:
-        """Numbers that an inner core sends in a product.
+        """Number of values that an inner core sends in a product.
 
-        Each of the k cores with a node of c copies sends 2(1 − 1/k)(c − 1) numbers per
-        component. Copies multiply over the edges, c = ∏cᵢ and k = ∏kᵢ, with kᵢ = 2
-        where a core ends. So do the sums over the nodes of a brick, of 1, c, 1/k, c/k.
+        A node with one copy in each of c subdomains on k cores has c − 1 rows per
+        component, for which each of these cores sends 2(1 − 1/k)(c − 1) values on
+        average. Both c and k are products of one factor per axis; the factor of k is 2
+        on the faces between bricks, otherwise 1. Hence, the sums of 1, c, 1/k and c/k
+        over the nodes of a brick are also products of one factor per axis.
         """
         n, nodes, copies, share, copied = self.cells, 1.0, 1.0, 1.0, 1.0
         for cores, cuts in zip(self.grid, self.cuts, strict=True):
@@ -120,25 +129,28 @@ class Distribution:
 
     @property
     def entries(self) -> float:
-        """Entries of orthonormal gluing rows B: c(c − 1) for a node with c copies."""
+        """Number of entries of orthonormal gluing rows B.
+
+        A node with c copies has c(c − 1) entries per component.
+        """
         S, n = self.side, self.cells
         squares = S * (n + 3) - 2  # sum of c² along an edge
         return self.components * (squares**3 - (S * (n + 1)) ** 3)
 
     @property
     def dofs(self) -> float:
-        """Degrees of freedom of the undivided cube, without its boundary layer."""
+        """Degrees of freedom of the undivided cube, without one layer of nodes."""
         return self.components * self.cells**3 * self.cores * self.per_core
 
     @property
     def block(self) -> int:
-        """Number of components on the surface of a subdomain, which occur in rows."""
+        """Number of components on the surface of a subdomain, the order of (K⁺)_bb."""
         n = self.cells
         return self.components * ((n + 1) ** 3 - (n - 1) ** 3)
 
     @property
     def coarse(self) -> float:
-        """Unknowns of the coarse problem."""
+        """Number of unknowns of the coarse problem."""
         return self.modes * self.cores * self.per_core / self.cluster**3
 
 
@@ -146,37 +158,38 @@ class Distribution:
 class Prediction:
     """Cost of one product with F and one projection, per core."""
 
-    local: float  #: s, as the next five
-    joints: float
-    rows: float
-    messages: float
-    reductions: float
-    coarse: float
-    sent: float  #: bytes to all neighbours
-    blocks: float  #: memory of the blocks of its subdomains, B
-    factors: float  #: of the factors of their stiffness, B
-    coarse_memory: float  #: of the coarse problem, on one core or on one node, B
-    steps: float  #: iterations relative to those without clusters
+    local: float  #: time of the local products, s
+    joints: float  #: time of the joints of clusters, s
+    rows: float  #: time of the products with B and G, s
+    messages: float  #: time of the messages, s
+    reductions: float  #: time of the reductions, s
+    coarse: float  #: time of the coarse problem, s
+    sent: float  #: data sent to all other cores, B
+    blocks: float  #: memory of the blocks (K⁺)_bb of a core's subdomains, B
+    factors: float  #: memory of the factors of the stiffness of these subdomains, B
+    coarse_memory: float  #: memory of the coarse problem, per core or on one node, B
+    steps: float  #: number of iterations relative to that without clusters
 
     @property
     def seconds(self) -> float:
-        """Time of a product, s."""
+        """Time of one product with F and one projection, s."""
         local = self.local + self.joints + self.rows
         return local + self.messages + self.reductions + self.coarse
 
     @property
     def effective(self) -> float:
-        """Time of a product multiplied by the relative number of iterations, s."""
+        """Time `seconds` multiplied by the relative number of iterations, s."""
         return self.seconds * self.steps
 
 
 def factor_entries(unknowns: float, modes: int) -> float:
     """Return the number of entries of a sparse Cholesky factor of a coarse problem.
 
-    The graph is a cube of S³ subdomains, each coupled with 26 neighbours. Nested
-    dissection leads to O(n^4/3) entries (George 1973, SIAM J. Numer. Anal. 10). The
-    constant and its boundary correction were fitted to CHOLMOD with METIS for S = 8, 12
-    and 16: 8.52e5, 5.33e6 and 1.79e7 entries, within 2 %.
+    The graph is a cube of S³ subdomains, each coupled with up to 26 others. Nested
+    dissection leads to O(n^(4/3)) entries for n unknowns (George 1973, SIAM J. Numer.
+    Anal. 10). The constant `ENTRIES` and the boundary correction `EDGE` were fitted to
+    factors of CHOLMOD with METIS for S = 8, 12 and 16, which have 8.52e5, 5.33e6 and
+    1.79e7 entries; the fit is within 2 %.
     """
     dense: float = unknowns * (unknowns + 1) / 2
     side: float = (unknowns / modes) ** (1 / 3)
@@ -187,7 +200,7 @@ def factor_entries(unknowns: float, modes: int) -> float:
 
 
 def predict(run: Distribution, machine: Machine) -> Prediction:
-    """Predict the cost of a product with F."""
+    """Predict the cost of one product with F and one projection."""
     s, n = run, run.coarse
     triangle = BYTES * s.block * (s.block + 1) / 2
     distinct = 1.0 if s.congruent else s.per_core
@@ -209,7 +222,8 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
             2.0 * s.block**2 * s.per_core / machine.rate,
         ),
         joints=_joints(s, machine, distinct) if s.cluster > 1 else 0.0,
-        # an entry of B is multiplied by 3 rigid modes, or by the only one
+        # each component of a node moves in 3 of the 6 rigid modes (a translation, two
+        # rotations), or in the only mode: G has 3 entries or 1 for each entry of B
         rows=2 * ENTRY * (1 + (s.modes + 1) // 2) * s.entries / s.cores
         / machine.bandwidth,
         messages=2 * s.neighbours * machine.latency + sent * machine.seconds_per_byte,
@@ -224,9 +238,10 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
 
 
 def _joints(s: Distribution, machine: Machine, distinct: float) -> float:
-    """Return the time of V M⁺Vᵀ, s."""
-    m, columns = s.cluster, 7 * s.modes  # of six faces and of the subdomain
-    unknowns = s.modes * (3 * m**2 * (m - 1) + m**3)  # of a cluster
+    """Return the time of a product with V M⁺Vᵀ, s."""
+    # columns of V for six faces and for the subdomain; unknowns of M⁺ of one cluster
+    m, columns = s.cluster, 7 * s.modes
+    unknowns = s.modes * (3 * m**2 * (m - 1) + m**3)
     inverse = BYTES * unknowns * (unknowns + 1) / 2 * s.per_core / m**3
     passes = max(
         2 * BYTES * s.block * columns * distinct / machine.bandwidth,

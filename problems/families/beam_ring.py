@@ -1,4 +1,4 @@
-"""The family of the paper's benchmark; see `problems.models.beam_ring`."""
+"""Family `beam-ring`, the paper's benchmark; see `problems.models.beam_ring`."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_NODES = 50_000_000  #: the entries of K are indexed by 32-bit integers
+MAX_NODES = 50_000_000  #: limit due to the 32-bit indices of the entries of K
 
 
 class BeamRing(ContactFamily):
-    """The paper's benchmark: beam on a half ring, plane or extruded."""
+    """The paper's benchmark: a beam on a half ring, plane or extruded."""
 
     name = "beam-ring"
     keys = schema(
@@ -59,7 +59,7 @@ class BeamRing(ContactFamily):
     singular = "the work of a point load grows without bound as its cell shrinks"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; radial defaults to 2·Nh, step to steps."""
+        """Return all keys; `radial` defaults to 2·Nh, and `step` to `steps`."""
         params: dict[str, Any] = {**self.defaults, **given}
         derived = {"radial": 2 * params["Nh"], "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}
@@ -72,7 +72,7 @@ class BeamRing(ContactFamily):
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
         if nodes > MAX_NODES:
             raise InputError(
-                f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
+                f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} result in {nodes:.2g} nodes; "
                 f"expected at most {MAX_NODES:.2g}"
             )
         check_memory(self.name, (3 * (p["depth"] + 1) if p["depth"] else 2) * nodes)
@@ -85,9 +85,10 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved, with its own load steps.
+        """Return the keys with half the mesh size; raise InputError with friction.
 
-        Friction is refused, because the refined arcs of the ring are other polygons.
+        The load steps of the refined case are solved on the refined mesh. Friction is
+        not supported, because refinement changes the polygons of the arcs.
         """
         refuse_friction(self.name, params)
         return super().refined(params)

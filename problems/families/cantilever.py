@@ -46,9 +46,9 @@ class Cantilever(DeclaredFamily):
     model = "cantilever.newton_step"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; with the default nx, cells are half as long as thick."""
+        """Return all keys; by default, nx = 2·ny·slenderness, and step is steps."""
         params: dict[str, Any] = {**self.defaults, **given}
-        # limited before rounding: slenderness may be up to 1e30
+        # the number is limited before it is rounded: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)
         derived = {"nx": round(cells), "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}

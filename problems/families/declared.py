@@ -1,4 +1,4 @@
-"""Base classes of families that declare their keys and name functions of models."""
+"""Base classes of families that declare their keys and the functions of a model."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ class DeclaredFamily(Family):
     model : "MODULE.FUNCTION" of `problems.models` that returns the case. The parameters
         of the function may be form, params, reference and individual keys
     subdomains : module of `problems.models` whose `in_subdomains` returns the
-        decomposed problem and whose `results` evaluates it on ranks; if empty, one
-        process always assembles the dual
+        decomposed problem and whose `results` returns a function that evaluates
+        solutions on ranks; empty if the family has no such module
     cells : keys with numbers of cells, which refinement doubles if there is no key
         `halvings`
-    conditions : checks that involve several keys; each applies if its key is declared
+    conditions : checks that involve several keys, by the key that must be declared for
+        the check to apply
 
     """
 
@@ -72,9 +73,9 @@ class DeclaredFamily(Family):
                 check(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved, or None if the family has no meshes.
+        """Return the keys with half the mesh size, or None if the family has no mesh.
 
-        Refined arcs are other polygons.
+        Refinement may change the polygons that approximate arcs.
 
         Raises
         ------
@@ -96,9 +97,9 @@ class DeclaredFamily(Family):
     def emission(
         self, form: str, params: Mapping[str, Value]
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return a function that assembles the share of a rank in the dual, or None.
+        """Return a function that assembles the subdomains of a rank in the dual.
 
-        None means that one process must assemble the case.
+        None means that one process must assemble the whole case.
         """
         if form != "dual" or not self.is_divided(params):
             return None
@@ -107,7 +108,7 @@ class DeclaredFamily(Family):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return this rank's share of the dual; collective."""
+        """Return the local part of the dual on this rank; collective."""
         from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
         del reference
@@ -117,7 +118,7 @@ class DeclaredFamily(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case in one form."""
+        """Return the case in the form `form`."""
         params = self.complete(params)
         self.check(params)
         emit = _model(self.model)
@@ -134,9 +135,9 @@ class ContactFamily(DeclaredFamily):
     Attributes
     ----------
     problem : "MODULE.FUNCTION" of `problems.models` that returns the `ContactProblem`
-        for params
-    model : "MODULE.FUNCTION" that returns the case of a Newton iteration, for
-        kinematics=finite
+        for a mapping of all keys
+    model : "MODULE.FUNCTION" of `problems.models` that returns the case of a Newton
+        iteration if kinematics=finite; empty if the family has no such cases
 
     """
 
@@ -144,14 +145,14 @@ class ContactFamily(DeclaredFamily):
     model = ""
 
     def contact_problem(self, params: Mapping[str, Value]) -> ContactProblem:
-        """Return the contact problem of complete keys."""
+        """Return the contact problem for `params`, which must contain all keys."""
         problem: ContactProblem = _model(self.problem)(params)
         return problem
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case in one form."""
+        """Return the case in the form `form`."""
         params = self.complete(params)
         if params.get("kinematics") == "finite":
             return super().build(form, params, reference)
@@ -165,7 +166,7 @@ class ContactFamily(DeclaredFamily):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return this rank's share of the dual; collective."""
+        """Return the local part of the dual on this rank; collective."""
         from mortarbench.problems.duality.decomposed import distributed_qp_of
         from mortarbench.problems.duality.problem import qp_choice
 

@@ -1,4 +1,4 @@
-"""The family of FCLIB problems; see `problems.files.fclib`."""
+"""Family `fclib`, problems from FCLIB files; see `problems.files.fclib`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 class Fclib(FromFile):
     """Contacts with Coulomb friction from FCLIB files, ``fclib:PATH.hdf5``.
 
-    The QP is the last convex problem of `loop`, whose solution satisfies Coulomb's law,
-    or problem number `iterate`. The digest of the file is a parameter of the case.
+    Coulomb's law is solved by a sequence of convex problems, with fixed cones or fixed
+    discs according to the key `loop`. The QP is the last one, whose solution satisfies
+    Coulomb's law, or problem number `iterate` if `iterate` is not 0. The digest of the
+    file is a parameter of the case.
     """
 
     name = "fclib"
@@ -30,7 +32,7 @@ class Fclib(FromFile):
     forms = ("dual",)
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless keys are in range and the file exists."""
+        """Raise InputError unless the keys are in range and the file exists."""
         loops = ("cones", "tresca")
         if params["loop"] not in loops:
             raise unknown("loop", str(params["loop"]), loops, where=self.name)
@@ -38,7 +40,7 @@ class Fclib(FromFile):
         super().check(params)
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
-        """Return the file with the digest of its content."""
+        """Return the path of the file, the digest of its content, and its suffix."""
         return SourceFile(
             path=str(params["path"]), sha256=str(params["sha256"]), suffix=".hdf5"
         )
@@ -46,15 +48,15 @@ class Fclib(FromFile):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case of a convex problem, scaled by the maxima of W and q.
+        """Return the case of a convex problem, scaled by the largest W_ii and |q_i|.
 
         Raises
         ------
         InputError
-            If the file is damaged or its problem not convex, or if the loop does not
-            converge.
+            If the file is damaged, its problem is not convex, or the sequence of convex
+            problems does not converge.
         PastEndError
-            If the loop has fewer problems than `iterate`.
+            If the sequence has fewer problems than `iterate`.
 
         """
         import numpy as np
@@ -120,6 +122,6 @@ class Fclib(FromFile):
         )
 
 
-#: stored solutions with a larger scaled natural map count as dummies; for r = 0 the map
-#: is about 1
+#: stored forces r with a larger scaled natural map (a residual of Coulomb's law) count
+#: as placeholders rather than solutions; for r = 0 the map is about 1
 DUMMY = 0.1

@@ -1,4 +1,4 @@
-"""The family of QPs from files; see `problems.files.readers`."""
+"""Family `file`, QPs from files; see `problems.files.readers`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ class FromFile(Family):
     """QPs from files: npz, mat (of `export` or Maros-Mészáros), QPS text or Parquet.
 
     Text and mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file
-    is a parameter of the case. It identifies the measured QP in records, and a changed
-    file is another case.
+    is a parameter of the case. The digest identifies the measured QP in records, and a
+    changed file defines a different case.
 
-    copies : copies in a result folder; None to read files from their original path
+    copies : copies of files in a result folder; None to read files from their original
+        paths
     """
 
     name = "file"
-    path_suffix = ""  #: everything after ``file:`` is the path
+    path_suffix = ""  #: empty, because everything after ``file:`` is the path
     defaults: Mapping[str, Value] = MappingProxyType({"path": "", "sha256": ""})
     forms = ("qp",)
 
@@ -55,7 +56,7 @@ class FromFile(Family):
         self._located(params)
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
-        """Return the file with its digest and format."""
+        """Return the path of the file, the digest of its content, and its suffix."""
         path, sha256 = str(params["path"]), str(params["sha256"])
         suffix = format_of(Path(path))
         if path.lower().endswith(".gz"):
@@ -71,7 +72,7 @@ class FromFile(Family):
         return [] if self.copies is None else self.copies.paths()
 
     def _located(self, params: Mapping[str, Value]) -> Path:
-        """Return the path of a file with the digest: the original, or its copy."""
+        """Return the path of the file, or of a copy, with the digest in `params`."""
         source = self.source_file(params)
         if self.copies is not None:
             return self.copies.locate(source)
@@ -82,7 +83,7 @@ class FromFile(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case; `value` is the objective in the units of the file."""
+        """Return the case; its quantity `value` is the objective of the file."""
         from mortarbench.harness import Case
         from mortarbench.problems.files.readers import read
 

@@ -1,4 +1,4 @@
-"""The family of bodies from mesh files; see `problems.models.gmsh_bodies`."""
+"""Family `bodies`, bodies from mesh files; see `problems.models.gmsh_bodies`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 
 class GmshBodies(ContactFamily):
-    """User-defined bodies: a mesh, and a TOML with materials, loads, contacts.
+    """User-defined bodies: a mesh file, and a TOML file with materials and contacts.
 
-    The digest of both files is a parameter of the case, so that changed files define
-    another case.
+    The digest of both files is a parameter of the case, so that changed files define a
+    different case.
     """
 
     name = "bodies"
@@ -59,7 +59,7 @@ class GmshBodies(ContactFamily):
     conditions = MappingProxyType({"kinematics": check_kinematics})
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys, including those of the file; step defaults to steps."""
+        """Return all keys, some from the TOML file; `step` defaults to `steps`."""
         params: dict[str, Value] = {**self.defaults, **given}
         if params["path"]:
             from mortarbench.problems.models.description import read_description
@@ -76,7 +76,7 @@ class GmshBodies(ContactFamily):
         return params if "step" in given else params | {"step": params["steps"]}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless keys are in range and the digest is correct."""
+        """Raise InputError unless the keys are in range and the digest is correct."""
         from mortarbench.problems.models.description import pair_laws, read_description
 
         p: Any = params
@@ -95,7 +95,7 @@ class GmshBodies(ContactFamily):
         check_digest(p["path"], p["sha256"], content_digest(path, mesh))
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every edge of the mesh halved."""
+        """Return the keys of the case in which every edge of the mesh is bisected."""
         from mortarbench.problems.models.gmsh_bodies import laws_of
 
         finer = super().refined(params)
@@ -104,25 +104,29 @@ class GmshBodies(ContactFamily):
         return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Return a remark if contact sides are arcs, whose chords refinement keeps."""
+        """Return a remark if contact sides are arcs, otherwise an empty string.
+
+        Refinement keeps the chords of arcs, and thus the error of the geometry.
+        """
         from mortarbench.problems.models.gmsh_bodies import has_arcs
 
         if not has_arcs(params):
             return ""
         return (
-            "of the bodies as they are meshed; chords of an arc stay corners: for "
-            "pressures, generate a finer mesh"
+            "of the bodies as they are meshed; corners between chords of an arc "
+            "remain: for pressures, generate a finer mesh"
         )
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case of one load step in one form.
+        """Return the case of one load step in the form `form`.
 
         Raises
         ------
         InputError
-            If a file is invalid, or if the Cholesky factorisation fails by rounding.
+            If a file is invalid, or if the Cholesky factorisation fails because of
+            rounding.
 
         """
         from numpy.linalg import LinAlgError
@@ -137,6 +141,7 @@ class GmshBodies(ContactFamily):
         except (LinAlgError, CholmodNotPositiveDefiniteError):
             raise InputError(
                 f"{path}: the stiffness has no Cholesky factor in double precision; "
-                "expected smaller ratios of the sides of cells, and of the moduli E"
+                "expected smaller ratios between the sides of cells and between the "
+                "moduli E"
             ) from None
         return replace(case, remarks=(*remarks(Path(path)), *overlap_remark(params)))

@@ -33,11 +33,11 @@ class HalfPlane(DeclaredFamily):
     model = "half_plane.half_plane_case"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; peak defaults to Q, loading without unloading."""
+        """Return all keys; `peak` defaults to `Q`, which means no unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the law allows Q and peak, without sliding."""
+        """Raise InputError unless the law admits Q and peak without sliding."""
         super().check(params)
         check_dense_memory(self.name, int(params["n"]))
         if params["law"] == "cattaneo":

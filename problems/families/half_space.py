@@ -22,12 +22,14 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-#: bytes per cell of the grid, for vectors, and transforms on four times as many cells
+#: bytes per cell of the grid, for vectors and for Fourier transforms on four times as
+#: many cells
 _CELL_BYTES = 600
-#: largest number of cells per side of a normal problem for the reference solver; 48
-#: take 6 s of processor time, 64 take 31 s
+#: largest number of cells per side for which the reference solver solves the normal
+#: problem; the solve takes 6 s of processor time with 48 cells, and 31 s with 64
 MAX_SOLVED = 48
-#: smallest number of cells per side of a rough surface, whose shortest wave is side/32
+#: smallest number of cells per side of a rough surface; the shortest wavelength is 1/32
+#: of the side
 MIN_ROUGH = 64
 
 
@@ -75,7 +77,7 @@ class HalfSpace(DeclaredFamily):
             )
 
     def _check_law(self, p: Mapping[str, Any]) -> None:
-        """Raise InputError for combinations of law, friction and their parameters."""
+        """Raise InputError if law, friction and their parameters are incompatible."""
         law, friction = p["law"], p["friction"]
         if law == "mindlin" and friction != "none":
             raise InputError(

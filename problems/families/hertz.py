@@ -1,4 +1,4 @@
-"""The families of Hertzian line contact; see `problems.models.hertz`."""
+"""Families of Hertzian line contact; see `problems.models.hertz`."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class HertzPlane(ContactFamily):
 
 
 class HertzCylinder(ContactFamily):
-    """Hertz contact: an elastic half cylinder pressed onto another one."""
+    """Hertz contact: an elastic half cylinder pressed onto another half cylinder."""
 
     name = "hertz-cylinder"
     keys = schema(
@@ -77,7 +77,7 @@ class HertzCylinder(ContactFamily):
     problem = "hertz.problem"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; peak defaults to Q, loading without unloading."""
+        """Return all keys; `peak` defaults to `Q`, which means no unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
@@ -111,6 +111,6 @@ class HertzCylinder(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; raise InputError with friction."""
+        """Return the keys with half the mesh size; raise InputError with friction."""
         refuse_friction(self.name, params)
         return super().refined(params)

@@ -1,4 +1,4 @@
-"""The family of obstacle problems; see `problems.models.obstacle`."""
+"""Family `obstacle`, with exact solutions; see `problems.models.obstacle`."""
 
 from __future__ import annotations
 
@@ -43,5 +43,5 @@ class Obstacle(DeclaredFamily):
         check_memory(self.name, int(params["n"]) ** int(params["dim"]))
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True for a decomposed membrane; one process assembles strings."""
+        """Return True for a decomposed membrane, and False for a string."""
         return params["dim"] == 2 and super().is_divided(params)

@@ -27,9 +27,8 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_DISTORTION = (
-    0.35  #: largest shift in cell sizes; shifts of half a cell could invert cells
-)
+#: largest shift of a node, in cell sizes; shifts of half a cell could invert cells
+MAX_DISTORTION = 0.35
 
 
 class ContactPatch(ContactFamily):
@@ -57,7 +56,7 @@ class ContactPatch(ContactFamily):
     cells = ("lower", "upper")
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range, and stretch below 1."""
+        """Raise InputError unless every key is in its range and is used."""
         super().check(params)
         cells = (int(params["lower"]), int(params["upper"]))
         dim = int(params["dim"])
@@ -83,9 +82,10 @@ class ContactPatch(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; raise InputError with Coulomb's law.
+        """Return the keys with half the mesh size; raise InputError for Coulomb's law.
 
-        Blocks have n/2 rows of cells, rounded up, which may not double for odd n.
+        A block has ⌈n/2⌉ rows of cells. If n is odd, this number does not double
+        exactly.
         """
         finer = double(params, *self.cells)
         meshes = "/".join(f"{name}={n}" for name, n in finer.items())

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Plate(DeclaredFamily):
-    """A clamped plate or box in subdomains with jumps of E, for studies of FETI."""
+    """A clamped plate or box of subdomains with jumps of E, for studies of FETI."""
 
     name = "plate"
     keys = schema(

@@ -1,4 +1,4 @@
-"""Variational inequalities with bounds; see `problems.models.variational`."""
+"""Families of variational inequalities with bounds: `problems.models.variational`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 /* Integrals over single cells, summed into the values of a CSC matrix.
 
-   The functions work for any n nodes and dim coordinates. They are inlined, so that
-   compilers unroll the loops for callers that pass constants. */
+   The functions apply to any number n of nodes and any number dim of coordinates. They
+   are inlined, so that compilers unroll the loops for callers that pass constants. */
 
 #include <stddef.h>
 
@@ -9,7 +9,8 @@
 #define DIM 3
 
 #if defined(__x86_64__) && defined(__gnu_linux__)
-/* compiled twice, selected at load time; without FMA, both versions round identically */
+/* Compile two versions, one of which is selected at load time. Both round identically,
+   because neither uses FMA. */
 #define CLONED __attribute__((target_clones("avx2", "default")))
 #else
 #define CLONED
@@ -25,7 +26,7 @@ static const int VOIGT[DIM + 1][DIM][DIM] = {
     {{0}}, {{0}}, {{0, 2}, {2, 1}}, {{0, 5, 4}, {5, 1, 3}, {4, 3, 2}},
 };
 
-/* Finite element as data, see problems.fem.elements. */
+/* Tables of a finite element, see problems.fem.elements. */
 typedef struct {
     int points, pairs;
     const double *gradients; /* (points, dim, n) gradients of the shape functions */
@@ -69,7 +70,7 @@ INLINED void cell_stiffness(
         Ke[i] = 0;
     for (int q = 0; q < elem->points; q++) {
         const double *reference = elem->gradients + q * dim * n;
-        /* J = ∂x/∂ξ by differences of corners; Σ x_a ∂N_a/∂ξ would lose digits */
+        /* J = ∂x/∂ξ from differences of corners, because Σ x_a ∂N_a/∂ξ loses digits */
         for (int k = 0; k < dim; k++)
             for (int m = 0; m < dim; m++) {
                 const int *last = elem->edges + 2 * k * pairs + 1;
@@ -79,7 +80,7 @@ INLINED void cell_stiffness(
                          * span[(k * pairs + e) * dim + m];
                 J[k][m] = sum;
             }
-        /* grad omits its factor 1/det, which enters twice: w det (1/det)² = w/det */
+        /* grad omits the factor 1/det, which enters twice: w det (1/det)² = w/det */
         const double weight = elem->weights[q] / adjugate(dim, J, adj);
         for (int m = 0; m < dim; m++)
             for (int a = 0; a < n; a++) {
@@ -109,9 +110,9 @@ INLINED void cell_stiffness(
     }
 }
 
-/* Add the block Ke of a cell to the values of a dof pattern.
+/* Add the block Ke of a cell to the entries of a matrix in the order of dof_pattern.
 
-   The entry of components (i, k) and (j, l), node first, is
+   The entry for component k of node i and component l of node j is
    Ke[i·node_i + k·part_k + j·node_j + l·part_l];
    nodes (n,), ptr and slot (n, n): see problems.fem.elasticity.Pattern */
 INLINED void scatter(
@@ -163,7 +164,7 @@ CLONED static void sum_stiffness(
         sum_cells(n, dim, elem->pairs, elem, points, E, cells, D, material, ptr, slot, data);
 }
 
-/* Sum blocks (E, n·dim, n·dim), indexed by nodes, then by components. */
+/* Sum blocks (E, n·dim, n·dim), whose rows are ordered by node, then by component. */
 static void sum_blocks(
     int n, int dim, const double *blocks, ptrdiff_t E, const int *cells, const int *ptr,
     const int *slot, double *data

@@ -37,24 +37,24 @@ class Fronts:
     Front s eliminates the positions start[s] … start[s + 1] − 1. The border of s,
     border[first[s]:first[s + 1]], lists the later positions with nonzeros (including
     fill-in) in the rows of s, ascending. The children of s are the last `children[s]`
-    roots of subtrees before s.
+    fronts before s that are not children of an earlier front.
     """
 
-    start: Ints  #: (F + 1,)
-    first: Ints  #: (F + 1,)
-    border: Ints
-    children: Ints  #: (F,)
-    roots: Marks  #: (F,) True for fronts of the nodes to be eliminated last
+    start: Ints  #: (F + 1,) first position of each front
+    first: Ints  #: (F + 1,) start of the border of each front in `border`
+    border: Ints  #: borders of all fronts
+    children: Ints  #: (F,) number of children of each front
+    roots: Marks  #: (F,) True for fronts of the nodes that are eliminated last
 
 
 def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
-    """Compute an elimination order of the nodes (N,) of a mesh, and its fronts.
+    """Compute an elimination order (N,) of the nodes of a mesh, and its fronts.
 
     Parameters
     ----------
     K : (dN, dN) symmetric pattern in CSC; node i has the d components d·i, d·i + 1, …
     points : (N, dim) positions of the nodes
-    last : nodes to be eliminated last in their connected component
+    last : nodes that are eliminated after all others of their connected component
 
     Returns
     -------
@@ -73,7 +73,7 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
 
 
 def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:
-    """Replace each position i by the (possibly empty) ends[i] … ends[i + 1] − 1."""
+    """Replace each position i by the positions ends[i] … ends[i + 1] − 1, if any."""
     count = np.diff(ends)[fronts.border]
     above = np.append(0, np.cumsum(count))
     each = np.arange(above[-1]) - np.repeat(above[:-1], count)

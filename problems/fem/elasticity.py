@@ -89,7 +89,7 @@ def shape_gradients(corners: Floats, xi: Vector) -> tuple[Floats, Vector]:
 
 
 def strain_matrix(gradients: Floats) -> Floats:
-    """Return B (E, v, n·dim) with ε = B u_e, where u_e = (u_x1, u_y1, …)."""
+    """Return B (E, v, n·dim) in ε = B u_e for v strains and u_e = (u_x1, u_y1, …)."""
     E, n, dim = gradients.shape
     B = np.zeros((E, dim * (dim + 1) // 2, n * dim))
     for (i, j), component in np.ndenumerate(VOIGT[dim]):
@@ -108,8 +108,8 @@ def stiffness(
     Parameters
     ----------
     D : (v, v) elasticity matrix, or (k, v, v) for k materials
-    material : (E,) material of each cell, 0 … k − 1; default: 0
-    pattern : sparsity pattern of the mesh, if already computed
+    material : (E,) index of the material of each cell; default: 0 for all cells
+    pattern : sparsity pattern of the mesh; default: compute it
 
     """
     pattern = pattern or sparsity(mesh)
@@ -130,11 +130,12 @@ def stiffness(
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Sparsity pattern of a stiffness matrix, which only depends on the cells."""
+    """Sparsity pattern of a stiffness matrix, which depends only on the cells."""
 
-    cells: NDArray[np.int32]  #: (E, c)
+    cells: NDArray[np.int32]  #: (E, c) nodes of each cell
     ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
-    slot: NDArray[np.int32]  #: (E, c, c) index of node b among the neighbours of node a
+    #: (E, c, c) index of the node of corner b among the neighbours of that of corner a
+    slot: NDArray[np.int32]
     indptr: NDArray[np.int32]  #: (n + 1,) column pointers of K in CSC
     indices: NDArray[np.int32]  #: row indices of K in CSC
 
@@ -153,7 +154,7 @@ def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
 
 
 def rigid_motions(points: Floats) -> Floats:
-    """Return the linearised rigid motions (n, r) of one body with the nodes (N, dim).
+    """Return the linearised rigid motions (n, r) of one body with nodes at `points`.
 
     The columns are a translation along each axis, followed by the linearised rotation
     x_k e_l − x_l e_k about the centroid of the nodes for each pair of axes (k, l). The
@@ -171,10 +172,11 @@ def rigid_motions(points: Floats) -> Floats:
 
 
 def rigid_modes(points: Floats) -> Floats:
-    """Return an orthonormal basis R (n, r) of ker K of one body, for eq. (4).
+    """Return an orthonormal basis R (n, r) of ker K of one body, see paper, eq. (4).
 
-    In the plane, the analytic rigid motions are orthogonal. In space, rotations about
-    the principal axes of inertia of the nodes are used, which are orthogonal.
+    In the plane, the rigid motions of `rigid_motions` are already orthogonal. In space,
+    the rotations are taken about the principal axes of inertia of the nodes, because
+    rotations about the coordinate axes need not be orthogonal.
     """
     R = rigid_motions(points)
     dim = points.shape[1]

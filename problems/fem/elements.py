@@ -1,4 +1,4 @@
-"""Finite elements as data: products of simplices.
+"""Finite elements whose reference cells are products of simplices.
 
 A simplex with the vertices v_0 … v_d has the barycentric coordinates λ_0 … λ_d, affine
 functions with λ_i(v_j) = δ_ij. The reference cell is the product of one or more
@@ -11,7 +11,7 @@ Quadrilaterals and hexahedra are products of intervals, wedges are products of a
 triangle and an interval, and tetrahedra are single simplices. An isoparametric cell is
 the image of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
 
-The quadrature rule of a simplex has d + 1 points of equal weight, centroid +
+The quadrature rule of a simplex has d + 1 points of equal weight, at centroid +
 (vertex − centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3
 on intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1).
 The stiffness of affine cells is therefore exact. If the cell is a single simplex,
@@ -42,9 +42,9 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 class Element:
     """A product of simplices with n corners."""
 
-    kind: str  #: name of the cells in meshio
-    simplices: tuple[Ints, ...]  #: vertices of each factor
-    vertices: Ints  #: (n, factors) vertex of each factor at each corner
+    kind: str  #: meshio's name for cells of this kind
+    simplices: tuple[Ints, ...]  #: vertices (d + 1, d) of each simplex (factor)
+    vertices: Ints  #: (n, factors) for each corner, its vertex of each factor
 
     @property
     def dim(self) -> int:
@@ -73,7 +73,7 @@ class Element:
 
     @property
     def weights(self) -> Vector:
-        """Weights of the quadrature points, (q,); their sum is the volume."""
+        """Weights (q,) of the quadrature points; their sum is the reference volume."""
         volume = np.prod(
             [
                 abs(np.linalg.det(s[1:] - s[0])) / factorial(s.shape[1])
@@ -83,20 +83,21 @@ class Element:
         return np.full(len(self.points), volume / len(self.points))
 
     def shapes(self, xi: Vector) -> Vector:
-        """Return N_a (n,) at the point ξ (dim,) of the reference cell."""
+        """Return all N_a (n,) at the point ξ (dim,) of the reference cell."""
         return np.asarray(np.prod(self._coordinates(xi)[0], axis=0))
 
     def gradients(self, xi: Vector) -> Floats:
-        """Return ∂N_a/∂ξ (n, dim) at the point ξ (dim,) of the reference cell."""
+        """Return all ∂N_a/∂ξ (n, dim) at the point ξ (dim,) of the reference cell."""
         values, slopes = self._coordinates(xi)
         others = [np.delete(values, f, axis=0).prod(axis=0) for f in range(len(values))]
         columns = zip(slopes, others, strict=True)
         return np.hstack([slope * rest[:, None] for slope, rest in columns])
 
     def _coordinates(self, xi: Vector) -> tuple[Floats, list[Floats]]:
-        """Return, for each factor, λ at ξ for the vertex of each corner, and gradients.
+        """Return the barycentric coordinates λ_{a_f} of all corners a, and gradients.
 
-        The values are (factors, n).
+        The coordinates at ξ are (factors, n). The list contains one array of gradients
+        (n, d) for each factor.
         """
         values, slopes, start = [], [], 0
         for simplex, vertex in zip(self.simplices, self.vertices.T, strict=True):
@@ -118,8 +119,8 @@ class Element:
     def edges(self) -> NDArray[np.int32]:
         """First and last corners (dim, p, 2) of the edges along each axis.
 
-        Axis k of a simplex joins its vertices 0 and k + 1. Axes with fewer than p edges
-        are padded with pairs of equal corners.
+        Axis k of a simplex joins its vertices 0 and k + 1. An axis with fewer than p
+        edges is padded with pairs of equal corners.
         """
         axes = []
         for f, simplex in enumerate(self.simplices):
@@ -155,7 +156,7 @@ TETRA = Element(
     simplices=(TETRAHEDRON,),
     vertices=np.arange(4)[:, None],
 )
-#: elements by dimension and number of columns of a table of cells
+#: elements by dimension and number of corners
 ELEMENTS = {
     (element.dim, len(element.vertices)): element
     for element in (QUAD, HEXAHEDRON, WEDGE, TETRA)

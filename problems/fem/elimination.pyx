@@ -2,8 +2,8 @@
 # cython: initializedcheck=False
 """Compiled loops of the multifrontal method, with dense work in BLAS and LAPACK.
 
-See `problems.fem.multifrontal`. The rows of U = Lᵀ of a front, stored row by row, are
-the columns of L in the column-major order of LAPACK.
+See `problems.fem.multifrontal`. The rows of U = Lᵀ of a front are stored one after
+another. LAPACK, which stores matrices by columns, reads them as the columns of L.
 """
 
 from libc.stdint cimport int64_t
@@ -36,7 +36,8 @@ def eliminate(
     cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, depth = 0
     cdef int low, pivots, rest, size, info = 0
     cdef double one = 1.0, minus = -1.0
-    cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
+    # row of each position in the current front
+    cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)
     cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
     cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
     # stack of the Schur complements of fronts whose parents are not yet assembled
@@ -46,7 +47,8 @@ def eliminate(
     for s in range(children.shape[0]):
         low, pivots, rest = start[s], start[s + 1] - start[s], first[s + 1] - first[s]
         size = pivots + rest
-        # S is above the complements of the children on the stack, which are added to it
+        # S lies on the stack above the complements of the children, because these
+        # complements are added to S
         U, S = &rows[0] + offset[s], &store[0] + top
         for i in range(pivots):
             place[low + i] = i
@@ -75,7 +77,7 @@ def eliminate(
             dtrsm(b"R", b"L", b"T", b"N", &rest, &pivots, &one, U, &size, U + pivots,
                   &size)
             dsyrk(b"L", b"N", &rest, &pivots, &minus, U + pivots, &size, &one, S, &rest)
-        if children[s]:  # S then replaces the complements of the children
+        if children[s]:  # S replaces the complements of the children on the stack
             for i in range(rest):
                 t = i * rest + i
                 memmove(&store[top + t], S + t, (rest - i) * sizeof(double))
@@ -108,10 +110,10 @@ cdef void add(
     Py_ssize_t rest,
     double *U, double *S,
 ) noexcept nogil:
-    """Add the upper triangle of the Schur complement of a child at places `to` (m,).
+    """Add the upper triangle of the Schur complement of a child to its parent front.
 
-    below (m, m) complement of the child; U (pivots, pivots + rest) and
-    S (rest, rest) of the parent front
+    below : (m, m) complement of the child; to : (m,) rows in the parent front;
+    U : (pivots, pivots + rest) and S : (rest, rest) of the parent front
     """
     cdef Py_ssize_t i, j
     cdef double *row
@@ -141,7 +143,8 @@ def substitute(
     cdef double *U
     cdef double *xs
     for t in range(2 * fronts):
-        s = min(t, 2 * fronts - 1 - t)  # forward up the tree, then backward down
+        # forward substitution up the tree, then backward substitution down the tree
+        s = min(t, 2 * fronts - 1 - t)
         pivots, rest = start[s + 1] - start[s], first[s + 1] - first[s]
         size = pivots + rest
         if not pivots:
@@ -166,9 +169,9 @@ def substitute(
 def scatter_symmetric(
     const double[:, :] upper, const int[::1] at, double[:, ::1] to
 ):
-    """Copy a symmetric matrix, given by its upper triangle, to rows and columns `at`.
+    """Copy a symmetric matrix, given by its upper triangle, into the matrix `to`.
 
-    Rows and columns with negative `at` are skipped.
+    Row and column i are copied to row and column at[i], or skipped if at[i] < 0.
     """
     cdef Py_ssize_t i, j
     for i in range(at.shape[0]):

@@ -15,8 +15,9 @@ W = w + U(θ), the volumetric part only depends on the average over the cell,
 
     Π_e = ∫ w(F) dA + V U(θ̄),    θ̄ = 1/V ∫ θ(F) dA,    K_e = ∫ ∂²(w + U′(θ̄)θ) + U″/V ggᵀ
 
-with g = ∫ ∂θ/∂u dA. Since Π_e is an energy, K_e is symmetric. The method has no effect
-on triangles. Q1P0 may develop hourglass modes under strong compression.
+with the area V of the cell and g = ∫ ∂θ/∂u dA. Since Π_e is an energy, K_e is
+symmetric. On triangles, where θ is constant, the method has no effect. Q1P0 may develop
+hourglass modes under strong compression.
 
 The units of coordinates and moduli determine all others: with lengths in units of l and
 moduli in units of F₀/l, forces are in units of F₀ and energies in units of F₀l.
@@ -44,19 +45,21 @@ from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
-#: smallest Poisson's ratio with mean dilatation; below it, fully integrated cells are
-#: used. Without mean dilatation, a cantilever is 3.9 % too stiff at ν = 0.45, and 21
-#: times as stiff at ν = 0.4999
+#: smallest Poisson's ratio for which cells use the mean dilatation; for smaller ratios,
+#: cells are fully integrated. Without the mean dilatation, a cantilever is 3.9 % too
+#: stiff at ν = 0.45, and 21 times as stiff as it should be at ν = 0.4999
 NEARLY_INCOMPRESSIBLE = 0.4
-#: negative eigenvalues of a cell tangent count as zero (translations) up to this share
-#: of its largest eigenvalue
+#: a negative eigenvalue of a cell tangent counts as zero if its magnitude is at most
+#: this share of the largest magnitude: rounding may make the zero eigenvalues of
+#: translations negative
 EIGENVALUE_ROUNDING = 1e-12
-#: replacement of negative eigenvalues, as a share of the largest one of the cell
+#: positive replacement of negative eigenvalues of a cell tangent, as a share of its
+#: largest eigenvalue in magnitude
 CLIPPED_EIGENVALUE = 1e-6
 
 
 class InvertedCellError(ArithmeticError):
-    """Error for an inverted cell, with J ≤ 0 at one of its Gauss points."""
+    """Error for an inverted cell: J = det F ≤ 0 at one of its Gauss points."""
 
     def __init__(self, cell: int, determinant: float) -> None:
         self.cell, self.determinant = cell, determinant
@@ -65,19 +68,19 @@ class InvertedCellError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Data of the cells of hyperelastic bodies that are independent of u."""
+    """Data of the cells of hyperelastic bodies, independent of the displacement u."""
 
     mesh: Mesh
     materials: tuple[Hyperelastic, ...]  #: material of each body
     body: NDArray[np.int64]  #: (E,) body of each cell
-    dofs: NDArray[np.int64]  #: (E, n·dim)
+    dofs: NDArray[np.int64]  #: (E, n·dim) dofs of each cell
     gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the q Gauss points
-    volumes: Floats  #: (E, q) volume of each Gauss point
+    volumes: Floats  #: (E, q) weight of each Gauss point in the integral over the cell
     pattern: Pattern  #: sparsity of K_t
 
 
 class EnergyDerivatives(NamedTuple):
-    """Strain energy of a state, with its derivatives with respect to u."""
+    """Strain energy of a displacement u, with its derivatives with respect to u."""
 
     energy: float  #: Π
     forces: Vector  #: (n,)  r = ∂Π/∂u, internal forces
@@ -111,14 +114,14 @@ def deformation_gradients(cells: Cells, u: Vector) -> Floats:
 
 
 def _deformed(cells: Cells, u: Vector, gradients: Floats) -> Floats:
-    """Return F (E, q, dim, dim) at points with shape function gradients `gradients`."""
+    """Return F (E, q, dim, dim) at points with gradients ∂N_a/∂X (E, q, n, dim)."""
     E, _, n, dim = gradients.shape
     moved = u[cells.dofs].reshape(E, 1, n, dim)
     return np.asarray(np.eye(dim) + np.swapaxes(moved, -1, -2) @ gradients)
 
 
 def strain_energy(cells: Cells, u: Vector) -> float:
-    """Return Π(u); infinity if a cell is inverted."""
+    """Return the strain energy Π(u), or infinity if a cell is inverted."""
     F = deformation_gradients(cells, u)
     if (determinant(F) <= 0).any():
         return np.inf
@@ -183,12 +186,12 @@ def assemble(cells: Cells, tangents: Floats) -> csc_array:
 def convex_tangent(
     cells: Cells, tangents: Floats, positive: Callable[[csc_array], bool]
 ) -> tuple[csc_array, int]:
-    """Assemble K_t, modified cell by cell if it is not positive definite.
+    """Assemble K_t; if it is not positive definite, modify the tangents of its cells.
 
-    The modification replaces negative eigenvalues of each cell tangent by a small
-    positive share of its largest one (Teran, Sifakis, Irving and Fedkiw 2005, "Robust
-    quasistatic finite elements and flesh simulation", who replace them by 0). Zero
-    eigenvalues are kept, so that translations remain in the kernel of each cell.
+    Negative eigenvalues of a cell tangent are replaced by a small positive share of its
+    largest eigenvalue (in Teran, Sifakis, Irving and Fedkiw 2005, "Robust quasistatic
+    finite elements and flesh simulation", they are replaced by 0). Zero eigenvalues are
+    kept, so that translations remain in the kernel of each cell tangent.
 
     Parameters
     ----------
@@ -221,11 +224,11 @@ def convex_tangent(
 
 
 def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
-    """Replace negative eigenvalues of matrices (E, k, k).
+    """Replace negative eigenvalues of symmetric matrices (E, k, k) by positive ones.
 
     Returns
     -------
-    new matrices, and the number of matrices with negative eigenvalues
+    the new matrices, and the number of matrices that had negative eigenvalues
 
     """
     values, vectors = np.linalg.eigh(tangents)
@@ -283,13 +286,13 @@ def _by_material(cells: Cells) -> list[tuple[Hyperelastic, NDArray[np.int64]]]:
 
 
 def _average(values: Floats, volumes: Floats) -> Floats:
-    """Return the mean over each cell, repeated for all of its Gauss points, (E, q)."""
+    """Return the mean over each cell, repeated at each of its Gauss points, (E, q)."""
     mean = (values * volumes).sum(axis=1) / volumes.sum(axis=1)
     return np.repeat(mean[:, None], volumes.shape[1], axis=1)
 
 
 def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
-    """Integrate ∫ P ∂N/∂X, (E, n·dim)."""
+    """Return ∫ P ∂N_a/∂X dA of each cell and corner a, (E, n·dim)."""
     at_points = gradients @ np.swapaxes(P, -1, -2)  # (E, q, n, dim)
     nodal = (volumes[:, :, None, None] * at_points).sum(axis=1)
     return np.asarray(nodal.reshape(-1, np.prod(nodal.shape[1:])))
@@ -298,9 +301,9 @@ def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:
     """Add rows and columns of the fourth corner of triangles to those of the third.
 
-    A triangle repeats its third corner. The assembled sum is unchanged, but the
-    eigenvalues of a block are then those of the triangle instead of a quadrilateral
-    whose equal corners may separate.
+    A triangle is stored with its third corner repeated. The assembled K_t is unchanged,
+    but each block then has the eigenvalues of the triangle, instead of those of a
+    quadrilateral whose third and fourth corners may move apart.
     """
     moved, cells = tangents.copy(), is_triangle(mesh.cells)
     moved[cells, 4:6] += moved[cells, 6:]

@@ -1,9 +1,9 @@
-"""Fixing nodes of a floating body: a few nodes, far apart, that exclude rigid motions.
+"""Fixing nodes of a floating body: if they are fixed, no rigid motion is possible.
 
-The farther apart the fixing nodes are, the better is the condition of K without their
-rows and columns: two neighbouring corners lose three digits, the central nodes of four
-parts hardly any. In space the nodes must not be collinear, because the body could
-rotate about their line.
+The farther apart the fixing nodes are, the better K is conditioned without their rows
+and columns: fixing two neighbouring corners costs three digits of accuracy, and fixing
+the central nodes of four parts of the body hardly any. In space the fixing nodes must
+not be collinear, because the body could rotate about their line.
 """
 
 from __future__ import annotations
@@ -17,22 +17,23 @@ from scipy.sparse.linalg import eigsh
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 
-#: number of fixing nodes per body; fewer nodes worsen the condition, more nodes
-#: increase fill-in
+#: number of fixing nodes per body; fewer nodes worsen the conditioning, more nodes
+#: increase the fill-in
 PARTS = 4
-#: smallest admissible distance of the fixing nodes from their common line (maximum over
-#: the nodes), relative to that of the farthest node of the body. Blocks have at least
-#: 0.35, bars of one cell may have 0
+#: fixing nodes in space count as collinear if their distances from the line of best fit
+#: are smaller than this multiple of the largest distance of a node of the last part
+#: from the line. The ratio of these distances is at least 0.35 for blocks, and may be 0
+#: for bars that are one cell wide
 MIN_DISTANCE = 0.25
 
 
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
-    """Select `parts` (a power of two) fixing nodes of one body, by geometry.
+    """Select `parts` (a power of two) fixing nodes of one body by their positions.
 
-    The nodes `points` (N, dim) are bisected recursively across the longest principal
-    axis, at most down to single nodes. The node nearest to the centroid of each part is
-    selected. In space, if all selected nodes are nearly collinear, the last one is
-    replaced by a node off their line.
+    The nodes at `points` (N, dim) are bisected recursively across their longest
+    principal axis, until there are `parts` parts or a part is a single node. The node
+    nearest to the centroid of each part is selected. In space, if the selected nodes
+    are nearly collinear, the last one is replaced by a node away from their line.
     """
     groups = [np.arange(len(points))]
     while len(groups) < parts and all(group.size > 1 for group in groups):
@@ -53,11 +54,11 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
 
 
 def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes:
-    """Select fixing nodes by spectra of the mesh graph, as in the paper and ref. [8].
+    """Select fixing nodes by spectral bisection of the mesh graph (paper, ref. [8]).
 
     The nodes are bisected recursively at the median of the Fiedler vector (the second
-    eigenvector of the graph Laplacian). In each part, the most central node, with the
-    largest entry of the Perron vector of the adjacency matrix, is selected.
+    eigenvector of the graph Laplacian). In each part, the node with the largest entry
+    in the Perron vector of the adjacency matrix, the most central node, is selected.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes
 
 
 def _graph(cells: Nodes, nodes: int) -> csr_array:
-    """Return the adjacency matrix of nodes that share an edge."""
+    """Return the adjacency matrix (N, N): 1 for two nodes that share an edge."""
     a, b = cells.ravel(), np.roll(cells, -1, axis=1).ravel()
     ones = np.ones(2 * a.size)
     ends = (np.concatenate([a, b]), np.concatenate([b, a]))

@@ -12,11 +12,11 @@ with a measure θ of the dilatation. The mean dilatation method requires this sp
     neo-Hooke                 w = μ/2 (F:F − 2 − 2 ln J),    θ = J,     U = Λ/2 ln²θ
     St. Venant-Kirchhoff      w = μ E:E,   E = ½(FᵀF − I),   θ = tr E,  U = Λ/2 θ²
 
-(Neo-Hooke is from Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite
-Element Analysis", Section 6.4; the trace of C in three dimensions is F:F + 1.) At F = I
-both tangents are those of linear elasticity. St. Venant-Kirchhoff softens under
-compression and has no barrier against J → 0: the magnitude of its stress decreases
-below a uniaxial stretch of 1/√3.
+The neo-Hookean energy is taken from Bonet and Wood 2008, "Nonlinear Continuum Mechanics
+for Finite Element Analysis", Section 6.4, with the invariant I₁ = F:F + 1 in plane
+strain. At F = I both tangents are those of linear elasticity. The St. Venant-Kirchhoff
+material softens under compression and its energy remains finite as J → 0: if a uniaxial
+stretch decreases below 1/√3, so does the magnitude of the stress.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Hyperelastic(ABC):
 
 
 class NeoHooke(Hyperelastic):
-    """Compressible neo-Hooke, W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J."""
+    """Compressible neo-Hookean material, W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J."""
 
     def shear(self, F: Floats) -> Derivatives:
         """Return w = μ/2 (F:F − 2 − 2 ln J) with its derivatives; NaN if J ≤ 0."""
@@ -139,13 +139,13 @@ class NeoHooke(Hyperelastic):
         )
 
     def thickness_rate(self, F: Floats) -> Floats:
-        """Return J."""
+        """Return ∂θ/∂F₃₃ = J (…)."""
         # det F = F₃₃ J₂ with the determinant J₂ in the plane
         return determinant(F)
 
 
 class StVenantKirchhoff(Hyperelastic):
-    """St. Venant-Kirchhoff, W = Λ/2 (tr E)² + μ E:E with E = ½(FᵀF − I)."""
+    """St. Venant-Kirchhoff material, W = Λ/2 (tr E)² + μ E:E with E = ½(FᵀF − I)."""
 
     def shear(self, F: Floats) -> Derivatives:
         """Return w = μ E:E with its derivatives."""
@@ -175,12 +175,12 @@ class StVenantKirchhoff(Hyperelastic):
         return lame / 2 * theta**2, lame * theta, np.full_like(theta, lame)
 
     def thickness_rate(self, F: Floats) -> Floats:
-        """Return 1."""
+        """Return ∂θ/∂F₃₃ = 1 (…)."""
         # tr E = … + ½(F₃₃² − 1)
         return np.ones(F.shape[:-2])
 
 
-#: materials by the values of the key `material`
+#: material classes by value of the key `material`
 MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyType(
     {"neo-hooke": NeoHooke, "svk": StVenantKirchhoff}
 )

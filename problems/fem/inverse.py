@@ -1,21 +1,22 @@
-"""Generalised inverses K⁺ of the stiffness by sparse Cholesky, and their condensation.
+"""Generalised inverses K⁺ of the stiffness matrix K by sparse Cholesky factorisation.
 
 The stiffness matrix K of a floating body is regularised by fixing nodes (Brzobohatý,
-Dostál, Kozubek, Kovář, Markopoulos 2011, reference [8] of the paper): with R* the rows
-of the rigid modes at a few nodes (orthonormalised, zero elsewhere) and ρ > 0,
+Dostál, Kozubek, Kovář, Markopoulos 2011, reference [8] of the paper). Let R* contain
+the rows of the rigid modes R at the fixing nodes, orthonormalised, and zeros elsewhere.
+With ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
 so that K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
-factor. It is not the Moore-Penrose inverse, but for balanced loads (Rᵀf = 0) both
-solutions only differ by a rigid motion. For supported bodies, K⁺ is K_ff⁻¹ on the free
-components and zero on the prescribed ones.
+factor. K⁺ is not the Moore-Penrose inverse, but if the load is balanced (Rᵀf = 0), the
+solutions K⁺f of the two inverses differ only by a rigid motion. For supported bodies,
+K⁺ is K_ff⁻¹ on the free components f and zero on the prescribed ones.
 
-The entries of B are in the components c of contact sides and supports. If these
-components are eliminated last, the trailing block L_cc of the factor yields
+Only the columns c of B, the components of contact sides and supports, have entries. If
+these components are eliminated last, the trailing block L_cc of the factor yields
 (K⁺)_cc = (L_cc L_ccᵀ)⁻¹, and  F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  (eq. (3) of the paper)
-requires one small product in every load step. Fixing nodes are eliminated together with
-c, so that the term ρ R*R*ᵀ, which couples them, causes no fill-in elsewhere.
+requires one small product in every load step. The fixing nodes are eliminated together
+with c, so that the term ρ R*R*ᵀ, which couples them, causes no fill-in elsewhere.
 """
 
 from __future__ import annotations
@@ -43,18 +44,18 @@ NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class Interface(NamedTuple):
-    """Components with entries in constraint rows, and the nodes of all unknowns."""
+    """Components with entries in constraint rows, and positions of all nodes."""
 
-    components: Nodes  #: (c,) ascending
+    components: Nodes  #: (c,) indices of the components, ascending
     points: NDArray[np.float64]  #: (N, dim) positions of the nodes of K
 
 
 class GeneralisedInverse(Protocol):
-    """A symmetric K⁺ (n, n) with K K⁺ K = K on the components on which it acts."""
+    """A symmetric K⁺ (n, n) with K K⁺ K = K on the components that are not fixed."""
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time of the factorisation, s; one factor serves all load steps."""
+        """Wall-clock time in s of the factorisation, which serves all load steps."""
 
     @property
     def kernel(self) -> NDArray[np.float64]:
@@ -78,12 +79,12 @@ class CholeskyInverse:
     """K⁺ by CHOLMOD; BK⁺Bᵀ requires one solve per row of B, as in the paper."""
 
     factor: Factor
-    free: Nodes  #: components on which K⁺ acts; it is zero on the others
+    free: Nodes  #: components that are not fixed; other rows and columns of K⁺ are zero
     kernel: NDArray[np.float64]
     seconds: float  #: time of the factorisation
 
     def __call__(self, b: Vector) -> Vector:
-        """Apply K⁺ by one solve per column."""
+        """Apply K⁺ with one solve per column of b."""
         x = np.zeros_like(b)
         x[self.free] = self.factor.solve_A(b[self.free])
         return x
@@ -121,7 +122,7 @@ class CondensedInverse:
         ptr, idx = index_arrays(B)
         F, within = congruence(ptr, idx, B.data, number, self.compliance)
         if not within:
-            raise ValueError("rows touch components outside the condensed interface")
+            raise ValueError("rows have entries outside the condensed interface")
         return F
 
     def at_constraints(self, b: Vector) -> Vector:
@@ -134,12 +135,12 @@ class CondensedInverse:
 def regular_inverse(
     K: Matrix, free: Nodes, interface: Interface | None = None
 ) -> GeneralisedInverse:
-    """Factorise K_ff; with `interface`, also compute (K⁺)_cc.
+    """Factorise K_ff for the components f in `free`; with `interface`, compute (K⁺)_cc.
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If K_ff is singular. Without an interface, the error is that of CHOLMOD.
+        If K_ff is singular. CHOLMOD's error is raised if `interface` is None.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)
@@ -185,8 +186,9 @@ def supported_inverse(
 ) -> GeneralisedInverse:
     """Factorise K_ff of bodies whose supports may allow rigid motions.
 
-    For each such motion, one further component is fixed, selected by a QR factorisation
-    of the motions with pivoting. Balanced loads cause no reactions at these components.
+    For each rigid motion that the supports allow, one further component is fixed. These
+    components are selected by a QR factorisation of the motions with pivoting. Balanced
+    loads cause no reactions at them.
 
     Parameters
     ----------
@@ -212,7 +214,7 @@ def _inverse(
     interface: Interface | None,
     fixed: Nodes = NO_NODES,
 ) -> GeneralisedInverse:
-    """Factorise K_ff, with the components of the interface and `fixed` last."""
+    """Factorise K_ff, eliminating components of `interface` and `fixed` last."""
     start = perf_counter()
     if interface is None:
         K_ff = csc_matrix(K[free][:, free])

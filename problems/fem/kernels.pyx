@@ -1,8 +1,8 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 """Compiled loops of the assembly, and of congruences BCBᵀ.
 
-Cells couple each node to few others. The sparsity pattern is therefore computed node by
-node, and the entries of each cell are added directly to the CSC arrays, without
+Cells couple each node to few other nodes. The sparsity pattern is therefore computed
+node by node, and the entries of each cell are added directly to the CSC arrays, without
 triplets and sorting. The integrals for all elements are in `cells.h`, and types are in
 `kernels.pyi`.
 """
@@ -11,7 +11,9 @@ import numpy as np
 
 
 def node_pattern(const int[:, ::1] cells, int nodes):
-    """Return the nodes that share a cell with each node, ascending, as CSR (ptr, idx).
+    """Return, for each node, the nodes that share a cell with it, as CSR (ptr, idx).
+
+    The nodes are listed in ascending order and include the node itself.
 
     cells : (E, n) node numbers, less than `nodes`
     """
@@ -39,7 +41,7 @@ def node_pattern(const int[:, ::1] cells, int nodes):
                 if seen[b] == a:
                     continue
                 seen[b] = a
-                k = end  # insertion sort: nodes have few neighbours
+                k = end  # insertion sort, because nodes have few neighbours
                 while k > first and idx[k - 1] > b:
                     idx[k] = idx[k - 1]
                     k -= 1
@@ -67,9 +69,11 @@ def dof_pattern(const int[::1] ptr, const int[::1] idx, int dim):
 
 
 def slots(const int[:, ::1] cells, const int[::1] ptr, const int[::1] idx):
-    """Return the index of node b among the neighbours of node a, for a, b in a cell.
+    """Return positions of corner b in the list of neighbours of corner a of each cell.
 
     The result is (E, n, n), with a along the second and b along the third axis.
+
+    ptr, idx : lists of neighbours, see `node_pattern`
     """
     cdef Py_ssize_t e, i, j, t, n = cells.shape[1]
     cdef int a, b
@@ -118,7 +122,7 @@ def add_stiffness(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Return the values of Σ_e ∫ BᵀDB in the dof pattern.
+    """Return the entries of Σ_e ∫ BᵀDB in the order of `dof_pattern`.
 
     elem : `Element`; points : (N, dim); cells : (E, n); D : (materials, v, v) in
     Voigt's notation; material : (E,) material of each cell; ptr, slot : see `Pattern`
@@ -149,7 +153,10 @@ def add_tangents(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Return the sum of cell tangents (E, n·dim, n·dim) as values of the dof pattern."""
+    """Sum cell tangents (E, n·dim, n·dim) into entries in the order of `dof_pattern`.
+
+    ptr, slot : see `Pattern`
+    """
     cdef int n = cells.shape[1]
     cdef int dim = tangents.shape[1] // n
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])

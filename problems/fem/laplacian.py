@@ -1,4 +1,4 @@
-"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes under unit tension, uniform grids."""
+"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes of unit tension on uniform grids."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
 
 
 def _along(n: int, h: float) -> tuple[csc_array, csc_array]:
-    """Return ∫N_a′N_b′ and ∫N_aN_b of n linear elements in a row."""
+    """Return ∫N_a′N_b′ and ∫N_aN_b of a line of n linear elements of length h."""
     inside = np.ones(n)
     # number of cells adjacent to each node
     ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]

@@ -2,13 +2,13 @@
 
 The dimension and the number of corners determine the element. Plane meshes may mix
 quadrilaterals and triangles. A triangle is a degenerate quadrilateral whose last two
-corners coincide. The bilinear map is then onto the triangle, and N₁, N₂, N₃ + N₄ are
-its barycentric coordinates,
+corners coincide. The bilinear map then covers the triangle, and N₁, N₂, N₃ + N₄ are its
+barycentric coordinates,
 
     Σ N_a x_a = x,   Σ N_a = 1   ⟹   N₁, N₂, N₃ + N₄ are linear in x,
 
-so that the bilinear element *is* the linear triangle (P1). 2×2 Gauss points integrate
-its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
+so that the bilinear element *is* the linear triangle (P1). The 2×2 Gauss rule
+integrates its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
 
 Meshes in space consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
 are stored as hexahedra, which are degenerate in the same way: a tetrahedron is
@@ -31,7 +31,8 @@ from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Elemen
 
 Nodes = NDArray[np.int64]
 
-#: corners of a degenerate hexahedron, by kind of cell
+#: eight corners of a degenerate hexahedron as indices into those of a tetrahedron or
+#: wedge, by kind of cell
 REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]}
 
 
@@ -41,8 +42,8 @@ class Mesh:
 
     In the plane, a boundary is a chain of nodes with the body on its left: with the
     unit tangent t, the outward normal is (t_y, −t_x). In space, a boundary is an array
-    (k, 4) of faces with corners anticlockwise from outside; triangles repeat their last
-    corner.
+    (k, 4) of faces whose corners are anticlockwise as seen from outside; triangular
+    faces repeat their last corner.
 
     >>> mesh = rectangle((0.0, 0.0), (2.0, 1.0), (2, 1))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["bottom"].tolist()
@@ -78,7 +79,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class StructuredGrid:
-    """Structured grid; any block of it can be generated separately.
+    """Structured plane grid, any block of which can be generated separately.
 
     The node in row j and column i has the number j·(nx + 1) + i; cells are numbered in
     the same way.
@@ -109,7 +110,7 @@ class StructuredGrid:
         return dict(zip(self.names, chains, strict=True))
 
     def block(self, columns: slice, rows: slice) -> NDArray[np.float64]:
-        """Return the points (l·k, 2) of some rows and columns of nodes, row by row."""
+        """Return the points (l·k, 2) on l rows and k columns of nodes, row by row."""
         points = self.place(self.columns[columns], self.rows[rows])
         return np.asarray(np.ascontiguousarray(points.reshape(-1, 2)))
 
@@ -123,11 +124,12 @@ class StructuredGrid:
         return np.asarray(points if at < 2 else points[::-1])
 
     def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points (k, 2) of some nodes, equal to those of `block`."""
+        """Return the points (k, 2) of nodes (k,), identical to those of `block`."""
         row, column = np.divmod(node, self.columns.size)
         points = np.empty((node.size, 2))
         by_rows = np.unique(row).size <= np.unique(column).size
-        # line by line, because `place` evaluates full products of columns and rows
+        # one row or column at a time, because `place` evaluates all combinations of
+        # columns and rows
         for line in np.unique(row if by_rows else column):
             k = np.flatnonzero((row if by_rows else column) == line)
             parameters = (
@@ -151,14 +153,15 @@ class StructuredGrid:
 
 @dataclass(frozen=True, eq=False)
 class HalfDisc:
-    """Half disc of rings of cells, with triangles at its centre.
+    """Half disc divided into rings of cells, with triangles at its centre.
 
-    With a angles and r radii, the node on ring j at angle i has the number  j·a + i,
-    and the centre is the last node. Cells are numbered ring by ring, triangles last.
+    If a is the number of angles and r that of radii, the node on ring j at angle i has
+    the number j·a + i, and the centre is the last node, a·r. Cells are numbered ring by
+    ring, and the triangles last.
     """
 
     centre: tuple[float, float]
-    angles: Vector  #: (a,) increasing, from one end of the arc to the other, π apart
+    angles: Vector  #: (a,) increasing by π from the first end of the arc to the last
     radii: Vector  #: (r,) positive and decreasing, from the radius of the arc inwards
     names: tuple[str, str] = ("arc", "flat")  #: names of the sides
 
@@ -185,7 +188,7 @@ class HalfDisc:
         return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=-1)
 
     def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points of some nodes (k, 2)."""
+        """Return the points (k, 2) of nodes (k,)."""
         ring, angle = np.divmod(node, self.angles.size)
         radius = np.append(self.radii, 0.0)[ring][:, None]
         return np.asarray(np.asarray(self.centre) + radius * self._direction[angle])
@@ -195,7 +198,8 @@ class HalfDisc:
 
         Corners of cells are indices into the returned nodes.
 
-        angles, rings : ranges of cells along rings, and of rings
+        angles : range of the cells within each ring
+        rings : range of the rings
         """
         a, r = self.angles.size, self.radii.size
         # the innermost ring consists of triangles with the centre as common corner
@@ -214,7 +218,8 @@ class HalfDisc:
     def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
         """Return the mean lengths of cells along radii and along arcs.
 
-        Each length is the product of a factor per ring and a factor per angle of cells.
+        The length of a cell is the product of two factors, one for its ring and one for
+        its angle. The factors of each length are returned as a pair (rings, angles).
         """
         half, r = np.diff(self.angles) / 2, np.append(self.radii, 0.0)
         return (-np.diff(r), np.cos(half)), ((r[1:] + r[:-1]) / 2, 2 * np.sin(half))
@@ -233,7 +238,7 @@ class HalfDisc:
 
 
 def cells_of_block(columns: int, rows: int) -> Nodes:
-    """Return the cells (E, 4) between columns × rows of nodes, row by row."""
+    """Return the cells (E, 4) of a grid of columns × rows nodes, row by row."""
     i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
     corners = i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]
     return np.stack(corners, axis=-1).reshape(-1, 4)
@@ -258,9 +263,10 @@ def rectangle_grid(
 def box(
     corner: tuple[float, ...], size: tuple[float, ...], divisions: tuple[int, ...]
 ) -> Mesh:
-    """Mesh a box by nx × ny × nz equal hexahedra; numbers vary fastest along x.
+    """Mesh a box by nx × ny × nz equal hexahedra.
 
-    The names of boundaries are those of `box_grid`. Lengths are in m.
+    Numbers of nodes and cells vary fastest along x. The names of boundaries are those
+    of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
@@ -274,10 +280,10 @@ def box(
 
 
 def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
-    """Mesh a box by hexahedra between increasing coordinates.
+    """Mesh a box by hexahedra whose faces lie at the given increasing coordinates.
 
-    Numbers vary fastest along x. The boundaries are left and right (x), front and back
-    (y), bottom and top (z).
+    Numbers of nodes and cells vary fastest along x. The boundaries are left and right
+    (smallest and largest x), front and back (y), bottom and top (z).
     """
     axes = x, y, z
     counts = [axis.size for axis in axes]
@@ -302,10 +308,11 @@ def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
 
 
 def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
-    """Extrude a plane mesh of quadrilaterals to layers of hexahedra from z = 0, m.
+    """Extrude a plane mesh of quadrilaterals along z, from 0 to `thickness`.
 
-    Nodes and cells are numbered layer by layer. A chain of nodes becomes a set of faces
-    of the same name. The end faces have no name.
+    The mesh consists of `layers` layers of hexahedra. Nodes and cells are numbered
+    layer by layer. Each boundary, a chain of nodes, becomes a set of faces of the same
+    name. The end faces have no name.
     """
     N = len(mesh.points)
     step = N * np.arange(layers + 1)
@@ -313,7 +320,8 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
     points = np.column_stack([np.tile(mesh.points, (layers + 1, 1)), z])
     ends = step[:-1, None, None], step[1:, None, None]
     cells = np.concatenate([mesh.cells + at for at in ends], axis=2)
-    # the body is on the left of the chain, so (a, b, b', a') is anticlockwise outside
+    # the body is on the left of the chain, so (a, b, b', a') is anticlockwise from
+    # outside
     facets = {
         name: np.stack([chain[:-1], chain[1:], chain[1:] + N, chain[:-1] + N], axis=-1)
         for name, chain in mesh.boundaries.items()
@@ -325,7 +333,7 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
 
 
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
-    """Move the nodes of a `box` at random; nodes of a side remain in its plane.
+    """Shift the nodes of a `box` at random; the nodes of a side remain in its plane.
 
     share : largest shift along an axis, relative to the mean cell size along this axis
     """
@@ -340,9 +348,12 @@ def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
 def half_ring_grid(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> StructuredGrid:
-    """Divide the upper half of a ring by equal angles and equal layers.
+    """Divide the upper half of a ring into cells of equal angle and equal thickness.
 
     The sides are outer (from angle 0 to π), left_foot, inner and right_foot.
+
+    radii : inner and outer radius
+    divisions : numbers of cells along the arc and across the ring
     """
     angles, layers = divisions
 
@@ -374,22 +385,25 @@ def rectangle(
 def half_ring(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh the upper half of a ring by equal angles and equal layers.
+    """Mesh the upper half of a ring by cells of equal angle and equal thickness.
 
     The boundaries are outer (from angle 0 to π), left_foot, inner and right_foot.
+
+    radii : inner and outer radius, m
+    divisions : numbers of cells along the arc and across the ring
     """
     return half_ring_grid(centre, radii, divisions).mesh()
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
-    """Mesh half a disc by rings of cells, with triangles at its centre.
+    """Mesh half a disc by rings of cells, the innermost of which consists of triangles.
 
     The boundaries are arc (anticlockwise) and flat (through the centre).
 
     Parameters
     ----------
-    angles : increasing, from one end of the arc to the other, π apart
-    radii : positive and decreasing, from the radius of the arc inwards
+    angles : angles of the nodes, increasing by π from the first to the last
+    radii : radii of the rings of nodes, positive and decreasing from that of the arc
 
     """
     return HalfDisc(centre, angles, radii).mesh()
@@ -398,7 +412,7 @@ def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mes
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
     """Join the meshes of bodies without merging nodes; return the mesh and `body` (E,).
 
-    Names of boundaries must be distinct (see `prefixed`): of several boundaries with
+    Names of boundaries should be distinct (see `prefixed`): if several boundaries have
     the same name, only that of the last body is kept.
 
     >>> block = rectangle((0.0, 0.0), (1.0, 1.0), (1, 1))
@@ -452,7 +466,7 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
 
 
 def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vector]:
-    """Return the nodes of faces (k, 4) in space, ascending, and nodal areas ∫N_j, m².
+    """Return the nodes of `faces` (k, 4), ascending, and their areas ∫N_j dA, m².
 
     >>> unit = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
     >>> nodes, areas = nodal_areas(unit.points, unit.boundaries["top"])

@@ -29,9 +29,9 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Multifrontal:
-    """Factor K_oo = LLᵀ, stored as rows of U = Lᵀ, front by front.
+    """Factor L of K_oo = LLᵀ; the rows of U = Lᵀ are stored front by front.
 
-    The block of a front is pivots × (pivots + border).
+    A front with p pivots and a border of b positions has p × (p + b) entries.
     """
 
     order: Nodes  #: o, components in elimination order
@@ -47,7 +47,7 @@ class Multifrontal:
         return x.T.reshape(b.shape)
 
     def trailing(self) -> list[tuple[Nodes, Floats]]:
-        """Return the unknowns eliminated last and their U, for each connected part."""
+        """Return the last unknowns of each connected component and their block of U."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
             positions = slice(f.start[s], f.start[s + 1])
@@ -65,10 +65,10 @@ def multifrontal(
     Parameters
     ----------
     K : (n, n) symmetric, CSC
-    free : components f
+    free : components f in K_ff
     points : (N, dim) positions of the nodes; node i has the n/N components from i·n/N
-    last : components whose nodes are eliminated last. If K couples distant nodes, they
-        should be among these nodes
+    last : components whose nodes are eliminated last. If K couples distant nodes, these
+        should belong to `last`, to limit fill-in
 
     Raises
     ------

@@ -7,11 +7,11 @@ from libc.stdint cimport int64_t
 
 import numpy as np
 
-#: Jacobi sweeps for a 3 × 3 matrix; convergence is quadratic, and four suffice for
-#: double precision
+#: number of Jacobi sweeps for a 3 × 3 matrix; since convergence is quadratic, four
+#: suffice for double precision
 cdef int SWEEPS = 8
-#: off-diagonal entries and differences of eigenvalues below this share of the trace
-#: count as zero
+#: off-diagonal entries, and differences of eigenvalues, count as zero up to this
+#: multiple of the trace
 cdef double ROUNDING = 1e-9
 
 
@@ -38,7 +38,10 @@ def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
 
 
 def components(const int[::1] ptr, const int[::1] idx):
-    """Return the connected component of each node (N,), numbered by first nodes."""
+    """Return the number of the connected component of each node, (N,).
+
+    Components are numbered in the order of their first nodes.
+    """
     cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
     cdef int count = 0
     numbers = np.full(nodes, -1, dtype=np.int32)
@@ -104,7 +107,7 @@ def dissect_components(
                 stack[depth, 0], stack[depth, 1] = low, middle
                 stack[depth + 1, 0], stack[depth + 1, 1] = middle, separator
                 depth += 2
-            else:  # a leaf, or all nodes have the same coordinate
+            else:  # a leaf, or all nodes have the same coordinate along the axis
                 length[fronts], children[fronts] = high - low, 0
             fronts += 1
         lengths[begin:fronts] = lengths[begin:fronts][::-1].copy()
@@ -124,8 +127,8 @@ cdef void bisect(
     """Reorder `part` to first half, second half and separator.
 
     `middle` and `separator` are set to the offsets of the second half and of the
-    separator, and `side` to `cut` on the first half and cut + 1 on the rest. kind, copy
-    and along (2, N) are workspace.
+    separator, and `side` to `cut` on the first half and to cut + 1 on the other nodes.
+    `kind`, `copy` and `along` (2, N) are workspace.
     """
     cdef Py_ssize_t a, t, s, n = part.shape[0]
     cdef double value, least = INFINITY, most = -INFINITY
@@ -134,8 +137,8 @@ cdef void bisect(
     for t in range(n):
         along[1, t] = along[0, t]
         least, most = fmin(least, along[0, t]), fmax(most, along[0, t])
-    # without the tolerance, rounding of the coordinates could split a grid line at the
-    # median between both halves
+    # without the tolerance, rounding of the coordinates could assign nodes of the grid
+    # line at the median to different halves
     value = find(&along[1, 0], n, n // 2) - 1e-9 * (most - least)
     for t in range(n):
         side[part[t]] = cut + (along[0, t] >= value)
@@ -159,7 +162,7 @@ cdef void bisect(
 cdef void coordinates(
     const double[:, :] points, const int[::1] part, double[::1] along
 ) noexcept:
-    """Write the coordinates of nodes along their longest principal axis."""
+    """Write the coordinates of the nodes `part` along their longest principal axis."""
     cdef Py_ssize_t t, k, l, n = part.shape[0], dim = points.shape[1]
     cdef double[3] mean = [0.0, 0.0, 0.0]
     cdef double[3] axis
@@ -183,10 +186,11 @@ cdef void coordinates(
 
 
 cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
-    """Write the eigenvector of the largest eigenvalue of C (upper triangle).
+    """Write the eigenvector for the largest eigenvalue of C (upper triangle) to `axis`.
 
-    In space, it is computed by the cyclic Jacobi method. Off-diagonal entries due to
-    rounding are not eliminated, so that a cube is bisected along its edges.
+    In space, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
+    entries due to rounding are not eliminated, so that a cube is bisected across its
+    edges.
     """
     cdef Py_ssize_t k, l, j, sweep, longest = 0
     cdef double angle, c, s, one, other, size = C[0][0] + C[1][1] + C[2][2]
@@ -213,7 +217,7 @@ cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcep
                 for j in range(3):  # … and its transpose times C from the left
                     one, other = C[k][j], C[l][j]
                     C[k][j], C[l][j] = c * one + s * other, c * other - s * one
-    for k in range(1, 3):  # select the first of axes that are equal up to rounding
+    for k in range(1, 3):  # if axes are equally long up to rounding, select the first
         if C[k][k] > C[longest][longest] + ROUNDING * size:
             longest = k
     for k in range(3):
@@ -252,7 +256,10 @@ def borders(
     const int[::1] start,
     const int[::1] children,
 ):
-    """Compute the borders: later neighbours of a front, and borders of its children.
+    """Compute the borders of all fronts.
+
+    The border of a front consists of the later neighbours of its nodes, and of the
+    borders of its children without the nodes of the front.
 
     Returns first (F + 1,) and border, see `Fronts`.
     """
@@ -287,7 +294,7 @@ def borders(
         stack[depth] = s
         depth += 1
 
-    # two counting sorts, by position and then by front, sort borders at linear cost
+    # sort each border by two counting sorts at linear cost: by position, then by front
     cdef int[::1] at = np.append(0, np.bincount(entries[:end], minlength=nodes)).cumsum(
         dtype=np.int32
     )

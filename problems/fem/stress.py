@@ -1,12 +1,13 @@
-"""Stresses from displacements: at cell centres and Gauss points, recovered at nodes.
+"""Stresses from displacements at cell centres and Gauss points, and recovery at nodes.
 
 Nodal stresses follow from superconvergent patch recovery (Zienkiewicz and Zhu 1992).
 Stresses are superconvergent at the centres of multilinear cells, and most accurate at
 the centroids of linear triangles and tetrahedra. Around each interior node, a linear
-polynomial is fitted to these values. At a boundary node, the polynomials of the
-interior nodes with which it shares a cell are averaged. If there are none (at the
-corner of a single triangle), the average is over its boundary neighbours. Bodies have
-no common nodes, so that no average extends over several bodies.
+polynomial is fitted to these values. At a boundary node, the polynomials of all
+interior nodes that share a cell with the node are averaged. At a boundary node that
+shares no cell with an interior node (the corner of a single triangle), the averages at
+the boundary nodes of its cells are averaged. Bodies have no common nodes, so that no
+average extends over several bodies.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.f
     if mesh.dim == 2:
         return _stress_at(mesh.element.centre, mesh, D, u)
     stress = np.empty((len(mesh.cells), D.shape[-1]))
-    for block in mesh.blocks:  # the centre of a hexahedron is not that of a wedge
+    # the centre of a degenerate hexahedron is not that of the wedge or tetrahedron
+    for block in mesh.blocks:
         part = Mesh(mesh.points, block.nodes, {})
         of_cells = D if D.ndim == 2 else D[block.cells]
         stress[block.cells] = _stress_at(part.element.centre, part, of_cells, u)
@@ -91,7 +93,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         count = np.bincount(b, minlength=N)
         polynomial[count > 0] /= count[count > 0, None, None]
         has_value = has_value | (count > 0)
-    # the constant term is the value at the node about which it is expanded
+    # each polynomial is expanded about its node: its constant term is the nodal value
     result = polynomial[:, 0]
     isolated = ~has_value  # in a single layer of cells: average over adjacent cells
     result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]
@@ -126,7 +128,7 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
 def _neighbours(
     mesh: Mesh, first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all pairs of nodes in a common cell, from masks `first` and `second`."""
+    """Return all pairs (a, b) of nodes in a common cell with first[a] and second[b]."""
     cells = mesh.cells[first[mesh.cells].any(axis=1)]
     corners = cells.shape[1]
     a, b = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, corners).ravel()

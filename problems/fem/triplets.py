@@ -1,7 +1,8 @@
 """Assembly of the stiffness by triplets, vectorised as in the paper's library [6].
 
-All element matrices are computed at once and sorted into a sparse matrix. This method
-is the baseline for `problems.fem.elasticity.stiffness` in benchmarks and experiments.
+All element matrices are computed at once, and their entries are summed into a sparse
+matrix. This method is the baseline against which benchmarks and experiments compare
+`problems.fem.elasticity.stiffness`.
 """
 
 from __future__ import annotations

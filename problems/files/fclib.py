@@ -1,17 +1,21 @@
 """FCLIB files: problems of contact with Coulomb friction in HDF5.
 
-The unknowns of a local problem are the contact forces r, in blocks (N, T₁[, T₂]), and
-multipliers l. Global problems also contain the velocities v of the bodies::
+The unknowns of a local problem are the contact forces r, in blocks of one normal and
+one or two tangential components, and multipliers l of equality constraints; u are the
+relative velocities at the contacts. Global problems also have the velocities v of the
+bodies as unknowns::
 
     u = W r + V l + q,   Vᵀr + R l + s = 0                        (local)
     M v = H r + G l + f,   Gᵀv + b = 0,   u = Hᵀv + w             (global)
 
-where û = u + (μ‖u_T‖, 0) is in the dual of the friction cones K, and r ∈ K is
-orthogonal to û.
-A matrix is a group of nzmax, m, n, nz, p, i and x. It is stored by columns if nz = −1,
-by rows if nz = −2, and as nz triplets otherwise. According to the documentation of
-FCLIB, p contains the rows of triplets, but files written by Siconos have the order of
-CSparse, with columns in p. Both orders are read; the second is used if both fit.
+In both forms, r is in the friction cone K, û = u + (μ‖u_T‖, 0) is in the dual cone of
+K, and r is orthogonal to û.
+
+A matrix is a group with the members nzmax, m, n, nz, p, i and x. It is stored by
+columns if nz = −1, by rows if nz = −2, and as nz triplets otherwise. According to the
+documentation of FCLIB, p contains the row indices of triplets, but files written by
+Siconos follow CSparse, where p contains the column indices. Both conventions are read;
+if the indices fit the shape of the matrix in both, the second is used.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.
@@ -47,14 +51,13 @@ Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """A contact problem, with the solution and description stored in its file."""
+    """A contact problem, with the solution that its file contains."""
 
     contact: FrictionalContact
     is_local: bool
     stored: Vector | None  #: (n,) forces of /solution; None if the file has no solution
-    multipliers: (
-        Vector  #: (p,) multipliers of /solution; zeros if the file has no solution
-    )
+    #: (p,) multipliers of /solution; zeros if the file does not contain them
+    multipliers: Vector
 
 
 def read_datasets(path: Path) -> Datasets:
@@ -66,7 +69,7 @@ def read_datasets(path: Path) -> Datasets:
         If the file cannot be read, is not HDF5, or is too large.
 
     """
-    import h5py  # workers of solvers do not need HDF5
+    import h5py  # imported here, because workers of solvers do not need HDF5
 
     arrays: dict[str, NDArray[Any]] = {}
 
@@ -108,7 +111,7 @@ def write_datasets(path: Path, arrays: Datasets) -> None:
 
 
 def read_fclib(path: Path) -> FclibFile:
-    """Read an FCLIB file; the global form is reduced to the local one.
+    """Read an FCLIB file, and reduce a global problem to a local one.
 
     Raises
     ------
@@ -128,8 +131,8 @@ def to_contact(arrays: Datasets) -> FclibFile:
     Raises
     ------
     InputError
-        If an array is missing or inconsistent with others, or if the kind of problem is
-        not supported.
+        If an array is missing or inconsistent with other arrays, or if the kind of
+        problem is not supported.
 
     """
     kinds = [
@@ -174,7 +177,7 @@ def _local(part: _Group, n: int, mu: Vector) -> FrictionalContact:
 
 
 def _global(part: _Group, n: int, mu: Vector) -> FrictionalContact:
-    """Eliminate the velocities, and the multipliers of Gᵀv + b = 0."""
+    """Return the local form of a global problem, with v and l eliminated."""
     f, w = part.vector("vectors/f"), part.vector("vectors/w", n)
     M, H = part.matrix("M", f.size, f.size), part.matrix("H", f.size, n)
     check_size("W, a dense matrix", 8 * (n + f.size) * n)
@@ -197,7 +200,7 @@ def _factor(name: str, K: Any) -> Any:
 
 
 class _Group:
-    """Arrays of a group of a file, validated on access."""
+    """Arrays in one group of a file, validated on access."""
 
     def __init__(self, name: str, arrays: Datasets) -> None:
         self.name, self._arrays = name, arrays
@@ -258,9 +261,10 @@ class _Group:
 
 
 def save_fclib(path: Path, qp: QP, meta: Mapping[str, Any], source: str = "") -> None:
-    """Write a QP over friction cones, or the arrays of the FCLIB file `source`.
+    """Write a QP over friction cones, or a copy of the FCLIB file `source`.
 
-    meta : plain data, stored as the description in JSON
+    meta : metadata of plain types, stored in JSON as the description of the problem
+    source : path of an FCLIB file whose arrays are copied; if empty, `qp` is written
 
     Raises
     ------
@@ -280,13 +284,13 @@ def save_fclib(path: Path, qp: QP, meta: Mapping[str, Any], source: str = "") ->
 def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
     """Return a QP over friction cones as the arrays of a local problem.
 
-    Equality rows A r = b become V = Aᵀ, s = −b, R = 0.
+    Equality rows A r = b are stored as V = Aᵀ, s = −b and R = 0.
 
     Raises
     ------
     InputError
-        If a variable is not in a cone, the cones differ in dimension, there are other
-        constraints, or P is an operator.
+        If a variable is not in a cone, the cones differ in dimension, the QP has
+        inequality rows or sets other than cones, or P is an operator.
 
     """
     cones = [one for one in qp.sets[1:] if isinstance(one, Cones)]
@@ -307,7 +311,7 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
         )
     if not qp.is_explicit:
         raise InputError(
-            "P is an operator; expected a matrix, since FCLIB files hold nothing else"
+            "P is an operator; expected a matrix, since FCLIB files store only matrices"
         )
     kind, names = "fclib_local", {"mu": np.concatenate([one.slope for one in cones])}
     arrays = {f"{kind}/spacedim": np.array([dims.pop()], dtype=np.int32)}
@@ -327,7 +331,7 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
 
 
 def _compressed(M: Any) -> Datasets:
-    """Return the arrays of a matrix stored by columns."""
+    """Return the arrays that store a matrix by columns."""
     M = csc_array(M)
     M.sum_duplicates()
     sizes = {"nzmax": M.nnz, "m": M.shape[0], "n": M.shape[1], "nz": _COLUMNS}

@@ -37,9 +37,9 @@ def format_of(path: Path) -> str:
 
 
 def check_digest(path: Value, asked: Value, found: str) -> None:
-    """Raise InputError unless the digest of a file is that in the name of the case."""
+    """Raise InputError if the digest `found` of a file is not that in its case name."""
     if asked != found:
         raise InputError(
             f"{path}: its content has the digest {found}, not {asked}; "
-            "the file changed, or another one was meant"
+            "the file changed, or a different file was meant"
         )

@@ -1,12 +1,13 @@
 """QPS: the MPS format of linear programs with a section for the quadratic term.
 
-Fields are separated by white space, so that names cannot contain any; files in fixed
-columns are read as well. Sections follow Maros and Mészáros (1999), "A repository of
-convex quadratic programming problems", Optim. Methods Softw. 11/12:
+Fields are separated by white space, so that names cannot contain any. Files in fixed
+columns can be read if their names contain no spaces. Sections follow Maros and Mészáros
+(1999), "A repository of convex quadratic programming problems", Optim. Methods Softw.
+11/12:
 
 * N rows after the first are ignored; the RHS of the objective is minus its constant.
-* RANGES R turns  ≤ b  into [b − |R|, b],  ≥ b  into [b, b + |R|],  = b  into
-  [b, b + R] or, for R < 0, [b + R, b].
+* A number R in RANGES changes  ≤ b  to [b − |R|, b],  ≥ b  to [b, b + |R|],  and  = b
+  to [b, b + R] or, if R < 0, to [b + R, b].
 * BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in
   commercial readers.
 * QUADOBJ and QSECTION contain one triangle of P, and QMATRIX both. The objective is
@@ -15,8 +16,8 @@ convex quadratic programming problems", Optim. Methods Softw. 11/12:
 Undefined names and malformed numbers raise an error that states their line. (The reader
 of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
 
-Writing and reading a QP reproduces every number to the last digit. If P is symmetric up
-to rounding only, its symmetric part is written: the objective depends on this part
+Writing and reading a QP reproduces every number to the last digit. If P is symmetric
+only up to rounding, its symmetric part is written: the objective depends on this part
 alone, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
 """
 
@@ -46,7 +47,7 @@ _NUMBER = re.compile(
 
 @dataclass(eq=False)
 class _QPSModel:
-    """Content of the sections read so far; keys are names of rows and columns."""
+    """Content of the sections that have been read, by names of rows and columns."""
 
     rows: dict[str, str] = field(default_factory=dict)  #: type N, L, G or E by name
     columns: dict[str, int] = field(default_factory=dict)
@@ -64,7 +65,8 @@ class _QPSModel:
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
     """Parse a QPS text; return the problem and the sign of its objective.
 
-    For a maximisation, the sign is −1 and the objective, with its constant, is negated.
+    If the objective is to be maximised, the sign is −1, and the problem returned is the
+    minimisation of the negative objective (with its constant).
 
     Raises
     ------
@@ -99,7 +101,7 @@ def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
 def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     """Write `qp` as a QPS text; an operator P is assembled.
 
-    The format has no metadata: `meta`, plain data, is written as comments.
+    meta : metadata of plain types, written as comments because QPS has no metadata
 
     Raises
     ------
@@ -195,7 +197,7 @@ def _header(model: _QPSModel, section: str, words: list[str]) -> None:
         raise unknown("section", words[0], known)
     if section == "QSECTION" and words[1:] not in ([], [model.objective]):
         raise InputError(
-            f"QSECTION {words[1]} is of a constraint; expected {model.objective!r}"
+            f"QSECTION {words[1]} belongs to a constraint; expected {model.objective!r}"
         )
     if section == "OBJSENSE" and words[1:]:
         _sense(model, words[1:])
@@ -237,7 +239,7 @@ def _column(model: _QPSModel, words: list[str]) -> None:
 
 
 def _sides(target: str) -> Callable[[_QPSModel, list[str]], None]:
-    """Return a reader of RHS or RANGES, whose set name is optional."""
+    """Return a reader of lines of RHS or RANGES, where the set name is optional."""
 
     def read(model: _QPSModel, words: list[str]) -> None:
         _expect(2 <= len(words) <= 5, "one or two pairs of row and number")
@@ -253,7 +255,9 @@ def _bound(model: _QPSModel, words: list[str]) -> None:
     kind, *rest = words
     kind = kind.upper()
     if kind in ("BV", "LI", "UI", "SC", "SI"):
-        raise InputError(f"bound {kind} makes the variable discrete; expected none")
+        raise InputError(
+            f"bound {kind} makes the variable discrete; expected continuous variables"
+        )
     if kind not in ("LO", "UP", "FX", "FR", "MI", "PL"):
         raise unknown("bound type", words[0], ("LO", "UP", "FX", "FR", "MI", "PL"))
     if kind in ("FR", "MI", "PL"):
@@ -276,7 +280,9 @@ def _bound(model: _QPSModel, words: list[str]) -> None:
 
 def _quadratic(target: str) -> Callable[[_QPSModel, list[str]], None]:
     def read(model: _QPSModel, words: list[str]) -> None:
-        _expect(len(words) in (3, 5), "a column and one or two of column and number")
+        _expect(
+            len(words) in (3, 5), "a column and one or two pairs of column and number"
+        )
         values: dict[tuple[str, str], float] = getattr(model, target)
         i = words[0]
         for j, number in zip(words[1::2], words[2::2], strict=True):

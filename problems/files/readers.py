@@ -26,7 +26,8 @@ from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 #: constant
 Loaded = tuple[QP, float, float]
 
-_COPIES = 16  #: memory of the Python objects of a QPS text, relative to the file size
+#: bound on the memory of the Python objects of a QPS text, relative to the file size
+_COPIES = 16
 
 
 def read(path: Path) -> Loaded:
@@ -53,7 +54,7 @@ def _npz(path: Path) -> Loaded:
 
 
 def _mat(path: Path) -> Loaded:
-    """Read a .mat file: our own, recognised by G or h, or one of Maros-Mészáros."""
+    """Read a .mat file: an export (it contains G or h) or a Maros-Mészáros problem."""
     arrays = read_mat(path)
     with located(str(path)):
         if {"G", "h"} & arrays.keys():
@@ -98,7 +99,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     Raises
     ------
     InputError
-        If a variable is missing or its shape is inconsistent with others.
+        If a variable is missing or its shape is inconsistent with that of another one.
 
     """
     read = partial(_first_named, arrays)
@@ -106,7 +107,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     A, l, u = read(matrix, "A"), read(vector, "l"), read(vector, "u")
     r = float(vector(arrays, "r").sum()) if "r" in arrays else 0.0
     if not all(np.isfinite(values).all() for values in (P.data, A.data, q, r)):
-        raise InputError("P, A, q or r hold inf; expected finite numbers")
+        raise InputError("P, A, q or r contains inf; expected finite numbers")
     n, m = q.size, l.size
     for name, got, right in (
         ("P", P.shape, (n, n)),
@@ -135,7 +136,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
 def _first_named(
     arrays: Mapping[str, Any], read: Callable[..., Any], *names: str
 ) -> Any:
-    """Read a variable by the first of `names` that is present."""
+    """Read the variable with the first of `names` that is present."""
     return read(arrays, next((name for name in names if name in arrays), names[0]))
 
 

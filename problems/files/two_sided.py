@@ -21,8 +21,8 @@ class TwoSidedQP(NamedTuple):
     q: Vector  #: (n,)
     r: float
     A: Any  #: (m, n) sparse
-    l: Vector  #: (m,) values ≤ −1e20 are absent
-    u: Vector  #: (m,) values ≥ 1e20 are absent
+    l: Vector  #: (m,) lower limits; ≤ −1e20: no limit
+    u: Vector  #: (m,) upper limits; ≥ 1e20: no limit
     lb: Vector  #: (n,) like l
     ub: Vector  #: (n,) like u
 
@@ -36,7 +36,7 @@ def one_sided(qp: TwoSidedQP) -> QP:
     Raises
     ------
     InputError
-        If P is not symmetric, or limits cross.
+        If P is not symmetric, or a lower limit exceeds the upper limit.
 
     """
     P, A = csc_array(qp.P, dtype=float), csr_array(qp.A, dtype=float)

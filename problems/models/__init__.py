@@ -1,1 +1,1 @@
-"""Models behind the families: meshes, materials, loads and exact solutions."""
+"""Models of the families: meshes, materials, loads and exact solutions."""

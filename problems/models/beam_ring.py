@@ -2,18 +2,18 @@
 
 A beam of 2 m × 0.25 m (Figure 1 of the paper), with its lower left corner at height
 0.5 m, is clamped on the left and pulled down by F₀ = 10⁸ N/m at its upper right corner.
-It is supported by a half ring with radii 0.3 m and 0.49 m around (1 m, 0), clamped at
+Below the beam is a half ring with radii 0.3 m and 0.49 m around (1 m, 0), clamped at
 both feet. The initial gap is 1 cm.
 
-The paper is not consistent in some details. Its 313 nodes for Nr = 4, Nh = 3 imply a
-ring with Nh radial layers (``radial=3``), whereas its text and Table 1 imply 2·Nh (424
-nodes). m_E is the number of prescribed displacement components,
-2(Nr + 1) + 4(radial + 1), not of prescribed nodes. Plane strain and a force per unit
-thickness are implied, not stated.
+The paper is not consistent in some details. The 313 nodes that it states for Nr = 4,
+Nh = 3 imply a ring with Nh radial layers (``radial=3``), whereas the text and Table 1
+of the paper imply 2·Nh layers (424 nodes). m_E is the number of prescribed displacement
+components, 2(Nr + 1) + 4(radial + 1), not of prescribed nodes. Plane strain and a force
+per unit thickness are implied, not stated.
 
-With depth > 0 the bodies are extruded to layers of hexahedra over a thickness of 1 m.
-Their end faces are free, or in plane strain (u_z = 0). Clamped sides are fixed in all
-directions, and F₀ = 10⁸ N is distributed over the loaded edge.
+With depth > 0 the bodies are extruded to `depth` layers of hexahedra over a thickness
+of 1 m. The end faces are free, or in plane strain (u_z = 0). Clamped sides are fixed in
+all directions, and F₀ = 10⁸ N is distributed over the loaded edge.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ from mortarbench.problems.fem.mesh import (
 )
 
 LENGTH = 2.0  #: l, length of the beam, m
-LOAD = 1e8  #: F₀ = 0.1 GN per m of thickness
+LOAD = 1e8  #: F₀, N per m of thickness
 THICKNESS = 1.0  #: thickness of extruded bodies, m
 NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
@@ -160,12 +160,12 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
 
 
 def _tip(shape: Shape) -> tuple[Nodes, Vector]:
-    """Return the components of the upper right corner of the beam.
+    """Return the loaded components of the upper right corner of the beam.
 
     Returns
     -------
-    components (dim·k,) of the k nodes of the corner (an edge in space), and the share
-    (k,) of the load on each node
+    components (dim·k,) of the k nodes of the corner (an edge in space), and the
+    fraction (k,) of the load that acts on each node
 
     """
     sides = shape.sides

@@ -7,18 +7,19 @@ strain,
 
     EI θ″ = −P cos θ,    EI = E t³ / (12(1 − ν²)),    θ(0) = θ′(L) = 0,
 
-whose solution by elliptic integrals (Bisshopp and Drucker 1945, Quarterly of Applied
-Mathematics 3, 272-275) only depends on PL²/EI, the key `load`. The error of this model
-is of order (t/L)²: under small loads, shear increases the deflection by the fraction
-3/(5(1 − ν)) (t/L)², 0.2 % for L/t = 20 and ν = 0.3.
+where θ is the slope of the beam axis. The solution by elliptic integrals (Bisshopp and
+Drucker 1945, Quarterly of Applied Mathematics 3, 272-275) depends only on PL²/EI, the
+key `load`. The error of this model is of order (t/L)²: under small loads, shear
+increases the deflection by the fraction 3/(5(1 − ν)) (t/L)², 0.2 % for L/t = 20 and
+ν = 0.3.
 
-Bilinear cells h_x × h_y cannot represent bending. In linear elasticity the beam is
-hence too stiff by the fractions
+Bilinear cells h_x × h_y cannot represent bending exactly. In linear elasticity the beam
+is therefore too stiff by the fraction
 
     (1 − ν)/2 (h_x/t)²  (parasitic shear)  +  ν²/(1 − 2ν) (h_y/t)²  (constant ε_y)
 
-which is 0.55 % and 0.35 % for square cells, ν = 0.3 and t = 8h. The default `nx`
-therefore results in cells with h_x = h_y/2. With mean dilatation
+whose terms are 0.55 % and 0.35 % for square cells, ν = 0.3 and t = 8h. With the default
+`nx`, cells have h_x = h_y/2 to reduce the first term. With mean dilatation
 (`problems.fem.finite_strain`) the second term is −ν(h_y/t)².
 """
 
@@ -57,9 +58,10 @@ class Elastica(NamedTuple):
 
 
 def elastica(load: float) -> Elastica:
-    """Return the elastica of a cantilever under the end load PL²/EI.
+    """Return the end displacement of a cantilever under the end load PL²/EI = `load`.
 
-    With the slope θ₀ of the end, k² = ½(1 + sin θ₀) and sin φ = 1/(k√2):
+    With the slope θ₀ of the end, k² = ½(1 + sin θ₀), sin φ = 1/(k√2), and the elliptic
+    integrals K, F (first kind) and E (second kind):
 
         √load = K(k) − F(φ, k),    w/L = 1 − 2(E(k) − E(φ, k))/√load,
         1 − u/L = √(2 sin θ₀/load).
@@ -99,7 +101,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     def results(at: Iteration, s: Solution) -> dict[str, Any]:
         """Compare the mean displacement of the end face, m, with the elastica."""
         end = at.tangent.mesh.boundaries["right"]
-        # mean over the face by ∫N_j
+        # mean over the face, with the weights ∫N_j of the nodes
         share = nodal_lengths(at.tangent.mesh.points[end])
         u = share @ as_vectors(s.x, 2)[end] / share.sum() * LENGTH
         return {

@@ -48,22 +48,23 @@ axes may have any length. The centre of a cylinder is any point on its axis. Nod
 all components fixed have no contact row. Contact with a rigid body has nodal rows even
 if ``contact = "mortar"``.
 
-In .inp and .med files, bodies are sets of elements or groups of cells, boundaries are
-surfaces, or sets or groups of facets or nodes, and points are sets of nodes.
+In .inp files, bodies are element sets, boundaries are surfaces, element sets of facets
+or node sets, and points are node sets. In .med files, these are groups of cells, groups
+of facets or nodes, and groups of nodes.
 
 If the mesh has physical volumes, these are the bodies, and boundaries are physical
 surfaces. Vectors then have three components, forces are in N, and a force on a boundary
 is distributed uniformly over its area; `point` is a physical point or curve, whose
-nodes share a force equally. Friction, finite strain and ``plane = "stress"`` are
-refused for volumes.
+nodes share a force equally. Finite strain and ``plane = "stress"`` are not available
+for volumes.
 
-The keys between mesh and units are optional; the values above are their defaults.
-Bodies supported by contact alone have no form dual-bounds and, for linear kinematics,
-require ``steps = 1``. The default of units.length is the longer side of the bounding
-box of the mesh, and that of units.force is the sum of |load| over the nodes. A pair
-without a law of its own has the law of the top-level keys friction, bound and mu, whose
-default is no friction. The top-level key ``loading = "static"`` measures slip from the
-undeformed state.
+The keys from length_unit to units are optional. The values above are their defaults,
+except for units: the default of units.length is the longest side of the bounding box of
+the mesh, and that of units.force is the sum of |load| over the nodes. Bodies supported
+by contact alone have no form dual-bounds and, for linear kinematics, require
+``steps = 1``. A pair that sets no friction law has the law of the top-level keys
+friction, bound and mu, whose default is no friction. With the top-level key
+``loading = "static"``, slip is measured from the undeformed state.
 """
 
 from __future__ import annotations
@@ -137,7 +138,8 @@ LENGTH_UNITS = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-#: smaller moduli, in Pa, are softer than rubber; a remark asks whether MPa was meant
+#: smallest modulus without a remark, Pa. A smaller modulus is that of a material softer
+#: than rubber, or was meant to be in MPa
 MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
     "mesh",
@@ -243,8 +245,8 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
 def remarks(path: Path) -> tuple[str, ...]:
     """Return remarks on valid entries that may be mistakes.
 
-    They concern moduli that may be in another unit, and two-pass contact, in which each
-    of two sides is the slave of the other, so that two sets of rows share the force.
+    Remarks concern moduli that may not be in Pa, and two-pass contact: if each of two
+    sides is the slave of the other, two sets of rows share the contact force.
     """
     table = read_description(path)
     soft = (
@@ -257,7 +259,7 @@ def remarks(path: Path) -> tuple[str, ...]:
     two_passes = (
         f"{path}: contacts[{i}] is contacts[{sides.index((master, slave))}] "
         "with slave and master exchanged: the force is shared among the two, "
-        "so that neither pressure is that between the bodies; leave one out to see it"
+        "so that neither pressure is that between the bodies; leave one of them out"
         for i, (slave, master) in enumerate(sides)
         if (master, slave) in sides[:i]
     )
@@ -342,7 +344,7 @@ def _check_loads_act(
     loads: Sequence[NDArray[np.float64]],
     fixed: Nodes,
 ) -> None:
-    """Raise InputError for load components that only act on fixed components."""
+    """Raise InputError if a component of a load acts on fixed components only."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
         without_effect, dim = [], load.shape[1]
         for axis, name in enumerate(_AXES[:dim]):
@@ -359,7 +361,7 @@ def _check_loads_act(
 
 
 def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Raise InputError for values that the key of the same name in a case forbids."""
+    """Raise InputError if a value is not allowed for the case key of the same name."""
     for key in keys:
         allowed = SETTINGS[key].values
         if key in entry and checked.text(key, entry[key]) not in allowed:
@@ -367,7 +369,7 @@ def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
 
 
 def _check_friction_values(entry: Mapping[str, Any]) -> None:
-    """Raise InputError for invalid values of the friction keys of an entry."""
+    """Raise InputError if a friction key of an entry has an invalid value."""
     _check_choices(entry, ("friction", "loading"))
     for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
@@ -377,7 +379,7 @@ def _check_friction_values(entry: Mapping[str, Any]) -> None:
 def pair_laws(
     contacts: Sequence[Mapping[str, Any]], params: Mapping[str, Any]
 ) -> tuple[FrictionLaw, ...]:
-    """Return the friction law of each pair, from its entry or the keys of the case.
+    """Return the friction law of each pair, from its entry or from the case keys.
 
     Raises
     ------
@@ -409,9 +411,10 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
-    """Return the pair of an entry.
+    """Return the contact pair that an entry describes.
 
-    held : prescribed components; nodes with all components prescribed are `clamped`
+    held : prescribed components; slave nodes at which all components are prescribed are
+        marked as clamped if the master is a rigid body
     """
     checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
     if ("master" in entry) == ("rigid" in entry):
@@ -432,7 +435,9 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
         clamped = np.unique(slave)[np.isin(components, held).all(axis=1)]
         return ContactPair(slave, slave[:0], rigid, clamped)
     if np.intersect1d(slave, sides["master"]).size:
-        raise InputError("slave and master share nodes; expected sides that are apart")
+        raise InputError(
+            "slave and master share nodes; expected sides without common nodes"
+        )
     return ContactPair(slave, sides["master"])
 
 
@@ -467,7 +472,7 @@ def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
 def _check_faces(
     points: NDArray[np.float64], slave: Nodes, name: str, rigid: RigidBody
 ) -> None:
-    """Raise InputError if a slave does not face a rigid body or is far from it."""
+    """Raise InputError if a slave side does not face a rigid body or is far from it."""
     side = current_surface(points, np.zeros(points.size), slave, "slave")
     gap, normal = rigid.gap(side.x[side.facets].mean(axis=1))
     if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
@@ -493,7 +498,7 @@ def _sides(entries: list[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _check_unique(entries: list[dict[str, str]]) -> None:
-    """Raise InputError for a pair of sides that is listed twice."""
+    """Raise InputError if a pair of sides is listed twice."""
     sides = _sides(entries)
     for i, (slave, master) in enumerate(sides):
         if (first := sides.index((slave, master))) < i:
@@ -535,9 +540,9 @@ def _units(
 def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
-    """Return the nodes of the boundary or point of an entry, and its facets.
+    """Return the nodes of an entry's boundary or point, and the boundary's facets.
 
-    A point has no facets.
+    For a point, the array of facets is empty.
     """
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:

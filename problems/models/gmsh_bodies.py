@@ -1,6 +1,6 @@
-"""Bodies described by the user, ``bodies:PATH.toml/key=value/…/FORM``.
+"""User-defined bodies, ``bodies:PATH.toml/key=value/…/FORM``.
 
-`problems.models.description` documents the TOML file.
+For the TOML file, see `problems.models.description`.
 """
 
 from __future__ import annotations
@@ -36,14 +36,15 @@ from mortarbench.problems.models.description import (
 )
 from mortarbench.problems.ranges import check_plane_only
 
-#: largest angle between edges of a straight side; allows for rounded coordinates
+#: largest angle in rad between edges of a straight side, to allow for rounded
+#: coordinates
 MAX_STRAIGHT_ANGLE = 1e-6
-#: largest angle between the chords of an arc; larger angles are corners of the geometry
+#: largest angle in rad between the chords of an arc; larger angles are corners
 MAX_ARC_ANGLE = np.pi / 4
 
-#: smallest overlap of contact sides that a remark reports, relative to the smallest
-#: body. The chords of touching arcs overlap by up to 5R/n² with n edges per circle,
-#: 0.4 % of R for n = 36
+#: largest overlap of contact sides without a remark, relative to the extent of the
+#: smallest body. The chords of touching arcs overlap by up to 5R/n² with n edges per
+#: circle, which is 0.4 % of R for n = 36
 MAX_OVERLAP = 0.01
 
 
@@ -53,8 +54,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     Raises
     ------
     InputError
-        If the load of a body cannot be balanced, or if bodies with a rigid motion that
-        neither supports nor friction prevent have several load steps or linearisations.
+        If the load of a body cannot be balanced, or if there are several load steps or
+        linearisations although neither supports nor friction prevent a rigid motion.
 
     """
     p: Any = params
@@ -64,13 +65,13 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return contact_problem
     whole = elastic.whole
     rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(whole.mesh.dofs))
-    # displacements along frictionless contact are not unique, and hence neither is the
-    # next linearisation
+    # if a rigid motion along frictionless contact is possible, displacements are not
+    # unique, and hence neither is the next linearisation
     if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
             f"{p['path']}: supports and friction allow a rigid motion of some body, "
-            "which load steps and re-linearisations do not allow; expected steps=1 "
-            "and relin=1"
+            "which is not built for several load steps or re-linearisations; expected "
+            "steps=1 and relin=1"
         )
     return contact_problem
 
@@ -103,7 +104,8 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
         bodies=elastic,
         linearise=keyed_linearisation(p),
         stages=stages,
-        # the first bound of Coulomb's law must suffice to support bodies by friction
+        # the first slip bound of Coulomb's law must be large enough for friction to
+        # support bodies that nothing else supports
         initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )
 
@@ -136,13 +138,16 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
-    """Raise InputError for bodies in space with keys limited to plane bodies."""
+    """Raise InputError if bodies in space are combined with keys of plane bodies."""
     if elastic.shape.dim > 2:
         check_plane_only("bodies", params, "volumes")
 
 
 def overlap_remark(params: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return a remark if a slave node lies inside its master before any load acts."""
+    """Return a remark if a slave node is inside its master before any load acts.
+
+    Overlaps of up to `MAX_OVERLAP` times the extent of the smallest body cause none.
+    """
     p: Any = params
     whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole
     mesh = whole.mesh
@@ -168,7 +173,7 @@ def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
 
 @lru_cache(maxsize=4)
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
-    """Return the bodies of a description; `sha256` is part of the cache key."""
+    """Return the bodies of a TOML file; `sha256` only distinguishes cached results."""
     del sha256
     return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
 

@@ -1,18 +1,18 @@
 """GRECO's plate with Coulomb friction on a rigid plane (Code_Aster's SSNV128).
 
-A square of 40 mm in plane strain lies on y = 0 with μ = 1. Pressures act on its top and
-left sides, and its right side is supported in x:
+A square with sides of 40 mm in plane strain lies on the rigid plane y = 0 with friction
+(μ = 1). Pressures act on the top and left sides, and the right side is supported in x:
 
     σ_y = −5e7 Pa at y = 40 mm,  σ_x = −15e7 Pa at x = 0,  u_x = 0 at x = 40 mm
 
-with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end lifts off,
-the middle slips and the right end sticks. The published results are the tangential
-displacements of five points of the contact side, ±5 %, and the normal force at 38.75 mm
-for 32 cells per side (GRECO working group on friction; see document V6.04.128 of
-Code_Aster).
+with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end of the
+contact side lifts off, the middle slips and the right end sticks. The published results
+are the tangential displacements of five points of the contact side, ±5 %, and the
+normal force at x = 38.75 mm for 32 cells per side (GRECO working group on friction; see
+document V6.04.128 of Code_Aster).
 
-In space (dim=3) the square is extruded along z in cubes. Its end faces have u_z = 0, so
-that the solution is that of plane strain in every layer of nodes.
+In space (dim=3) the square is extruded along z into layers of cubes. The end faces have
+u_z = 0, so that the solution is that of plane strain in every layer of nodes.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ FORCE_AT = 38.75e-3  #: x of the published normal force, m
 
 
 class Plate(NamedTuple):
-    """Plate with the nodes of its sides, and nodal areas of the loaded sides."""
+    """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
 
     shape: StructuredGrids | StructuredSolids
     ground: Nodes  #: side y = 0, without its nodes on x = 40 mm
@@ -68,7 +68,7 @@ class Plate(NamedTuple):
     right: Nodes  #: nodes of x = 40 mm
     corner: Nodes  #: nodes of x = 40 mm, y = 0
     ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in the plane
-    thickness: float  #: 1 in the plane
+    thickness: float  #: thickness, m; 1 in the plane
 
 
 def plate(n: int) -> Plate:
@@ -169,7 +169,7 @@ def published_quantities(
     force in N/m.
     """
     dim, (pair,) = bodies.mesh.dim, bodies.pairs
-    nodes = np.setdiff1d(pair.slave_nodes, pair.clamped)  # those with rows
+    nodes = np.setdiff1d(pair.slave_nodes, pair.clamped)  # nodes with contact rows
     x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
     u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
     normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness

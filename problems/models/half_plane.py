@@ -1,16 +1,18 @@
 """Contact of two half planes with the logarithmic kernel: a dense F without a mesh.
 
 Tractions p on the surfaces of two half planes cause the relative displacement (Johnson
-1985, "Contact mechanics", Sections 2.2 and 2.3, with 2/(πE*) for both surfaces)
+1985, "Contact mechanics", Sections 2.2 and 2.3; the factor 2/(πE*) includes both
+surfaces)
 
     u(x) = −2/(πE*) ∫ ln(|x − s|/a) p(s) ds + a constant
 
-along the normal for pressures, and along the tangent for shear tractions. Normal and
-tangential displacements are decoupled because both bodies are of the same material.
-With a traction λ_j/h on each of n equal elements and u at their midpoints, u = Fλ,
-where F_ij only depends on |i − j|. F is positive definite on intervals shorter than 4a.
-Since the total force is prescribed, the constant is free: it is the multiplier of the
-single equation Σλ = force. This is the form ``dual`` of bodies with one rigid motion.
+along the normal for pressures, and along the tangent for shear tractions, with the half
+width a of the contact. Normal and tangential displacements are decoupled because both
+bodies are of the same material. With a traction λ_j/h on each of n equal elements of
+length h and with u at their midpoints, u = Fλ, where F_ij depends only on |i − j|. F is
+positive definite on intervals shorter than 4a. Since the total force is prescribed, the
+constant is free: it is the multiplier of the single equation Σλ = force. This is the
+form ``dual`` of bodies with one rigid motion.
 
 * law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R; |x| ≤ 3a/2
 * law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
@@ -52,14 +54,15 @@ from mortarbench.problems.models.line_contact import LineContact, TangentialCont
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: normal force P, N/m
 SIDE = "half plane on half plane"
-MESH_HALF_WIDTH = 1.5  #: half width of the potential contact of law=hertz, in a
+#: half width of the potential contact of law=hertz, in units of a
+MESH_HALF_WIDTH = 1.5
 
 #: exact solution for two cylinders of the radius and material of the Hertz families
 EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
 
 
 def half_plane_case(params: Mapping[str, Value]) -> Case:
-    """Return the case of complete keys, in its only form, dual."""
+    """Return the case, in form dual, for `params`, which must contain all keys."""
     p: Any = params
     if p["law"] == "hertz":
         return _hertz_case(p["n"])
@@ -107,10 +110,11 @@ def _hertz_case(n: int) -> Case:
     exact_energy = self_energy(((1.0, 1.0),)) - approach
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Hertz; errors are relative, and the error of p is in l².
+        """Compare with Hertz's solution.
 
-        `energy` is the elastic energy minus P·approach; the approach is zero where
-        u = 0.
+        Errors are relative; that of p is in the l² norm.
+        `energy` is the elastic energy minus P·approach in J/m; the approach is measured
+        from the level u = 0.
         """
         force = s.x * EXACT.P
         p, hertz = force / width, EXACT.pressure(x)
@@ -169,12 +173,13 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     exact_energy = self_energy(exact.semicircles) - exact.Q * exact_displacement
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Cattaneo and Mindlin; errors are relative, that of q in l².
+        """Compare with Cattaneo and Mindlin's solution.
 
+        Errors are relative; that of q is in the l² norm.
         `energy` is the elastic energy minus Q·displacement in J/m; `dissipation` is
-        Σg|slip| of this loading or unloading in J/m; `stick_half_width` is that of the
-        exact traction with the same ∫x²q; `shear_centre` is the mean of q over the
-        elements next to x = 0.
+        Σg|slip| of this loading or unloading in J/m, with the slip bounds g;
+        `stick_half_width` is that of the exact traction with the same ∫x²q;
+        `shear_centre` is the mean of q over the one or two elements next to x = 0.
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)
@@ -306,5 +311,5 @@ def _energy_unit(force: float) -> float:
 
 
 def _distance(got: Vector, exact: Vector) -> float:
-    """Return the relative l² distance."""
+    """Return the l² distance of `got` from `exact`, relative to the norm of `exact`."""
     return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

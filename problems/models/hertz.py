@@ -1,7 +1,8 @@
 """Line contact of cylinders, with Hertz's exact solution (Johnson 1985, Section 4.2).
 
 With 1/R = 1/R₁ + 1/R₂, 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ) and the force P per
-thickness, two elastic half spaces of these curvatures touch over |x| ≤ a under
+thickness, two elastic half spaces with radii of curvature R₁ and R₂ touch over |x| ≤ a
+with the pressure
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
@@ -9,25 +10,25 @@ Bodies are half discs under a uniform pressure on the flat side. The force is
 prescribed, since the theory does not determine the approach. Contact alone supports the
 upper body vertically, so that the form ``dual-bounds`` does not exist.
 
-More cells per a (`n`, `m`) only refine the contact zone. Outside this zone, cells grow
-by the factor GROWTH, irrespective of their number. Each of the `halvings` halves all
-cells.
+The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
+Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. Each of the
+`halvings` bisects all cells along both directions.
 
-R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark of the literature, where no units are
-stated. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.
+R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark in the literature, which states no
+units. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.
 
-A tangential force Q on two cylinders of the same material acts on the flat sides. It
-consists of shear tractions with resultants ±Q, and of normal tractions, linear along
-the side, that balance the moment without supports. Loads and deformations of both
-bodies are symmetric: contact and friction alone support the upper body, and the
-supports of the lower body have no reactions. Exact tractions are those of
+A tangential force Q on two cylinders of the same material acts on the flat sides. The
+loads are shear tractions with resultants ±Q, and normal tractions, linear along each
+side, that balance the moment without supports. Loads and deformations of the two bodies
+are symmetric: contact and friction alone support the upper body, and the supports of
+the lower body have no reactions. Exact tractions are those of
 `problems.models.line_contact`. The key `programme` is
 
 * normal-first: P without friction, then Q, then Q reduced from its peak, one step each;
-* proportional: P and Q grow together in steps with friction, with P ∝ k² so that a
-  grows by equal increments. If slip is measured in each step (quasi-static), the
-  traction is (Q/P)p and nothing slips. For a single static load, the tractions are as
-  if Q had been applied last.
+* proportional: P and Q grow together in steps k = 1, 2, … with friction, with P ∝ k² so
+  that a grows by equal increments. If slip is measured in each step (quasi-static), the
+  shear traction is (Q/P)p and nothing slips. For a single static load, the tractions
+  are as if Q had been applied last.
 
 Two errors do not vanish with the mesh size: the bodies are finite (0.1 %), and a/R is
 not zero. Contact of two cylinders is linearised at the undeformed state, along normals
@@ -86,8 +87,9 @@ UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
 GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
 
 GROWTH = 1.15  #: ratio of the sizes of neighbouring cells away from the contact
-UNIFORM_HALF_WIDTH = 1.5  #: half width of the uniformly meshed part of the arc, in a
-CURVE_POINTS = 601  #: number of points of plotted exact tractions, on the uniform part
+#: half width of the uniformly meshed part of the arc, in units of a
+UNIFORM_HALF_WIDTH = 1.5
+CURVE_POINTS = 601  #: number of points on the uniform part for plots of exact tractions
 
 
 @cached_problem
@@ -137,7 +139,7 @@ def _newton_path(
 def _cylinder_on_plane(
     params: Mapping[str, Value],
 ) -> tuple[ElasticBodies, LineContact]:
-    """Return the cylinder on a rigid plane, n cells per a, and Hertz's solution."""
+    """Return the cylinder on a rigid plane with n cells per a, and Hertz's solution."""
     p: Any = params
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
@@ -204,11 +206,11 @@ def _programme(
 ) -> tuple[Stage, ...]:
     """Return the stages of a tangential load: P without friction, then P and Q.
 
-    In the first stage, supports on the axis fix the upper cylinder; under P they have
-    no reactions. Without these supports and without friction, the cylinders could roll
-    on each other almost freely, because only the polygonal shape of their arcs resists.
-    Slip in the next stage would then be measured from an arbitrary state, and Q would
-    do work on the rolling.
+    In the first stage, supports on the axis fix the upper cylinder horizontally; under
+    P they have no reactions. Without these supports and without friction, the cylinders
+    could roll on each other almost freely, because only the polygonal shape of the arcs
+    would resist. Slip in the next stage would then be measured from an arbitrary state,
+    and the rolling would contribute to the work of Q.
     """
     p: Any = params
     discs, sides = half_cylinders(p).discs, elastic.shape.sides
@@ -224,7 +226,11 @@ def _programme(
         return _summed(forces + (_shearing(discs, Q * p["mu"]) if Q else []))
 
     def begin(k: int, end: State) -> State:
-        """Return the end of the preceding stage, with normal forces scaled by P."""
+        """Return the initial state of a stage, with normal forces in proportion to P.
+
+        k : number of the stage with friction, from 0
+        end : state at the end of the preceding stage
+        """
         previous = loads[max(k - 1, 0)][0]
         at_rest = not k and _slip_starts_at_rest(p)
         u = np.zeros_like(end.u) if at_rest else end.u
@@ -249,10 +255,10 @@ def _programme(
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
     """Return the cylinders, with n cells per a on the upper one and m on the lower one.
 
-    The upper cylinder has R = 8 mm and E = 200 GPa, the lower one R multiplied by
-    `radius` and E by `ratio`. If Hertz's a exceeds a radius, because the bodies are too
-    soft for the theory, the mesh is that for a = radius, so that the uniform part of
-    the arc does not exceed the half disc.
+    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower one is
+    multiplied by `radius`, and its modulus by `ratio`. If Hertz's a exceeds a radius,
+    because the bodies are too soft for the theory, the mesh is that for a = radius, so
+    that the uniform part of the arc does not exceed the half disc.
     """
     p: Any = params
     lower_material = Material(p["ratio"] * MATERIAL.E, MATERIAL.nu)
@@ -272,7 +278,8 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineConta
     """Return the cylinders in contact under P alone, and Hertz's solution.
 
     With a tangential force, the supports only exclude rigid motions and have no
-    reactions. Without it, they also enforce the symmetry about the axis.
+    reactions. Without a tangential force, the supports also enforce the symmetry about
+    the axis.
     """
     p: Any = params
     halves = half_cylinders(params)
@@ -307,7 +314,10 @@ def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPai
 
 
 def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
-    """Return the forces (2k,) of Q at the nodes of a flat side, (x, y) node by node."""
+    """Return nodal forces (2k,) of a tangential force Q on a flat side: x, y per node.
+
+    points : (k, 2) nodes of the side
+    """
     share, (x, y) = nodal_lengths(points), points.T
     # vertical forces ∝ x balance the moment of Q about the origin
     forces = Q * share / share.sum(), Q * y[0] * share * x / (share @ x**2)
@@ -315,7 +325,7 @@ def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
 
 
 def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
-    """Return the forces of Q at both flat sides."""
+    """Return the nodal forces of Q on the upper flat side, and of −Q on the lower."""
     sides = joined_sides(discs)
     loads = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
     return [
@@ -328,7 +338,7 @@ def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
 
 
 def _summed(forces: Sequence[Forces]) -> Forces:
-    """Return the sum of forces, without repeated components."""
+    """Return the sum of forces, with each component listed once."""
     component, value = (np.concatenate(part) for part in zip(*forces, strict=True))
     distinct, place = np.unique(component, return_inverse=True)
     total = np.zeros(distinct.size)
@@ -337,7 +347,7 @@ def _summed(forces: Sequence[Forces]) -> Forces:
 
 
 def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
-    """Return the shares of P and of μP applied in each step with friction."""
+    """Return the forces of each step with friction, as fractions of P and of μP."""
     p: Any = params
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
@@ -356,7 +366,7 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
     """Return the half disc around (0, 0) of a cylinder with centre (0, `centre`).
 
     Cells have size h at (0, 0) and grow along the arc and inwards. All cells are then
-    halved `halvings` times.
+    bisected in both directions `halvings` times.
     """
     radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
     arc = (
@@ -386,13 +396,16 @@ def graded_points(h: float, uniform: float, total: float) -> Vector:
 
 
 def insert_midpoints(x: Vector, times: int) -> Vector:
-    """Insert the midpoints of an increasing sequence, `times` times."""
+    """Insert midpoints between the numbers of an increasing sequence, repeatedly.
+
+    times : number of repetitions
+    """
     places = np.arange(x.size)
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
 def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
-    """Return nodal forces of a load P in −y, distributed uniformly over a flat side."""
+    """Return the nodal forces of a load P along −y, uniform over the side `flat`."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
     return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())
@@ -401,7 +414,7 @@ def _pressing(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
 def pressure_quantities(
     bodies: Bodies | ContactSides, primal: QP, exact: LineContact, s: Solution
 ) -> dict[str, Any]:
-    """Compare the pressure on the slave side with Hertz's.
+    """Compare the pressure on the slave side with Hertz's pressure.
 
     The nodal pressure is the vertical contact force divided by ∫N_j dx. Errors are
     relative. The half width is √(4∫px² dx/P), which is exact for Hertz's pressure,
@@ -438,10 +451,11 @@ def shear_quantities(
     """Compare the shear traction on the slave side with the exact one.
 
     The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
-    relative; the error of the force is relative to its peak. `shear_centre` is the
-    traction at x = 0. `stick_half_width` is that of the exact traction with the same
-    ratio of ∫x²q to ∫x²p, in which effects of the finite bodies on both cancel. It is
-    absent for proportional steps, where nothing slips.
+    relative; the error of the force is relative to the peak of the force.
+    `shear_centre` is the traction at x = 0. `stick_half_width` is that of the exact
+    traction with the same ratio of ∫x²q to ∫x²p; in this ratio, the effects of the
+    finite bodies on the two moments cancel. This half width is absent for proportional
+    quasi-static steps, where nothing slips.
     """
     p: Any = params
     slave, upper = bodies.pairs[0].slave, p["slave"] == "upper"
@@ -506,7 +520,7 @@ def _curve(
 
 
 def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
-    """Return the components u_x of the middle of arc and flat side, 0 by symmetry."""
+    """Return the components u_x at the middle of arc and flat side; 0 by symmetry."""
     chains = [sides[prefix + name] for name in ("arc", "flat")]
     return dofs_of(np.array([chain[chain.size // 2] for chain in chains]), 2, 0)
 

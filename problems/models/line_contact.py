@@ -1,22 +1,23 @@
 """Exact line contact: Hertz's pressure, and Cattaneo and Mindlin's shear traction.
 
-Two elastic bodies with parabolic profiles of relative curvature 1/R = 1/R₁ + 1/R₂, and
-1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ), are in contact over |x| ≤ a under the force
-P per thickness, with (Johnson 1985, "Contact mechanics", Section 4.2)
+Two elastic bodies with parabolic profiles of relative curvature 1/R = 1/R₁ + 1/R₂ and
+with 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ) are in contact over |x| ≤ a under the
+force P per thickness, with the pressure (Johnson 1985, "Contact mechanics", Section
+4.2)
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
 If both bodies are of the same material, p causes no relative tangential displacement,
 and a shear traction causes no relative normal displacement. Under a tangential force
 Q < μP applied after P, the zone c ≤ |x| ≤ a slips and the zone |x| < c sticks (Cattaneo
-1938; Mindlin 1949; Johnson, Section 7.2), with
+1938; Mindlin 1949; Johnson, Section 7.2), with the shear traction
 
     q(x) = μp₀√(1 − x²/a²) − μp₀(c/a)√(1 − x²/c²),    c/a = √(1 − Q/μP)
 
-where square roots of negative numbers count as zero. When Q decreases from Q* to Q,
-|Q| ≤ Q*, reverse slip spreads from the edge. The traction is then q = q* − 2q′, where
-q′ is the traction under the force (Q* − Q)/2, with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin
-and Deresiewicz 1953).
+where square roots of negative numbers count as zero. If the force decreases from Q* to
+Q, |Q| ≤ Q*, reverse slip spreads from the edge of the contact. The traction is then
+q = q* − 2q′, where q* is the traction under Q* and q′ that under the force (Q* − Q)/2,
+with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from mortarbench.harness import Vector
 class LineContact:
     """Hertz's solution for a force per thickness."""
 
-    P: float  #: N/m
+    P: float  #: force per thickness, N/m
     R: float  #: relative radius, m
     E_star: float  #: contact modulus, Pa
 
@@ -61,8 +62,8 @@ class TangentialContact:
 
     normal: LineContact
     mu: float
-    Q: float  #: tangential force over μP, −peak … peak
-    peak: float  #: largest tangential force so far over μP; Q if never unloaded
+    Q: float  #: tangential force over μP, between −peak and peak
+    peak: float  #: largest tangential force so far over μP; Q without unloading
 
     @property
     def before(self) -> TangentialContact:
@@ -98,10 +99,12 @@ class TangentialContact:
         return np.asarray(P * sum(w * _share(s / c) for w, c in self.semicircles))
 
     def stick_half_width(self, shear: float, pressure: float) -> float:
-        """Return c, m, of a traction with the moments ∫x²q dx and ∫x²p dx, N·m.
+        """Return the half width c of the stick zone from moments of the tractions, m.
 
         In loading,  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  In unloading, the
         traction at the peak is assumed to be exact. The result is clipped to [0, a].
+
+        shear, pressure : moments ∫x²q dx and ∫x²p dx, N·m
         """
         # a semicircle of force w and half width c has the moment ∫x² = wc²/4
         *others, (w, c) = self.semicircles

@@ -56,11 +56,12 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
-LOADS = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and its interval of y
+#: load f of each membrane, and the interval of y on which it acts
+LOADS = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))
 
 
 def membranes(form: str, params: Mapping[str, Value]) -> Case:
-    """Return the case in one of the forms."""
+    """Return the case in the form `form`."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
@@ -116,7 +117,7 @@ class Membranes:
 
     @property
     def grids(self) -> tuple[StructuredGrid, ...]:
-        """Grids of both squares, side by side."""
+        """Grids of the two adjacent squares, the left one first."""
         return tuple(
             rectangle_grid((x, 0.0), (1.0, 1.0), (self.side,) * 2).prefixed(f"{name} ")
             for x, name in zip((0.0, 1.0), NAMES, strict=True)
@@ -151,7 +152,7 @@ class Membranes:
         )
 
     def load(self, node: Nodes) -> Vector:
-        """Return the nodal forces on some nodes (k,)."""
+        """Return the nodal forces (k,) on the nodes `node` (k,)."""
         body, within = np.divmod(node, (self.side + 1) ** 2)
         row, column = np.divmod(within, self.side + 1)
         f = np.array([value for value, _ in LOADS])
@@ -160,7 +161,11 @@ class Membranes:
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
     def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
-        """Return the decomposed problem, with the gluing `rows`, a key of `GLUE`."""
+        """Return the decomposed problem of both membranes.
+
+        rows : kind of the rows that join copies of a node, the key `glue`
+        cluster : number of subdomains per side of a cluster; 0 for no clusters
+        """
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
         G = _contact_rows(sides, layout.nodes)
@@ -185,7 +190,7 @@ class Membranes:
         return np.kron(np.eye(2), np.full((half, 1), half**-0.5))
 
     def factorise(self) -> GeneralisedInverse:
-        """Factorise K without the prescribed components; the right membrane floats."""
+        """Factorise K on the free components; the right membrane may move rigidly."""
         free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
         return supported_inverse(self.qp.P, free, self.rigid)
 
@@ -197,7 +202,7 @@ class Membranes:
         return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
 
     def results(self, answer: LocalSolution) -> dict[str, Any]:
-        """Return the results of `quantities` from all ranks; collective."""
+        """Return the values of `quantities`, reduced over all ranks; collective."""
         lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
         return self._quantities(answer.z, answer.energy, lowest)
 
@@ -217,7 +222,7 @@ class Membranes:
 
 
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
-    """Return the decomposed problem of complete keys."""
+    """Return the decomposed problem for `params`, which must contain all keys."""
     p: Any = params
     return Membranes(p["S"], p["n"]).in_subdomains(p["glue"], p["cluster"])
 
@@ -236,7 +241,7 @@ def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
 
     h : length of a cell
     """
-    # rounded: coordinates of one grid line differ in their last digits
+    # round, because coordinates of nodes on one grid line differ in their last digits
     lines = [np.unique(x.round(9)) for x in (part.points / h).T]
     cells = tuple(x.size - 1 for x in lines)
     nodes = len(part.points)
@@ -253,7 +258,7 @@ def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
 
 def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
     """Return the rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
-    # nodes ascend with y on both sides, and the grids match
+    # sorted node numbers ascend with y on both sides, and the grids match
     pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
     ends = 2 * np.arange(len(pairs) + 1)
     data = np.tile([1.0, -1.0], len(pairs))

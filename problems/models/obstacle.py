@@ -78,7 +78,7 @@ SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
 
 
 def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
-    """Return the QP in one form."""
+    """Return the case in the form `form`."""
     p: Any = params
     if p["feti"] and form != "dual":
         raise InputError(
@@ -210,7 +210,7 @@ def _rank_quantities(
 
 
 def _grid(n: int, shape: str) -> StructuredGrid:
-    """Return the grid of Ω ⊂ ℝ², with nodes numbered as in `nodes`, along y first."""
+    """Return the grid of Ω ⊂ ℝ², numbered as in `nodes`, that is, fastest along y."""
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     return StructuredGrid(
         columns=x,
@@ -221,11 +221,11 @@ def _grid(n: int, shape: str) -> StructuredGrid:
 
 
 def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
-    """Return −q − Kw of `Problem` at some nodes (k,).
+    """Return the nodal forces −q − Kw of `Problem` at the nodes `node` (k,).
 
     On a square, K = K₁ ⊗ M₁ + M₁ ⊗ K₁, with the stiffness K₁ and mass matrix M₁ of
-    linear elements on a line. Kw is zero except at nodes on the boundary and adjacent
-    to it.
+    linear elements on a line. Kw is zero except at nodes on the boundary and at their
+    neighbours.
     """
     n = grid.divisions[0]
     h, (i, j) = 2 * HALF[shape] / n, np.divmod(node, n + 1)
@@ -247,12 +247,12 @@ def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
 
 
 def _cells_at(line: Nodes, n: int) -> Vector:
-    """Return the number of cells (k,) adjacent to points (k,) of a line of n cells."""
+    """Return the number of cells adjacent to each point (k,) of a line of n cells."""
     return np.where((line == 0) | (line == n), 1.0, 2.0)
 
 
 def _hat_integrals(n: int, h: float, node: Nodes) -> Vector:
-    """Return ∫N_j of some nodes (k,) of a grid of n × n cells of side h."""
+    """Return ∫N_j of the nodes `node` (k,) of a grid of n × n cells with side h."""
     i, j = np.divmod(node, n + 1)
     return np.asarray((h / 2) ** 2 * _cells_at(i, n) * _cells_at(j, n))
 
@@ -277,7 +277,7 @@ class Problem:
         return regular_inverse(self.qp.P, self.qp.G.indices)
 
     def floating(self) -> GeneralisedInverse:
-        """Factorise K with the constants as kernel, for duals with Dirichlet rows."""
+        """Factorise the whole K, with constants as kernel, for the form dual."""
         N = self.qp.q.size
         return supported_inverse(self.qp.P, np.arange(N), np.full((N, 1), N**-0.5))
 
@@ -297,7 +297,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     if dim == 2:
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
-    # the tolerance of half a cell allows for rounding of the coordinates
+    # half a cell is subtracted because coordinates are rounded
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
@@ -380,8 +380,9 @@ def exact_height(x: Vector, shape: str = "flat") -> Vector:
 def exact_energy(dim: int, shape: str = "flat") -> float:
     """Return ∫ ½|∇u|² + q u of the exact solution, which is ⅓ for the string.
 
-    For the membrane, the integral over r is in closed form, and that over φ numerical.
-    With the distance ρ of the boundary in the direction φ, the energy is
+    For the membrane, the integral over r is evaluated in closed form, and that over the
+    angle φ numerically. With the distance ρ of the boundary in the direction φ, the
+    energy is
 
         8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
 
@@ -389,7 +390,7 @@ def exact_energy(dim: int, shape: str = "flat") -> float:
     """
     if dim == 1:
         return 1 / 3
-    at, weights = leggauss(20)  # exact to rounding for these smooth integrands
+    at, weights = leggauss(20)  # exact up to rounding for these smooth integrands
     rho = HALF[shape] / np.cos(np.pi / 8 * (1 + at))
     if shape == "hemisphere":
         ball = -np.pi / 2 * (CONTACT_RADIUS**2 + np.log(1 - CONTACT_RADIUS**2))

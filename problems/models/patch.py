@@ -1,9 +1,9 @@
 """Contact patch test: transfer of a uniform pressure across a non-matching interface.
 
 Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both have
-rollers on their left sides, the lower one also on its bottom; the pressure p acts on
-the top. The exact solution is linear in each block, and bilinear elements represent it
-exactly:
+rollers on their left sides, and the lower one also on its bottom; the pressure p acts
+on the top of the upper one. The exact displacement is linear in each block, so that
+bilinear elements represent it exactly:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
@@ -15,7 +15,8 @@ material. The upper block is supported by contact alone, so that the form
 ``dual-bounds`` does not exist.
 
 In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
-−p. Linear fields are exact on distorted hexahedra too (`distort`).
+−p. Hexahedra represent linear displacements exactly even if they are distorted (key
+`distort`).
 
 At finite strain (kinematics=finite) the pressure is a dead load, a nominal stress, and
 the exact solution is homogeneous: with the stretches λ₁ along x and λ₂ along y
@@ -103,7 +104,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         linearise=keyed_linearisation(p),
         results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
-        # the first bound of Coulomb's law must suffice to support blocks by friction
+        # the first slip bound of Coulomb's law must be large enough for friction to
+        # support blocks that nothing else supports
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )
 
@@ -112,7 +114,7 @@ class Homogeneous(NamedTuple):
     """State of a block in uniform compression between frictionless plates."""
 
     lateral: float  #: stretch λ₁ along x
-    stretch: float  #: λ₂ along y
+    stretch: float  #: stretch λ₂ along y
     nominal: float  #: P₂₂, force per reference length and thickness, Pa
     cauchy: float  #: σ_y, Pa
     energy: float  #: W per reference area, Pa
@@ -120,7 +122,7 @@ class Homogeneous(NamedTuple):
 
 
 def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
-    """Return the state with stretch λ₂, by solving P₁₁ = 0 for λ₁."""
+    """Return the state with stretch λ₂ = `stretch`, by solving P₁₁ = 0 for λ₁."""
 
     def F(lateral: float) -> NDArray[np.float64]:
         return np.diag([lateral, stretch])
@@ -242,7 +244,7 @@ def _mean_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
 
 
 def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]:
-    """Return the largest relative error of σ_y in cells, and of positions in m."""
+    """Return the largest relative error of σ_y, and the largest position error, m."""
     bodies = path.bodies
     stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
     u = as_vectors(s.x * bodies.length, 2)
@@ -254,7 +256,7 @@ def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]
 
 
 def bodies(params: Mapping[str, Value]) -> ElasticBodies:
-    """Return the stacked blocks, with `lower` and `upper` cells along x and y."""
+    """Return the stacked blocks, with `lower` and `upper` cells along x (and y)."""
     p: Any = params
     if p["dim"] == 3:
         return _bodies_in_space(params)

@@ -1,17 +1,18 @@
 """An elastic plate in rectangular subdomains: a linear problem for studies of FETI.
 
 A plate of `width` × `height` is clamped at its left edge and pulled down by 1 MN per m
-of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some of
-them, the modulus is multiplied by `jump`: in every other subdomain (``checkerboard``)
-or in the subdomains at the clamped edge (``column``). There is no contact, so that the
-dual has equality constraints only. Its condition numbers measure the scalability of the
-method independently of load, stopping test and units.
+of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some
+subdomains, the modulus is multiplied by `jump`: in every other subdomain
+(``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
+contact, so that the dual has equality constraints only. Condition numbers of the dual
+measure the scalability of the method independently of load, stopping test and units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
-Supports are rows of B as in all families (Total FETI), or ``eliminated``. Subdomains at
-the clamped edge then do not float, as in FETI-1 (Farhat and Roux 1991).
+Supports are rows of B as in all families (Total FETI), or they are ``eliminated``. In
+the latter case, subdomains at the clamped edge do not float, as in FETI-1 (Farhat and
+Roux 1991).
 
 In space (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
 is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or
@@ -87,7 +88,7 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
-LOAD = 1e6  #: F₀, the load, N/m, in space N
+LOAD = 1e6  #: F₀, the load, N/m; in space, N
 STEEL = Material(E=210e9, nu=0.3)
 #: preconditioner and scaling for each spectrum; None means no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
@@ -99,7 +100,7 @@ PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
 
 
 def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
-    """Return the case in one of the forms."""
+    """Return the case in the form `form`."""
     plate = model(tuple(params.items()))
     mesh = plate.mesh
     new = plate.dual if form == "dual" else primal_form(plate.primal)
@@ -145,7 +146,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plate:
-    """Plate for one set of keys; K, f and moduli are in the units l and F₀."""
+    """Plate for one set of keys; K, f and moduli are in units of l and F₀."""
 
     volume: float  #: width × height, m²; volume in space, m³
     mesh: Mesh
@@ -164,7 +165,7 @@ class Plate:
 
     @property
     def torn(self) -> DecomposedBodies:
-        """Assembled subdomains of the plate."""
+        """Assembled subdomains, before they are joined."""
         return self.own.decomposed
 
     @cached_property
@@ -174,7 +175,7 @@ class Plate:
 
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
-        """Spectra of F on the kernel of the equality rows, by preconditioner."""
+        """Spectra of F on the kernel of the equality rows, by preconditioner name."""
         return _spectra(self.moduli, LocalDual(self.own))
 
     @property
@@ -183,9 +184,9 @@ class Plate:
         return _clamped(self.mesh.boundaries, self.mesh.dim)
 
     def von_mises(self, u: Vector) -> Vector:
-        """Recover the stress (N,) at the nodes, Pa; u in m.
+        """Recover the von Mises stress (N,) at the nodes in Pa from u in m.
 
-        Nodes between two materials have one value, although the stress jumps there.
+        A node between two materials has one value, although the stress jumps there.
         """
         D = self.D[self.material] * (LOAD / LENGTH)
         stress = recover(self.mesh, centre_stress(self.mesh, D, u))
@@ -211,7 +212,7 @@ def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
 
 @lru_cache(maxsize=4)
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
-    """Mesh and assemble the plate for complete keys, as one body."""
+    """Mesh and assemble the undivided plate; `params` must contain all keys."""
     p: Any = dict(params)
     parts, shape = in_subdomains(p), _shape(p)
     mesh, subdomain = shape.mesh, parts.layout.label
@@ -244,11 +245,11 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
 
 
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
-    """Return the decomposed problem of complete keys."""
+    """Return the decomposed problem for `params`, which must contain all keys."""
     p: Any = params
     shape, (moduli, D) = _shape(p), _stiffness(p)
     layout = _layout(shape, _side(p))
-    # a contact problem without contact rows
+    # the plate is treated as a contact problem without contact rows
     none = np.zeros(0)
     return DecomposedProblem(
         layout=layout,
@@ -276,7 +277,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
 def _rank_quantities(
     elements: int, moduli: Vector, dual: LocalDual, answer: LocalSolution
 ) -> dict[str, Any]:
-    """Return `quantities` and condition numbers from all ranks; collective."""
+    """Return `quantities` and condition numbers over all ranks; collective."""
     problem = answer.subdomains.problem
     nodes, dim = problem.layout.nodes, problem.components
     values = {
@@ -357,7 +358,7 @@ def _plane(p: Mapping[str, Any]) -> Plane | None:
 
 
 def _clamped(sides: Mapping[str, Nodes], dim: int) -> Nodes:
-    """Return the displacement components at the clamped side."""
+    """Return the displacement components of the nodes on the clamped side."""
     return dofs_of(nodes_of_side(sides["left"]), dim)
 
 
@@ -383,9 +384,10 @@ def _tip(nodes: int, dim: int) -> Nodes:
 
 
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
-    """Return counts, energy, J/m, and the displacement of the upper right corner, m.
+    """Return counts, the energy in J/m, and the tip displacement in m.
 
-    In space, the energy is in J, and the corner is that with the largest x, y and z.
+    The tip is the upper right corner. In space, the energy is in J, and the tip is the
+    corner with the largest x, y and z.
     """
     mesh = plate.mesh
     tip = _tip(len(mesh.points), mesh.dim)
@@ -402,10 +404,11 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
 def dual_quantities(plate: Plate) -> dict[str, Any]:
     """Return the decomposition, ‖PFP‖, and condition numbers with error bounds.
 
-    `norm_PFP` is ‖PFP‖ for E = 1, because all rows are scaled by √E; `kappa` is κ(PFP);
-    `kappa_lumped` and `kappa_dirichlet` are κ with these preconditioners and scaling by
-    multiplicity, `kappa_dirichlet_stiffness` with scaling by stiffness. `…_error` is
-    the error bound of each κ.
+    P is the projector onto the kernel of the equality rows. `norm_PFP` is ‖PFP‖ for
+    E = 1, because all rows are scaled by √E; `kappa` is κ(PFP). `kappa_lumped` and
+    `kappa_dirichlet` are κ with the preconditioner of that name and scaling by
+    multiplicity, `kappa_dirichlet_stiffness` with scaling by stiffness. Keys that end
+    in `_error` contain error bounds.
     """
     return conditions(plate.spectra) | decomposition_quantities(
         plate.torn, plate.dual.qp

@@ -2,10 +2,10 @@
 
 Each problem is min ½vᵀPv + qᵀv, l ≤ v ≤ u with a sparse P; all data are dimensionless.
 
-* string: the first tutorial of PERMON, u″ = 30 on (0, 1) above a sine
+* string: the first tutorial of PERMON, u″ = 30 on (0, 1) above a sine-shaped obstacle
 * journal bearing and torsion: Averick, Carter, Moré and Xue 1992, "The MINPACK-2 test
-  problem collection". The elements are linear, on triangles that halve the cells of a
-  uniform grid; coefficients are averaged over the corners of a triangle
+  problem collection". Elements are linear triangles, two per cell of a uniform grid;
+  coefficients are averaged over the corners of a triangle
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def torsion(n: int, twist: float) -> Case:
     length. The bar is plastic where |v| attains its bound.
     """
     h = 1 / (n + 1)
-    # distance from the ends of an interval; on a square, the smaller of two distances
+    # distance to the nearer end of an interval; on a square, the smaller of two such
+    # distances
     near = h * np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1))
     distance = np.minimum.outer(near, near).ravel()
     T, one = _second_difference(n), eye_array(n)

@@ -70,9 +70,10 @@ def read_msh_sets(path: Path) -> FileMesh:
                     name, [np.zeros(0, dtype=np.int64) for _ in blocks]
                 )
                 rows[k] = np.flatnonzero(tag == number)
-    # gmsh omits entities without a physical group, unless no groups exist
+    # cells with tag 0 beside named groups: the file was saved with Mesh.SaveAll = 1;
+    # otherwise gmsh omits entities without a physical group if any group exists
     is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
-    more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
+    more = f"; or, if they belong to no body, save {_SAVED}" if is_all else ""
     return FileMesh(
         path=path,
         points=np.asarray(mesh.points, dtype=float),
@@ -94,7 +95,7 @@ def _read(path: Path) -> Any:
         )
     with opened(path, "a .msh file") as file:
         size = os.fstat(file.fileno()).st_size
-    check_size(f"{path}: what it says", _PARSER_FACTOR * size)
+    check_size(f"{path}: its content", _PARSER_FACTOR * size)
     with parsing(path, "not a .msh file of format 2.2 or 4.1", _PARSER_FACTOR * size):
         with redirect_stderr(StringIO()):  # meshio warns about sections that it skips
             mesh = _parse(path)
@@ -133,7 +134,8 @@ def _parse(path: Path) -> Any:
     lines = [line.split() for line in entities.split(b"\n") if line.split()]
     points = int(lines[0][0])
     for i, fields in enumerate(lines[1:]):
-        # the number of physical tags follows the tag and the position or box
+        # the number of physical tags follows the tag of the entity and the position of
+        # a point (3 numbers) or the bounding box of other entities (6 numbers)
         at = 4 if i < points else 7
         if fields[at] == b"0":
             fields[at : at + 1] = [b"1", b"0"]
@@ -150,7 +152,8 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
     version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
     if kind != b"0":
         return None
-    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]  # without the count
+    # skip the end of the section's title and the line with the counts
+    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]
     numbers: list[int] = []
     remaining = 0  # cells of the current block, in format 4
     for fields in (list(map(int, line.split())) for line in lines):

@@ -1,10 +1,10 @@
-"""Reader of flat input files of Abaqus and CalculiX (.inp).
+"""Reader of Abaqus and CalculiX input files (.inp) without parts and instances.
 
-The keywords *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE define the mesh. Other keywords
-are skipped, or refused if they would change the mesh. meshio's reader is not used,
-because it drops *SURFACE, all but the last *NODE block and plane strain elements,
-assigns sets of *ELEMENT to the wrong block of cells, and opens any file named by
-*INCLUDE.
+The keywords *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE define the mesh. Any other
+keyword is an error if it would change the mesh, and is skipped otherwise. meshio's
+reader is not used, because it drops *SURFACE, all but the last *NODE block and plane
+strain elements, assigns the sets that *ELEMENT defines to the wrong block of cells, and
+opens any file named by *INCLUDE.
 
 Reference: G. Dhondt, CalculiX CrunchiX USER'S MANUAL, sections on *ELEMENT and *DLOAD
 (numbers of element faces).
@@ -33,7 +33,8 @@ from mortarbench.problems.fem.mesh_files.named import (
     Words,
 )
 
-#: memory of the parser, and total size of all sets, as multiples of the file size
+#: bound on the memory of the parser and on the total size of all sets, as a multiple of
+#: the file size
 _PARSER_FACTOR = 32
 _WORDS = Words(
     body="element set",
@@ -107,12 +108,12 @@ class _Sets:
     """Named sets of node or element numbers; names are case-insensitive."""
 
     def __init__(self, numbers: Nodes, limit: int) -> None:
-        self.numbers = numbers  #: (k,) all numbers in the file, sorted
+        self.numbers = numbers  #: (k,) all node or element numbers in the file, sorted
         self._limit = limit  #: largest total size of all sets
         self._members: dict[str, tuple[str, Nodes]] = {}
 
     def extend(self, name: str, members: Nodes) -> None:
-        """Add members to a set."""
+        """Add members to the set `name`, which need not exist."""
         name, before = self._members.get(name.upper(), (name, _NONE))
         members = np.unique(np.append(before, members))
         self._limit -= members.size
@@ -129,7 +130,7 @@ class _Sets:
         if (bad := ~np.isin(numbers, self.numbers)).any():
             raise InputError(
                 f"{where} contains {numbers[bad][0]}, which is not in the file; "
-                "expected numbers of its nodes or elements"
+                "expected numbers of nodes or elements in the file"
             )
         for name in names:
             if name.upper() not in self._members:
@@ -165,15 +166,15 @@ class _Sets:
 
 
 class _Elements(NamedTuple):
-    """All elements, with their cells by kind."""
+    """All elements of a file, with one table of cells for each kind of cell."""
 
-    cells: Mapping[str, Nodes]  #: corners by kind, as indices into the nodes
+    cells: Mapping[str, Nodes]  #: tables of corners by kind, as indices into the nodes
     number: Nodes  #: (k,) element numbers, sorted
     kind: NDArray[np.str_]  #: (k,) kind of each element
     row: Nodes  #: (k,) row of each element in the table of its kind
 
     def rows(self, members: Nodes) -> dict[str, Nodes]:
-        """Return the rows of elements in the tables of their kinds."""
+        """Return the rows of element numbers `members` in the tables, by kind."""
         at = np.searchsorted(self.number, members)
         kinds = self.kind[at]
         return {str(k): np.sort(self.row[at[kinds == k]]) for k in np.unique(kinds)}
@@ -183,15 +184,15 @@ _NONE = np.zeros(0, dtype=np.int64)
 
 
 def read_inp(path: Path) -> FileMesh:
-    """Read nodes, elements, sets and surfaces of elements.
+    """Read the nodes, elements, sets and surfaces of an .inp file.
 
-    A surface of elements is converted to cells, which are its facets.
+    The facets of a surface of elements become a named set of cells.
 
     Raises
     ------
     InputError
-        If the file is damaged, refers to other files, generates nodes or elements, or
-        contains elements other than linear solids, shells and trusses.
+        If the file is damaged, refers to other files, has keywords that generate nodes
+        or elements, or contains elements other than linear solids, shells and trusses.
 
     """
     text = content(path, "an .inp file", copies=_PARSER_FACTOR)
@@ -227,7 +228,7 @@ def _sections(text: str) -> Iterator[_Section]:
 
 
 def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
-    """Interpret the sections of a file."""
+    """Return the mesh that the sections of a file define."""
     for section in sections:
         keyword = "INCLUDE" if "INPUT" in section.params else section.keyword
         if keyword in _REFUSED:
@@ -290,7 +291,7 @@ def _nodes(
 def _elements(
     sections: Sequence[_Section], nodes: Nodes, limit: int
 ) -> tuple[_Elements, _Sets]:
-    """Return all elements, and the sets that *ELEMENT defines."""
+    """Return all elements, and the element sets that *ELEMENT defines."""
     tables: dict[str, list[Nodes]] = {}
     named = []
     for section in sections:
@@ -347,9 +348,9 @@ def _surfaces(
     element_sets: _Sets,
     node_sets: _Sets,
 ) -> dict[str, dict[str, list[Nodes]]]:
-    """Return the facets of surfaces, by name and kind.
+    """Return the facets of surfaces of elements, by name of the surface and kind.
 
-    Surfaces of nodes are added to `node_sets`.
+    Surfaces of nodes are added to `node_sets` instead.
     """
     surfaces: dict[str, dict[str, list[Nodes]]] = {}
     for section in sections:
@@ -385,7 +386,7 @@ def _name(section: _Section, key: str) -> str:
 
 
 def _distinct(numbers: Nodes, what: str) -> Nodes:
-    """Return sorted numbers; raise InputError if one occurs twice."""
+    """Check that no number occurs twice, and return the sorted numbers."""
     distinct, counts = np.unique(numbers, return_counts=True)
     if (counts > 1).any():
         raise InputError(

@@ -1,15 +1,14 @@
-"""Reader of MED files of Salome, gmsh and code_aster (.med): HDF5.
+"""Reader of MED files (.med, in HDF5) of Salome, gmsh and code_aster.
 
-::
+The reader uses these groups and datasets::
 
-    ENS_MAA/MESH[/STEP]/NOE/COO         coordinates, component by component
+    ENS_MAA/MESH[/STEP]/NOE/COO         x of all nodes, then y, then z
     ENS_MAA/MESH[/STEP]/MAI/TYPE/NOD    first corners of all cells, second corners, …
-    …/FAM                               family of each node or cell; 0 for none
+    …/FAM                               family of each node or cell; 0: no family
     FAS/MESH/(NOEUD|ELEME)/FAMILY       attribute NUM, GRO/NOM: groups of the family
 
-meshio's reader is not used, because it refuses files in which a kind of cells has no
-families (edges in Salome), reads results with the mesh, and follows links to other
-files.
+meshio's reader is not used, because it fails if a kind of cells has no families (as
+edges in Salome's files), reads results with the mesh, and follows links to other files.
 
 Reference: EDF, CEA, Open Cascade, MED-file 4.1, https://docs.salome-platform.org.
 """
@@ -65,12 +64,12 @@ _WORDS = {
         _LINEAR,
     ),
 }
-#: memory of the tables derived from an array, as a multiple of its size
+#: bound on the memory of the tables derived from an array, as a multiple of its size
 _PARSER_FACTOR = 8
 
 
 def read_med(path: Path) -> FileMesh:
-    """Read the nodes, cells and groups of the mesh of a file.
+    """Read the nodes, cells and groups of the mesh in a .med file.
 
     Raises
     ------
@@ -85,7 +84,8 @@ def read_med(path: Path) -> FileMesh:
     with opened(path, _EXPECTED) as stream:
         with parsing(path, "not a .med file (HDF5), or damaged", 0):
             file = h5py.File(stream, "r")
-            # visits neither soft nor external links, which may lead to other files
+            # visititems follows neither soft nor external links, which may lead to
+            # other files
             file.visititems(nodes.__setitem__)
             arrays = {k: v for k, v in nodes.items() if isinstance(v, h5py.Dataset)}
             sizes = [v.size * v.dtype.itemsize for v in arrays.values()]
@@ -142,7 +142,7 @@ def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
 
 
 def _families(nodes: Mapping[str, Any], place: str, count: int) -> NDArray[np.int64]:
-    """Return the family (count,) of each node or cell, 0 without families."""
+    """Return the family (count,) of each node or cell; 0 if there are no families."""
     if f"{place}FAM" not in nodes:
         return np.zeros(count, dtype=np.int64)
     return np.asarray(nodes[f"{place}FAM"][()], dtype=np.int64).reshape(count)

@@ -20,10 +20,11 @@ from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
 FLATNESS_TOLERANCE = 1e-9
 #: dimension of each supported kind of cell
 DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
-#: larger coordinates are refused, because their products would overflow
+#: coordinates must be smaller in magnitude, because products of larger ones could
+#: overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items()}
-#: corners in the order of the mirrored cell, by kind
+#: order of the corners that mirrors a cell, by kind
 _MIRRORED = {
     "tetra": [1, 0, 2, 3], "wedge": [3, 4, 5, 0, 1, 2],
     "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],
@@ -31,7 +32,7 @@ _MIRRORED = {
 
 
 class Words(NamedTuple):
-    """Terms of a file format for named parts, for error messages."""
+    """Terms of a file format for bodies and boundaries, used in error messages."""
 
     body: str = "body"
     boundary: str = "boundary"
@@ -47,14 +48,15 @@ class FileMesh(NamedTuple):
     points: NDArray[np.float64]  #: (N, 2) or (N, 3)
     #: cells by kind, with meshio's names; node numbers start at 0
     blocks: Sequence[tuple[str, NDArray[Any]]]
-    #: sets of cells by dimension and name; a set lists its rows in each block
+    #: sets of cells by dimension and name; for each block, a set lists the rows of its
+    #: cells
     cell_sets: Mapping[int, Mapping[str, Sequence[Nodes]]]
     node_sets: Mapping[str, Nodes]
     vocabulary: Mapping[int, Words]  #: terms by the dimension of the bodies
 
     @property
     def dim(self) -> int:
-        """Dimension of the bodies: 3 if there are cells in space."""
+        """Dimension of the bodies: 3 if there are solid cells, otherwise 2."""
         return max([2, *(_dimension(kind) for kind, _ in self.blocks)])
 
     @property
@@ -64,16 +66,16 @@ class FileMesh(NamedTuple):
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Names of sets that may be bodies."""
+        """Names of the sets of cells that may be bodies."""
         return tuple(self.cell_sets.get(self.dim, {}))
 
     def cells(self, dim: int, rows: Sequence[Nodes]) -> Nodes:
-        """Return selected cells of one dimension as a single array (E, c).
+        """Return selected cells of dimension `dim` as a single array (E, c).
 
-        Triangles are stored as degenerate quadrilaterals, c = 4, and mixed cells in
-        space as degenerate hexahedra, c = 8.
+        Triangles are stored as degenerate quadrilaterals, c = 4. If the file contains
+        solid cells of several kinds, all are stored as degenerate hexahedra, c = 8.
 
-        rows : rows in each block
+        rows : for each block, the rows of the selected cells
         """
         is_mixed = len({kind for kind, _ in self.blocks if DIMENSION[kind] == 3}) > 1
         parts: list[Nodes] = []
@@ -90,7 +92,7 @@ class FileMesh(NamedTuple):
 
 
 class NamedMesh(NamedTuple):
-    """A mesh with named parts, in the plane or in space."""
+    """A mesh with named bodies and boundaries, in the plane or in space."""
 
     points: NDArray[np.float64]  #: (N, dim)
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
@@ -98,7 +100,8 @@ class NamedMesh(NamedTuple):
     #: edges (k, 2) of each named curve, with the body on their left; in space, faces
     #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
-    spots: Mapping[str, Nodes]  #: nodes of each named point, or curve in space
+    #: nodes of each named point or set of nodes and, in space, of each named curve
+    spots: Mapping[str, Nodes]
     words: Words = Words()
 
     @property
@@ -139,19 +142,21 @@ def check_numbers(file: FileMesh) -> None:
 def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     """Select bodies and boundaries by name.
 
-    Sets of cells may overlap. The bodies are the sets in `bodies`, followed by other
-    sets with cells that are not in any body yet. Boundaries are sets of facets, and
-    sets of nodes that contain all corners of a facet on the boundary of the bodies.
+    Sets of cells may overlap. The sets in `bodies` become bodies first. Each other set
+    becomes a body of those of its cells that belong to no body yet, if there are any.
+    Boundaries are sets of facets, and sets of nodes that contain all corners of a facet
+    on the boundary of the bodies.
 
-    Nodes and cells are numbered body by body, which generalised inverses require.
-    Within a body, they keep the order of the file, where cells are grouped by kind.
-    Nodes without cells (such as centres of arcs) are dropped.
+    Nodes and cells are numbered body by body, as generalised inverses require. Within a
+    body, they keep the order of the file, where cells are grouped by kind. Nodes
+    without cells (such as centres of arcs) are dropped.
 
     Raises
     ------
     InputError
-        If the file contains surfaces that are not plane but no volumes, cells without a
-        name, bodies that share cells or nodes, or a body of several disconnected parts.
+        If the file contains no volumes and its surfaces are not plane, or if it
+        contains cells without a name, bodies that share cells or nodes, or a body of
+        several disconnected parts.
 
     """
     path, points, dim, words = file.path, file.points, file.dim, file.words
@@ -214,9 +219,10 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
 def refine(mesh: NamedMesh) -> NamedMesh:
     """Refine a plane mesh: bisect every edge, and divide each cell into four.
 
-    New nodes lie on the straight edges, so that the shape of bodies is unchanged. A
-    triangle is divided into four similar triangles, and a quadrilateral about the mean
-    of its corners. Nodes remain numbered body by body.
+    New nodes on edges are midpoints, so that the shape of bodies is unchanged. A
+    triangle is divided into four similar triangles, and a quadrilateral into four
+    quadrilaterals that meet at the mean of its corners. Nodes remain numbered body by
+    body.
     """
     cells, corners = mesh.cells, mesh.cells.T
     is_quad = ~is_triangle(cells)
@@ -303,7 +309,7 @@ def _bodies(
 
 
 def _dimension(kind: str) -> int:
-    """Return the dimension of a kind of cells, of any order; 0 if it is unknown."""
+    """Return the dimension of a kind of cells; if unsupported, 3 for solids, else 0."""
     spatial = ("pyramid", "tetra", "wedge", "hexahedron")
     return DIMENSION.get(kind, 3 if kind.startswith(spatial) else 0)
 
@@ -318,7 +324,7 @@ def _remedy(kind: str, words: Words) -> str:
 
 
 def _unique_in_order(parts: list[Nodes]) -> Nodes:
-    """Return the distinct nodes of all parts, in the order of first occurrence."""
+    """Return the distinct nodes of all arrays, in the order of first occurrence."""
     nodes = np.concatenate(parts)
     return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
 
@@ -326,14 +332,15 @@ def _unique_in_order(parts: list[Nodes]) -> Nodes:
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
     """Reorder clockwise cells; raise InputError for flat and non-convex cells."""
     x, triangle = points[cells], is_triangle(cells)[:, None]
-    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of both diagonals
+    # twice the area of a quadrilateral is the cross product of its diagonals
+    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])
     reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, reversed_, cells)
     if (flat := twice_area == 0).any():
         x, y = points[cells[flat.argmax()]].mean(axis=0)
         raise InputError(
             f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected "
-            "distinct corners, in their order around it"
+            "distinct corners, in their order around the cell"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     # the boundary of a convex cell turns left at every corner
@@ -342,7 +349,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
         x, y = points[cells[bad.argmax()]].mean(axis=0)
         raise InputError(
             f"{path}: the cell around ({x:.6g}, {y:.6g}) is not convex; "
-            "expected corners below 180°"
+            "expected interior angles below 180°"
         )
     return cells
 
@@ -380,8 +387,8 @@ def _check_apart(
         if (shared := owner[of_body] >= 0).any():
             other = names[owner[of_body[shared.argmax()]]]
             raise InputError(
-                f"{path}: bodies {other!r} and {name!r} share nodes; expected nodes of "
-                "its own for each body"
+                f"{path}: bodies {other!r} and {name!r} share nodes; expected separate "
+                "nodes for each body"
             )
         owner[of_body] = i
     start, end = cells[:, :-1].ravel(), cells[:, 1:].ravel()
@@ -402,7 +409,16 @@ def _directed(
     boundary: Mapping[Any, list[int]],
     words: Words,
 ) -> Nodes:
-    """Return the facets of a boundary, directed so that the body is on the left."""
+    """Return `facets` with their corners in the order that they have in `boundary`.
+
+    boundary : facets on the boundary of the bodies, by sorted corners
+
+    Raises
+    ------
+    InputError
+        If a facet is not on the boundary of the bodies.
+
+    """
     where = f"{words.boundary} {name!r}"
     facet = "an edge" if facets.shape[1] == 2 else "a face"
     if (facets < 0).any():

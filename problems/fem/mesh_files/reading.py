@@ -18,7 +18,7 @@ _READERS = {".inp": read_inp, ".med": read_med}
 
 
 def read_mesh_file(path: Path) -> FileMesh:
-    """Read cells and sets of a file: .inp, .med, or otherwise a .msh file of gmsh.
+    """Read the cells and sets of an .inp, .med or (with any other suffix) .msh file.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def read_mesh_file(path: Path) -> FileMesh:
 
 
 def read_msh(path: Path) -> NamedMesh:
-    """Read bodies and boundaries of a mesh file; all named sets of cells are bodies.
+    """Read the bodies and boundaries of a mesh file by name, see `named_mesh`.
 
     The file is a .msh file of gmsh with physical groups (format 2.2 or 4.1), an .inp
     file of Abaqus or CalculiX, or a .med file.
@@ -41,7 +41,7 @@ def read_msh(path: Path) -> NamedMesh:
     Raises
     ------
     InputError
-        If `read_mesh_file` or `named_mesh` refuses the file.
+        If the file or its mesh is invalid, see `read_mesh_file` and `named_mesh`.
 
     """
     return named_mesh(read_mesh_file(path))

@@ -1,25 +1,26 @@
-"""Contact of two elastic half-spaces as QPs whose P is an operator, and their results.
+"""Contact of two elastic half-spaces as QPs with operators P, and their results.
 
 Two spheres of the same material are approximated by paraboloids. The contact plane is
-divided into n × n cells of side h; the radius a of Hertz's contact is a share of half
-the width of this grid. The unknowns are forces on cells, and F is their influence
-matrix (`influence`).
+divided into n × n cells of side h; the half width of this grid is the radius a of
+Hertz's contact divided by `CONTACT_SHARE` or `ROUGH_SHARE`. The unknowns λ are forces
+on cells, and F is the matrix of displacements that they cause (`influence`).
 
 * law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, with the undeformed gap g = r²/2R − δ_n at the
-  centres of the cells, for Hertz's approach δ_n = a²/R. law=rough adds heights to g
+  centres of the cells, for Hertz's approach δ_n = a²/R
+* law=rough: the same problem, with the heights of a rough surface subtracted from g
 * law=mindlin: min ½λᵀFλ − δᵀλ over ‖λ_i‖ ≤ μp_i h² with Hertz's exact pressure p_i at
   the centres of the cells in contact, r < a, and the displacement δ along x of
   Cattaneo and Mindlin's solution. The normal and tangential problems are decoupled, so
   that one fixed-point step solves Coulomb's law
-* law=hertz with friction=coulomb: the same objective over ‖λ_i‖ ≤ μλ_n,i with the
-  solution λ_n of the normal problem; with friction=tresca, over ‖λ_i‖ ≤ bound·h² in
-  r < a
+* law=hertz with friction=coulomb: the objective of law=mindlin over ‖λ_i‖ ≤ μλ_n,i with
+  the solution λ_n of the normal problem; with friction=tresca, over ‖λ_i‖ ≤ bound·h²
+  for r < a
 
 Lengths are in units of a, and forces in units of F₀: P in the normal direction, and μP
 or bound·πa² in the tangential direction. Displacements are in units of F₀/(πE*a)
 (normal) and F₀/(πGa) (tangential). Hertz's gap is then 3π/4·(r²/2 − 1), and
-δ = 3π/8·(2 − ν)(1 − (c/a)²). For Tresca's law, the prescribed δ is π/4·(2 − ν)Q, the
-displacement of a rigid disc that sticks under Q.
+δ = 3π/8·(2 − ν)(1 − (c/a)²), where c is the radius of the stick zone. For Tresca's law,
+the prescribed δ is π/4·(2 − ν)Q, the displacement of a rigid disc that sticks under Q.
 """
 
 from __future__ import annotations
@@ -52,16 +53,16 @@ from mortarbench.problems.models.half_space.point_contact import (
 )
 from mortarbench.problems.models.half_space.rough_surface import rough_surface
 
-CONTACT_SHARE = 0.9  #: contact radius over half the width of the grid
-#: contact radius over half the width of the grid for rough spheres, which also touch
-#: beyond this radius. With the default roughness, contact reached the border for 6 of 8
-#: seeds with 0.9, and for none of them with 0.6
+CONTACT_SHARE = 0.9  #: ratio of Hertz's contact radius to the half width of the grid
+#: the same ratio for rough spheres, which also touch outside this radius. With the
+#: default roughness, contact reached the border of the grid for 6 of 8 seeds if the
+#: ratio was 0.9, and for none of these seeds if the ratio was 0.6
 ROUGH_SHARE = 0.6
 SIDE = "sphere on sphere"
 YOUNG = 200e9  #: modulus of both spheres, Pa
 RADIUS = 8e-3  #: radius of each sphere, m
 LOAD = 100.0  #: P, N; p₀ = 2.5 GPa for nu = 0.3, as in steel bearings
-_CURVE_POINTS = 601  #: number of points of plotted exact tractions
+_CURVE_POINTS = 601  #: number of points for plots of exact tractions
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class Cells:
 
     n: int
     places: NDArray[np.int64]  #: (k, 2) indices along x and along y
-    share: float = CONTACT_SHARE  #: contact radius over half the width of the grid
+    share: float = CONTACT_SHARE  #: ratio of a to the half width of the grid
 
     @property
     def h(self) -> float:
@@ -79,12 +80,12 @@ class Cells:
 
     @property
     def centres(self) -> NDArray[np.float64]:
-        """Centres (k, 2); the contact is centred at 0."""
+        """Centres (k, 2) of the cells, relative to the centre of the contact."""
         return np.asarray((self.places - (self.n - 1) / 2) * self.h)
 
     @property
     def r(self) -> Vector:
-        """Distances (k,) from the centre of the contact."""
+        """Distances (k,) of the cells from the centre of the contact."""
         return np.asarray(np.hypot(*self.centres.T))
 
     def __getitem__(self, selected: NDArray[np.bool_]) -> Cells:
@@ -97,7 +98,7 @@ class Cells:
 
 
 def half_space_case(params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the case for complete keys, in its only form, dual."""
+    """Return the case, in form dual, for `params`, which must contain all keys."""
     p: Any = params
     exact = PointContact(LOAD, RADIUS / 2, YOUNG / (2 * (1 - p["nu"] ** 2)))
     is_rough = p["law"] == "rough"
@@ -148,8 +149,8 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
         """Evaluate radius, force and pressure; compare smooth spheres with Hertz.
 
         `contact_radius` is that of a disc with the area of the cells in contact;
-        `energy` is the elastic energy in J, exactly 2/5·P·approach. Errors are
-        relative; that of p is in the l² norm.
+        `energy` is the elastic energy in J, whose exact value is 2/5·P·approach. Errors
+        are relative; that of the pressure p is in the l² norm.
         """
         p, hertz = s.x * exact.P / area, exact.pressure(exact.a * cells.r)
         active = int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum())
@@ -240,7 +241,7 @@ def _tresca(cells: Cells, exact: PointContact, p: Mapping[str, Any]) -> _Loading
 
 
 def _hertz_forces(cells: Cells, exact: PointContact) -> Vector:
-    """Return the forces p h² (k,) over P, with Hertz's pressure p at the centres."""
+    """Return forces p h²/P (k,) on cells, with Hertz's pressure p at the centres."""
     return exact.pressure(exact.a * cells.r) * (exact.a * cells.h) ** 2 / exact.P
 
 
@@ -269,8 +270,9 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
 
         Radii are those of discs with the area of the cells. `c_over_a` is the stick
         radius over the exact contact radius; `energy` is the elastic energy and
-        `dissipation` is Σ bound·|slip|, both in J. Errors are relative; that of q is in
-        the l² norm over the centres. The reference solution is exact only for nu = 0.
+        `dissipation` is Σ bound·|slip|, both in J. Errors are relative; that of the
+        shear traction is in the l² norm over the centres of the cells. Cattaneo and
+        Mindlin's solution is exact only for nu = 0.
         """
         force, slip = s.x.reshape(k, 2), slipping(s)
         stick_radius = cells.radius_of(int((~slip).sum()))
@@ -331,7 +333,7 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
 def _curves(
     exact: PointContact, sheared: ShearedPointContact | None = None
 ) -> NDArray[np.float64]:
-    """Return exact tractions along a radius: columns r (m), pressure and shear (Pa)."""
+    """Return columns r (m), exact pressure and exact shear (Pa) along a radius."""
     r = exact.a * np.linspace(0, 1 / CONTACT_SHARE, _CURVE_POINTS)
     shear = np.zeros(r.size) if sheared is None else sheared.traction(r)
     return np.column_stack([r, exact.pressure(r), shear])
@@ -357,5 +359,5 @@ def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
 
 
 def _distance(got: NDArray[np.float64], exact: NDArray[np.float64]) -> float:
-    """Return the relative distance in the l² norm."""
+    """Return the l² distance of `got` from `exact`, relative to the norm of `exact`."""
     return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

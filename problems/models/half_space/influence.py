@@ -1,9 +1,10 @@
 """Surface displacements of half-spaces under forces on square cells, by FFT.
 
-A force on a cell of side h is a uniform traction. The relative displacement of the
-surfaces of two half-spaces of the same material, at the centre of a cell at distance
-(x, y), is twice the displacement of one surface (Boussinesq and Cerruti; Johnson 1985,
-"Contact mechanics", Sections 3.2 and 3.6),
+A force on a cell of side h is distributed as a uniform traction. The relative
+displacement of the surfaces of two half-spaces of the same material, at the centre of a
+cell at distance (x, y), is twice the displacement of one surface. For a unit normal
+force and unit tangential forces it is (Boussinesq and Cerruti; Johnson 1985, "Contact
+mechanics", Sections 3.2 and 3.6)
 
     F_n = I₀/(πE*h²)
     F_t = 1/(πGh²) · [[(1 − ν)I₀ + νI_xx, νI_xy], [νI_xy, (1 − ν)I₀ + νI_yy]]
@@ -17,9 +18,9 @@ tangential displacement, and tangential forces cause no relative normal displace
 The antiderivatives are Y ln(X + r) for I_xx, X ln(Y + r) for I_yy and −r for I_xy (Love
 1929).
 
-An entry only depends on the distance between two cells. Therefore F is a principal
-submatrix of the circulant matrix C of a periodic grid of more than twice the size,
-which the FFT diagonalises: Fx = RᵀCRx, where R extends x by zeros. Hence
+An entry depends only on the distance between two cells. Therefore F is a principal
+submatrix of the circulant matrix C of a periodic grid of about twice the size, which
+the FFT diagonalises: Fx = RᵀCRx, where R extends x by zeros. Hence
 λ_min(F) ≥ λ_min(C); see docs/mathematics.md.
 """
 
@@ -35,19 +36,19 @@ from numpy.typing import NDArray
 from mortarbench.harness.operators import Arrays, Product, SerialisableOperator
 
 NAME = "half-space"  #: name in `problems.OPERATORS`, stored in files
-#: bound of the error of computed eigenvalues of C, relative to the largest one. Errors
-#: of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, 4e-15·‖C‖ for M = 8192
+#: bound on the error of computed eigenvalues of C, relative to the largest eigenvalue.
+#: Errors of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, which is 4e-15·‖C‖ for
+#: M = 8192
 EIGENVALUE_ROUNDING = 1e-12
-_STRIP_BYTES = 2**19  #: size of a strip of transforms, which should stay in cache
+_STRIP_BYTES = 2**19  #: size of a strip of transforms; small enough for the cache
 
 Array = NDArray[np.float64]
 
 
 class CellIntegrals(NamedTuple):
-    """Integrals over a unit cell, (m0, m1) for distances (i, j) of the centres.
+    """Integrals (m0, m1) over a unit cell, by distances i along x and j along y.
 
-    The first distance is x and the second is y. I_xy is odd in x and in y; I_xx and
-    I_yy are even.
+    I_xy is odd in x and in y; I_xx and I_yy are even.
     """
 
     xx: Array  #: I_xx
@@ -59,7 +60,7 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
     """Integrate x²/r³, y²/r³ and xy/r³ over unit cells at distances 0 … m0−1, 0 … m1−1.
 
     The integrals are differences of the antiderivatives at the four corners. At a large
-    distance m, cancellation loses about log₁₀(m) digits.
+    distance m, about log₁₀(m) digits are lost by cancellation.
     """
     X: Array = (np.arange(m0 + 1, dtype=float) - 0.5)[:, None]
     Y: Array = np.arange(m1 + 1, dtype=float) - 0.5
@@ -81,7 +82,7 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
 
 
 class Influence:
-    """The product x ↦ Fx on cells of a grid, for πE* = 1 (normal) or πG = 1 (shear).
+    """The product x ↦ Fx for cells of a grid, with πE* = 1 (normal) or πG = 1 (shear).
 
     cells : (k, 2) indices of each cell along x and along y
     h : side of a cell
@@ -94,13 +95,14 @@ class Influence:
         m0, m1 = int(i.max()) + 1, int(j.max()) + 1
         M0 = scipy.fft.next_fast_len(2 * m0 - 1, real=True)
         M1 = scipy.fft.next_fast_len(2 * m1 - 1)
-        # odd row length: if rows are a power of two apart, entries of a column compete
-        # for cache lines, and transforms along columns take 1.5 times as long
+        # make the row length odd: if rows are a power of two apart, entries of a column
+        # compete for cache lines, and transforms along columns take 1.5 times as long
         m1 |= 1
         self._period = M0, M1
         kernels = _kernels(cell_integrals(M0 // 2 + 1, M1 // 2 + 1), self._period, nu)
         self._diagonal = float(kernels[0][0, 0]) / h
-        #: eigenvalues of C (c, M0/2 + 1, M1): F_n, or those of xx, yy and xy
+        #: eigenvalues of C: (1, M0/2 + 1, M1) for F_n, or (3, M0/2 + 1, M1) for the xx,
+        #: yy and xy parts of F_t
         self._symbol = np.array(
             [scipy.fft.rfft2(K, axes=(1, 0)).real / h for K in kernels]
         )
@@ -108,7 +110,7 @@ class Influence:
         self._places = i * m1 + j  # in the bounding grid of m0 × m1 cells
 
     def __call__(self, x: Array) -> Array:
-        """Multiply F by (n,) or (n, k)."""
+        """Multiply F by a vector (n,) or by a matrix (n, k)."""
         if x.ndim == 2:
             return np.array([self(column) for column in x.T]).reshape(x.shape[::-1]).T
         (M0, M1), (components, m0, m1) = self._period, self._shape
@@ -116,8 +118,8 @@ class Influence:
         for c in range(components):
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
-        # transform along y in strips that stay in cache; half of each row is zero on
-        # input, and half of the output is not required
+        # transform along y in strips that stay in cache, because half of each row is
+        # zero on input and half of the output is not required
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
@@ -135,7 +137,7 @@ class Influence:
 
     @staticmethod
     def _multiply(V: NDArray[np.complex128], symbol: Array) -> None:
-        """Multiply transforms by eigenvalues, in place."""
+        """Multiply the transforms V by the eigenvalues `symbol`, in place."""
         if len(V) == 1:
             V *= symbol
             return
@@ -152,7 +154,7 @@ class Influence:
 
     @property
     def least_eigenvalue(self) -> float:
-        """Lower bound of the eigenvalues of F: that of C, minus rounding errors."""
+        """Lower bound on the eigenvalues of F: λ_min(C) minus a bound on its error."""
         least = greatest = self._symbol[0]
         if len(self._symbol) > 1:
             xx, yy, xy = self._symbol
@@ -162,10 +164,10 @@ class Influence:
 
 
 class NormalInfluence(Influence):
-    """The product for normal forces, with a preconditioner.
+    """The product for normal forces, with a preconditioner M.
 
-    Shear has no preconditioner: with discs, few CG steps occur, and M saves no
-    products.
+    The product for shear has no preconditioner: on discs, solvers take few CG steps, so
+    that preconditioning saves no products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
@@ -203,7 +205,8 @@ def _kernels(
     I_0 = I_xx + I_yy
     if nu is None:
         return [_extended(I_0, period)]
-    # an odd function jumps at half a period, but no two cells are so far apart
+    # an odd function jumps at half a period; any value is admissible there, because no
+    # two cells are so far apart
     for axis, M in enumerate(period):
         if M % 2 == 0:
             np.moveaxis(I_xy, axis, 0)[M // 2] = 0
@@ -215,7 +218,7 @@ def _kernels(
 
 
 def _extended(quadrant: Array, period: tuple[int, int], *, odd: bool = False) -> Array:
-    """Extend a function from one quadrant to the period: even, or odd in x and in y."""
+    """Extend a function from a quadrant to the period, even or odd in x and in y."""
     lag_0, lag_1 = (np.arange(M) - M * (np.arange(M) > M // 2) for M in period)
     function: Array = quadrant[np.abs(lag_0)[:, None], np.abs(lag_1)]
     if odd:
@@ -227,7 +230,13 @@ def _extended(quadrant: Array, period: tuple[int, int], *, odd: bool = False) ->
 def influence_operator(
     cells: NDArray[np.int64], h: float, nu: float | None = None
 ) -> SerialisableOperator:
-    """Return F on cells of a grid; see `Influence`."""
+    """Return F for cells of a grid as an operator that can be stored in files.
+
+    Parameters
+    ----------
+    cells, h, nu : see `Influence`
+
+    """
     arrays = {
         "cells": cells.astype(np.int32),
         "h": np.array([h]),

@@ -6,8 +6,9 @@ and the approach of distant points (Johnson 1985, "Contact mechanics", Section 4
 
     p(r) = p₀√(1 − r²/a²),   a³ = 3PR/4E*,   p₀ = 3P/2πa²,   δ_n = a²/R
 
-If both are of the same material, a tangential force Q < μP applied after P lets
-c ≤ r ≤ a slip while r < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2), with
+If both bodies are of the same material and a tangential force Q < μP is applied after
+P, the annulus c ≤ r ≤ a slips and the disc r < c sticks (Cattaneo 1938; Mindlin 1949;
+Johnson, Section 7.2), with the shear traction and the displacement
 
     q(r) = μp₀√(1 − r²/a²) − μp₀(c/a)√(1 − r²/c²),   c/a = (1 − Q/μP)^⅓
     δ = 3μP(2 − ν)/(8Ga)·(1 − (c/a)²)
@@ -29,9 +30,9 @@ from mortarbench.harness import Vector
 
 @dataclass(frozen=True)
 class PointContact:
-    """Hertz's solution for a force."""
+    """Hertz's solution for a normal force P."""
 
-    P: float  #: N
+    P: float  #: normal force, N
     R: float  #: relative radius, m
     E_star: float  #: contact modulus, Pa
 
@@ -57,7 +58,7 @@ class PointContact:
 
 @dataclass(frozen=True)
 class ShearedPointContact:
-    """Cattaneo and Mindlin's solution."""
+    """Cattaneo and Mindlin's solution for a tangential force Q applied after P."""
 
     normal: PointContact
     mu: float
@@ -66,7 +67,7 @@ class ShearedPointContact:
 
     @property
     def G(self) -> float:
-        """Shear modulus of both bodies, Pa: E* = G/(1 − ν)."""
+        """Shear modulus of both bodies, G = (1 − ν)E*, Pa."""
         return self.normal.E_star * (1 - self.nu)
 
     @property

@@ -1,1 +1,1 @@
-"""Models of families of elastic bodies in space."""
+"""Models of the families whose elastic bodies are always three-dimensional."""

@@ -1,8 +1,9 @@
 """A cube of hexahedra next to a rigid wall: PERMON's example of contact in space.
 
 The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and loaded by a pressure
-of 465 Pa on its top. It bulges towards the wall, which enforces u_x ≤ 1 mm on x = 1.
-Contact rows are simple bounds and require no linearisation. Clamped nodes have no row.
+of 465 Pa on its top. The cube bulges towards the wall, which enforces u_x ≤ 1 mm on
+x = 1. Contact rows are simple bounds and require no linearisation. Clamped nodes have
+no contact row.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the cube with n × n × n cells."""
+    """Return the contact problem of the cube with n × n × n cells."""
     p: Any = params
     divisions = p["n"], p["n"], p["n"]
     mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions)

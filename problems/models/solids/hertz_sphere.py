@@ -1,12 +1,13 @@
 """Elastic spheres in contact, and Hertz's exact solution.
 
 A sphere is pressed onto a rigid plane, or onto an equal sphere. Each body is the part
-of a sphere near the contact: a quarter of a block of half width and height EXTENT·a
-whose contact side is the sphere. The planes x = 0 and y = 0 are planes of symmetry. The
-tractions on the other sides are those of a point force P at the origin of a half-space
-(Boussinesq; Johnson 1985, Section 3.2); their relative difference from the tractions of
-Hertz's pressure is O((a/ρ)²). A whole sphere is not suitable, because its overall
-compression, which the theory neglects, is of order a/R, 6 % of the approach at 0.08.
+of a sphere near the contact: a quarter of a block of half width and height EXTENT·a,
+one side of which, the contact side, is part of the sphere. The planes x = 0 and y = 0
+are planes of symmetry. The tractions on the other sides are those of a point force P at
+the origin of a half-space (Boussinesq; Johnson 1985, Section 3.2). At the distance ρ
+from the origin, their relative difference from the tractions of Hertz's pressure is
+O((a/ρ)²). A whole sphere is not suitable, because its overall compression, which the
+theory neglects, is of order a/R relative to the approach, 6 % for a/R = 0.08.
 
 The upper body is supported by contact alone, so that the form ``dual-bounds`` does not
 exist. A support of the lower body along z has no reaction. The displacement far from
@@ -14,8 +15,8 @@ the contact is that of the half-space minus the approach of distant points to th
 z = 0. The approach is evaluated at the side opposite the contact and summed over the
 bodies.
 
-In Cattaneo and Mindlin's problem, a force Q along x acts after P on two blocks of
-double width, for which only y = 0 is a plane of symmetry. Its tractions on the cut
+In Cattaneo and Mindlin's problem, a tangential force Q acts along x on two blocks of
+double width, for which only y = 0 is a plane of symmetry. The tractions of Q on the cut
 faces are those of a tangential point force (Cerruti; Johnson, Section 3.6). P acts
 first, without friction, then Q with Coulomb's law; slip is measured from the state
 under P.
@@ -75,10 +76,12 @@ from mortarbench.problems.models.half_space.point_contact import (
 )
 from mortarbench.problems.models.hertz import graded_points
 
-#: size of the block over a; values of 6 and 10 change a and p₀ by 0.1 %
+#: half width and height of the block in units of a; values of 6 and 10 change the
+#: computed contact radius and p₀ by 0.1 %
 EXTENT = 4.0
-UNIFORM = 1.25  #: half width of the uniformly meshed part, in a
-#: largest a/R: the corner of the block is then at 0.71 R from the axis
+UNIFORM = 1.25  #: half width of the uniformly meshed part, in units of a
+#: largest a/R, for which the corner of the block is at a distance of 0.71 R from the
+#: axis
 MAX_RATIO = 1 / 8
 GROUND = RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 #: names of the bodies by the key `against`
@@ -98,7 +101,7 @@ class _Block(NamedTuple):
 
     @property
     def contact(self) -> Nodes:
-        """Faces on the sphere."""
+        """Faces on the sphere, the contact side."""
         return self.mesh.boundaries["bottom" if self.up > 0 else "top"]
 
     @property
@@ -129,7 +132,7 @@ class _Block(NamedTuple):
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the spheres, with n cells per contact radius a.
+    """Return the contact problem of the spheres, with n cells per contact radius a.
 
     Raises
     ------
@@ -156,8 +159,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     pair = ContactPair(sides[0], sides[0][:0], GROUND)
     if len(blocks) == 2:
         pair = ContactPair(*sides)
-        # supports of the lower block without reactions: against motion along z, and for
-        # a block of double width also along x and about y
+        # supports of the lower block, which have no reactions: they prevent motion
+        # along z, and for a block of double width also along x and about y
         axis = blocks[1].axis + first[1]
         fixed.append(dofs_of(axis[:1], 3, 2))
         if p["Q"]:
@@ -182,7 +185,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         stages = _programme(pressing, force, held, blocks[0].axis, p["mu"])
 
     def results(solution: ContactSolution) -> dict[str, Any]:
-        """Compare with Hertz; the approach is that of distant points, m."""
+        """Compare with the exact solution; approach is that of distant points, m."""
         approach = sum(
             _approach(block, solution, start, exact.P, material, p["R"])
             for block, start in parts
@@ -270,9 +273,9 @@ def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
 
 
 def _near(block: _Block, half_width: float) -> Nodes:
-    """Return the contact faces within a half width.
+    """Return the contact faces of which all nodes have |x|, |y| ≤ half_width.
 
-    On the lower body, the faces at the edge of this region are included.
+    On the lower body, faces with only some of their nodes in this region are included.
     """
     reach = np.abs(block.mesh.points[block.contact][..., :2])
     within = reach <= half_width * (1 + 1e-9)
@@ -289,16 +292,20 @@ def _far_forces(
 
     The point force on the block at the origin is a unit force along z, away from the
     contact, or along x (towards −x on the upper block). The forces on the far sides
-    follow from the tractions of its stress. They are scaled, and forces along z on the
-    opposite side are added, so that the resultant and the moment about y vanish despite
-    quadrature errors and the curved side.
+    follow from the tractions of the stress due to the point force. These forces are
+    scaled, and for a point force along x, forces along z are added on the side opposite
+    the contact, so that the resultant and the moment about y vanish despite quadrature
+    errors and the curved side.
+
+    stress : returns the stress (k, 3, 3) at points (k, 3) for the unit force
+    axis : axis of the point force, 0 (x) or 2 (z)
     """
     mesh, mirror = block.mesh, np.array([1, 1, block.up])
     forces, faces = np.zeros_like(mesh.points), block.far
     corners = mesh.points[faces]
     for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
         N, slopes = QUAD.shapes(xi), QUAD.gradients(xi)
-        # normals times area
+        # normal vectors with the length of the surface element
         normal = np.cross(*np.einsum("ar,fax->rfx", slopes, corners))
         at = mirror * np.einsum("a,fax->fx", N, corners)
         traction = mirror * np.einsum("fij,fj->fi", stress(at), mirror * normal)
@@ -315,7 +322,7 @@ def _far_forces(
 
 
 def _joined_forces(forces: Sequence[Forces], first: Nodes) -> Forces:
-    """Return the forces on all bodies, whose nodes start at `first`."""
+    """Return the forces on all bodies; the nodes of body k start at first[k]."""
     components = [f.component + 3 * k for f, k in zip(forces, first, strict=False)]
     return Forces(np.concatenate(components), np.concatenate([f.value for f in forces]))
 
@@ -343,7 +350,7 @@ def _approach(
 def point_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
     """Return the stress (k, 3, 3) at x (k, 3) under a unit force along z at the origin.
 
-    The half space is z ≥ 0, and no point x is on the z axis (Johnson, 3.19).
+    The half space is z ≥ 0, and no point x may be on the z axis (Johnson, eq. (3.19)).
     """
     r, z, rho = np.hypot(x[:, 0], x[:, 1]), x[:, 2], np.linalg.norm(x, axis=1)
     radial = x * [1, 1, 0] / r[:, None]
@@ -364,7 +371,7 @@ def point_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]
 def tangential_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
     """Return the stress (k, 3, 3) at x (k, 3) under a unit force along x at the origin.
 
-    The half space is z ≥ 0 (Cerruti; Johnson, 3.75 and 3.76).
+    The half space is z ≥ 0 (Cerruti; Johnson, eqs. (3.75) and (3.76)).
     """
     (X, Y, z), rho = x.T, np.linalg.norm(x, axis=1)
     s = rho + z
@@ -380,7 +387,7 @@ def tangential_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.flo
 
 
 def _settlement(x: NDArray[np.float64], material: Material) -> Vector:
-    """Return u_z (k,) under a unit point force, m/N; see `point_force_stress`."""
+    """Return u_z (k,) at x under a unit point force along z at the origin, m/N."""
     rho = np.linalg.norm(x, axis=1)
     factor = (1 + material.nu) / (2 * np.pi * material.E)
     return np.asarray(factor * (x[:, 2] ** 2 / rho**3 + 2 * (1 - material.nu) / rho))
@@ -389,10 +396,12 @@ def _settlement(x: NDArray[np.float64], material: Material) -> Vector:
 def _quantities(
     solution: ContactSolution, exact: PointContact, copies: int
 ) -> dict[str, Any]:
-    """Compare the pressure with Hertz's; forces and areas are those of full spheres.
+    """Compare with Hertz's pressure; forces and areas are those of full spheres.
 
     `contact_radius` is √(5∫pr²dA/2P) in m, which is exact for Hertz's pressure. Errors
     are relative.
+
+    copies : number of blocks that form a sphere, by symmetry
     """
     bodies, primal, s, _ = solution.sides
     (side,) = contact_sides(*solution.sides)
@@ -427,11 +436,13 @@ def _shear_quantities(
 ) -> dict[str, Any]:
     """Compare stick zone and tangential force of full spheres with the exact solution.
 
-    tangential_force: along x on the lower sphere, N. stick_area: of the sticking nodes,
-    which stick as a whole, m². stick_radius: √(5∫sr²dA/2∫s dA), m, with s = μp − q on
-    these nodes. It is exact for Cattaneo and Mindlin's q, with which s is distributed
-    like Hertz's pressure, with the radius c. c_over_a: over the exact contact
-    radius. c_over_a_moment: from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), exact for the same q.
+    `tangential_force` is the force along x on the lower sphere in N. `stick_area` is
+    the sum of the nodal areas of sticking nodes in m². `stick_radius` is
+    √(5∫sr²dA/2∫s dA) in m, with s = μp − q at sticking nodes. This radius is exact for
+    Cattaneo and Mindlin's traction q, because s is then distributed like Hertz's
+    pressure on a disc of radius c. `c_over_a` is the stick radius over the exact
+    contact radius. `c_over_a_moment` follows from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which
+    also holds for Cattaneo and Mindlin's q.
     """
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None

@@ -438,7 +438,7 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
     (found,) = meshes(tmp_path, f"bodies:{path}/dual")
 
     assert found.error is not None
-    assert ("chords of an arc stay corners" in str(found)) is is_arc
+    assert ("corners between chords of an arc remain" in str(found)) is is_arc
     assert (
         "for pressures, generate a finer mesh" in mesh_table([found]).rows[0][-1].text
     ) is is_arc

@@ -702,8 +702,8 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
     assert str(e.value).endswith(
         "m.msh: 3 cells without a name; expected a name for each: "
-        'Physical Surface("NAME") in the .geo file; or, if they are of no body, save '
-        "only physical groups: Mesh.SaveAll = 0"
+        'Physical Surface("NAME") in the .geo file; or, if they belong to no body, '
+        "save only physical groups: Mesh.SaveAll = 0"
     )
 
 
