@@ -257,7 +257,7 @@ cdef class Faces:
         self.enter()
 
     def minimise(self, long most):
-        """Minimise, starting from x; return False after `most` solves with factors of faces.
+        """Minimise from x; return False after `most` solves with factors of faces.
 
         1. x ← the minimum on its face, reduced until no component leaves the box.
         2. If no component at a bound has a feasible descent direction, x is the minimum.
@@ -319,7 +319,7 @@ cdef class Faces:
         return 0
 
     cdef int advance(self, double[::1] x, double[::1] g) except -1:
-        """Step to the minimum on the face of `wanted`, fixing components that reach bounds."""
+        """Step to the minimum on the face of `wanted`, fixing components at bounds."""
         cdef Py_ssize_t i, j
         cdef double length = 0.0, s, bound
         while length < 1:
