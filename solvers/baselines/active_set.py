@@ -14,7 +14,7 @@ from mortarbench.harness import QP, Matrix, Vector
 from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
 
-DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
+DELTA = 1e-9  #: δᵢ/Dᵢ: weight of the proximal term of xᵢ, relative to its curvature Dᵢ
 #: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to the curvature along it, with D
 #: = diag P
 KAPPA = 1e4
@@ -40,7 +40,7 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Result of the inner iterations."""
+    """Result of the inner iterations, with the final face and its solution operator."""
 
     active: Active
     solve: Solve
@@ -56,7 +56,7 @@ class Problem:
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) diag P, with a typical value in place of zeros
+    D: Vector  #: (n,) diagonal of P, with its mean positive entry in place of zeros
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise

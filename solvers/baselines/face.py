@@ -33,7 +33,7 @@ Solve = Callable[[Vector], Vector]
 #: mask of free components (n,), mask of active rows (p,) ↦ solution operator of that
 #: face
 Faces = Callable[[Mask, Mask], Solve]
-#: M, G, ρ and the mask of components without bounds ↦ faces; see `factoriser`
+#: M, G, ρ, mask of components without bounds ↦ `Faces`, as in `factoriser`
 Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
 
 
@@ -45,7 +45,7 @@ def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
     """Return a function that factorises the Newton system of a face.
 
     M : (n, n) dense or sparse, positive definite
-    G, rho : (p, n) inequality rows and (p,) their weights
+    G, rho : inequality rows (p, n) and their weights (p,)
     always_free : (n,) mask of components without bounds
 
     Raises

@@ -9,11 +9,11 @@ preconditioner M:
 2. w = P_Qᵀr; stop if ‖w‖ ≤ tol ‖w₀‖
 3. y = P_Q M w
 4. p = y − Σ pᵢ (yᵀFpᵢ)/(pᵢᵀFpᵢ) over all previous directions pᵢ
-5. x ← x + αp, r ← r − αFp, α = pᵀw/pᵀFp; back to 2
+5. x ← x + αp, r ← r − αFp with α = pᵀw/pᵀFp; go to 2
 
 Any Q that is positive definite on the range of Gᵀ is admissible. Q = I needs only G;
-Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if stiffnesses jump
-inside a body.
+Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if the stiffness
+jumps within a body.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class FETI:
     )
     #: weights of the copies of an interface node in the preconditioner
     scaling: Scaling = "stiffness"
-    Q: Weight = "identity"  #: weight of the projector
+    Q: Weight = "identity"  #: weight Q in the projector P_Q
     max_iter: int = 2000
 
     about: ClassVar[About] = About(
@@ -156,7 +156,7 @@ class _Coarse:
         return np.asarray(v - self.QGT @ self.solve(self.G @ v))
 
     def multipliers(self, r: Vector) -> Vector:
-        """Return the y with Gᵀy = r − P_Qᵀr."""
+        """Return the multipliers y (r,) with Gᵀy = r − P_Qᵀr."""
         return self.solve(self.QGT.T @ r)
 
 

@@ -175,7 +175,7 @@ def _sweep(
 
 
 def _local_change(block: _Block, x: Point, g: Point) -> Point:
-    """Return the d that minimises gᵀd + ½dᵀAd with x + d in the set of the block."""
+    """Minimise gᵀd + ½dᵀAd over d with x + d in the set of the block; return d."""
     A, length, size = block.A, block.length, range(len(x))
     at, first = x, 0.0
     for _ in range(MAX_LOCAL):

@@ -16,7 +16,8 @@ from mortarbench.harness import QP, Matrix, Vector
 ROUNDING = 1e-10
 
 
-@np.errstate(over="ignore", invalid="ignore")  # iterates of such problems diverge
+# iterates of QPs without a solution diverge
+@np.errstate(over="ignore", invalid="ignore")
 def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
     """Return True if y and z ≥ 0 are a Farkas certificate of infeasibility.
 

@@ -27,15 +27,15 @@ class Iterate(Protocol):
 
     @property
     def x(self) -> Vector:
-        """The point (n,), in the sets."""
+        """The point x (n,), which is in all sets."""
 
     @property
     def g(self) -> Vector:
-        """Px + q."""
+        """Gradient Px + q."""
 
     @property
     def most(self) -> float:
-        """L, the largest curvature dᵀPd/dᵀd so far."""
+        """Largest curvature dᵀPd/dᵀd so far, used as L."""
 
 
 I = TypeVar("I", bound=Iterate)

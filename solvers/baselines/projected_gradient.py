@@ -90,8 +90,9 @@ class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
     alpha: float
-    costs: tuple[float, ...]  #: objectives of the last M iterates, minus the first one
-    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if all are zero
+    #: objectives of the last M iterates, minus that of the start
+    costs: tuple[float, ...]
+    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if no curvature was positive
 
 
 def _start(problem: Problem) -> _State:
@@ -107,7 +108,7 @@ def _start(problem: Problem) -> _State:
 
 
 def _step(problem: Problem, memory: int, s: _State) -> _State | Solution:
-    """Return the next iterate; the objective at x + td is f + t·gᵀd + t²/2·dᵀPd."""
+    """Return the next iterate, or a `Solution` if the objective is unbounded below."""
     d = problem.project(s.x - s.alpha * s.g) - s.x
     w = problem.product(d)
     slope, curvature, square = float(s.g @ d), float(d @ w), float(d @ d)

@@ -40,7 +40,7 @@ class ScaledQP:
 
 
 def equilibrate(qp: QP) -> ScaledQP:
-    """Scale a QP with an explicit P; its matrices become dense if P is, else sparse.
+    """Scale a QP with an explicit P; all matrices become dense if P is, else sparse.
 
     Sets other than bounds must consist of blocks of variables; the variables of a block
     receive a common scale.

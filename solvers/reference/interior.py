@@ -1,4 +1,4 @@
-"""Primal-dual interior-point method, the first stage of the reference solve.
+"""Primal-dual interior-point method, which computes the start for refinement.
 
 Mehrotra's predictor-corrector method for  min ½xᵀPx + qᵀx,  Ax = b,  Cx + s = d,  s ≥ 0
 (Nocedal and Wright 2006, Numerical Optimization, ch. 16.6; Gertz and Wright 2003, ACM
@@ -42,7 +42,7 @@ from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
-DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
+DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
 #: KKT residual at which the iteration ends: small enough to identify the active
 #: constraints, which `polish` then treats as equations
 STOP_RESIDUAL = 1e-11
@@ -156,7 +156,7 @@ class _Problem:
 
 @np.errstate(all="ignore")  # a residual that overflows is not finite and ends the loop
 def interior_point(qp: QP, delta: float = DELTA) -> Solution:
-    """Return the iterate with the smallest KKT residual.
+    """Run the interior-point method; return the iterate with the smallest KKT residual.
 
     The slacks and multipliers of all inequalities are positive. The constants suit a
     QP whose largest entries are about one (`equilibrate`). No exception is raised if
@@ -219,7 +219,7 @@ def _problem(qp: QP, delta: float) -> _Problem:
 
 
 def _stacked(A: Matrix, rows: Matrix) -> Matrix:
-    """Stack rows below A, dense if A is."""
+    """Stack rows below A; the result is dense if A is dense."""
     if isinstance(A, np.ndarray):
         return np.vstack([A, rows.toarray() if issparse(rows) else rows])
     return vstack([A, rows])
@@ -246,7 +246,7 @@ def _start(problem: _Problem) -> Iterate:
 
 
 def _step(problem: _Problem, at: Iterate) -> Iterate:
-    """Return the next iterate: predictor, centring and corrector."""
+    """Return the next iterate, after a predictor and a centring corrector."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
     rows, curvature = problem.at(x, z)
@@ -271,6 +271,6 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
 
 
 def _step_length(at: Iterate, step: Iterate) -> float:
-    """Return the longest step that keeps s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
+    """Return the longest step length with s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
     lengths = [-v[dv < 0] / dv[dv < 0] for v, dv in ((at.s, step.s), (at.z, step.z))]
     return float(np.concatenate(lengths).min(initial=1 / BOUNDARY_FRACTION))

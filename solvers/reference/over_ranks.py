@@ -48,8 +48,8 @@ MAX_FACES = 300
 #: wrong components; after these, single components change
 PATIENCE = 10
 CG_REDUCTION = 1e-6  #: reduction of the projected residual in each round of CG
-MAX_CG_ROUNDS = 3  #: rounds of CG on a face
-MAX_CG_STEPS = 300  #: steps of CG in a round
+MAX_CG_ROUNDS = 3  #: limit of CG rounds on a face
+MAX_CG_STEPS = 300  #: limit of CG steps in a round
 #: CG ends at this norm of the projected residual, relative to that of the projected q
 ROUNDING_RESIDUAL = 1e-14
 #: Multipliers of the wrong sign and violations of bounds count as rounding below this
@@ -65,7 +65,7 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """Solve a distributed dual to about rounding; collective over all ranks.
 
     qp : the dual, with the local components of this rank
-    start : solution of a dual that differs in its bounds only; its active set is tried
+    start : solution of a dual that differs only in its bounds; its active set is tried
         first
 
     Raises

@@ -34,7 +34,8 @@ MEMORY = 10  #: number of iterates per acceleration, and between two acceleratio
 #: shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
-EQUALITY_PENALTY = 1e3  #: penalty of rows of A relative to the others, as in OSQP
+#: penalty of rows of A relative to that of all others, as in OSQP
+EQUALITY_PENALTY = 1e3
 MAX_PENALTY_CHANGE = 10.0  #: largest factor between the penalties of two rounds
 DIFFERENCE_STEP = 2.0**-26  #: √ε, step of difference quotients relative to t
 #: relative diagonal shift of the Newton matrix: it regularises dependent rows and
@@ -128,7 +129,7 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
         x, w = primal_point(t), project(t)
         multipliers = R * (t - w)
         yield problem.solution(_newton(problem, R, t), R)
-        # balance the relative residuals: √(primal/dual), as OSQP updates its ρ
+        # balance the relative residuals by the factor √(primal/dual), as OSQP does
         primal = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
         forces = [P @ x, q, M.T @ multipliers]
         dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
@@ -168,7 +169,7 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop
 def _newton(problem: _Problem, R: Vector, t: Vector) -> Any:
-    """Return the t with the least residual of (1) among the iterates from t.
+    """Return the Newton iterate, starting from t, with the least residual of (1).
 
     x is eliminated, as the components of Π(t) in the rows of I, so that t is the only
     unknown.

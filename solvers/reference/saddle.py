@@ -35,7 +35,7 @@ def saddle(P: Matrix, B: Matrix) -> Factorise:
     The function returns the solution operator (r, t) ↦ (u, v). It raises
     ArithmeticError if an entry of D or W is not finite or a pivot is zero.
 
-    P : (n, n), and B : (r, n), both dense or both sparse
+    P, B : (n, n) and (r, n) matrices, both dense or both sparse
     """
     n = P.shape[0]
     with_diagonal = (
@@ -113,6 +113,6 @@ def _factorise(K: Matrix) -> Callable[[Vector], Vector]:
 
 
 def _is_accurate(solve: Callable[[Vector], Vector], K: Matrix) -> bool:
-    """Return True if the factors solve one test system to MAX_SOLVE_RESIDUAL."""
+    """Return True if the factors solve a test system to MAX_SOLVE_RESIDUAL."""
     v = K @ np.linspace(1, 2, K.shape[0])
     return bool(np.abs(K @ solve(v) - v).max() <= MAX_SOLVE_RESIDUAL * np.abs(v).max())

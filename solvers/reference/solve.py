@@ -49,7 +49,7 @@ OUTLIER_FACTOR = 1e4
 
 
 def reference_solution(qp: QP) -> Solution:
-    """Solve a convex QP to about the rounding of x and its multipliers.
+    """Solve a convex QP; x and its multipliers are accurate to about rounding.
 
     `iterations` counts the steps of the interior-point method, if it ran. The remaining
     residual is due to rounding x to double precision: about 1e-16·|P||x| relative to
@@ -173,7 +173,7 @@ def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _outlier_size(qp: QP) -> float:
-    """Return the size above which a datum of a scaled QP counts as an outlier."""
+    """Return the absolute value above which data of a scaled QP count as outliers."""
     data = np.concatenate([qp.q, qp.b, qp.h, qp.lb, qp.ub])
     sizes = np.abs(data[np.isfinite(data) & (data != 0)])
     return OUTLIER_FACTOR * float(np.median(sizes)) if sizes.size else np.inf

@@ -34,7 +34,7 @@ from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_ro
 
 #: largest number of unknowns; a face costs O(n³), and `smalbe` is faster for fewer
 MAX_UNKNOWNS = 2000
-INITIAL_RHO = 1e3  #: initial ρ/‖P‖, Frobenius norm
+INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
 MAX_RHO = 1e9  #: limit of ρ/‖P‖; ρ grows if ‖C(x − x̃)‖ decreases slowly
 DELTA = 1e-10  #: weight δ of the proximal term
 
@@ -47,7 +47,8 @@ class Direct:
     decrease. The point is claimed solved if they are within 5·tol.
     """
 
-    max_solves: int = 10_000  #: limit of solves with factors of faces, in total
+    #: limit of the total number of solves with factors of faces
+    max_solves: int = 10_000
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",
@@ -131,7 +132,7 @@ class _Task:
         )
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
-        """Return the a with the least ‖(g + Cᵀa)_F‖ on the free components F."""
+        """Return the a that minimises ‖(g + Cᵀa)_F‖ on the free components F."""
         C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
         missing = g[free] + C.T[free] @ a
         change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)

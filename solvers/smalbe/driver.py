@@ -106,7 +106,7 @@ class _Task(NamedTuple):
 def prepared(
     qp: QP, tol: float, options: Options, carry: Carry | None, *, in_sequence: bool
 ) -> Solve:
-    """Prepare a run: eliminate free variables, project the QP, estimate its spectrum.
+    """Prepare a run: eliminate free variables, project the QP, estimate the spectrum.
 
     in_sequence : True if later QPs reuse the results; a factor of the free block and an
         accurate spectrum are then worth more time
@@ -188,7 +188,7 @@ def _projected(
 ) -> Projected:
     """Homogenise, project and normalise the QP; estimate the spectrum.
 
-    steps : number of steps of the Lanczos process
+    steps : largest number of steps of the Lanczos process
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and not qp.b.size and qp.q.any():
@@ -263,7 +263,7 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 
 
 def _start(task: _Task, tol: float) -> Iterate:
-    """Start from zero, or from the solution of the previous problem.
+    """Return the start: zero, or the solution of the previous problem of a sequence.
 
     A component that was at a bound starts at the same bound, even if its value has
     changed: slipping nodes usually continue to slip when the friction bound changes.
@@ -302,7 +302,7 @@ class OuterLoop:
         return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
 
     def solve(self, tol: float, at: Iterate) -> Iterate:
-        """Continue the outer loop from `at` to a tolerance."""
+        """Continue the outer loop from `at` to the tolerance `tol`."""
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
             self.options,
@@ -324,7 +324,7 @@ class OuterLoop:
 def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
-    """Prepare the outer loop with the preconditioner of the options."""
+    """Prepare the outer loop with the preconditioner and step rule of the options."""
     # not used with user-defined preconditioners or step rules
     if problem.factor is not None:
         solver = compiled.SMALBE(problem, options, False)
@@ -347,7 +347,7 @@ def outer_loop(
 def _solve_to_tolerance(
     task: _Task, tol: float
 ) -> tuple[Solution, Callable[[], Carry | None]]:
-    """Return a point whose KKT residuals on the original problem are within `tol`.
+    """Tighten the outer loop until the KKT residuals of the original QP are within tol.
 
     Residuals of up to CLAIM_FACTOR·tol are accepted; if they exceed tol, the tolerance
     of the outer loop is tightened once or twice more, and the best of these points is
@@ -479,7 +479,7 @@ def recovered(
     x = np.where(
         at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
     )
-    x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
+    x = np.clip(x, qp.lb, qp.ub)  # (l − x̃) + x̃ may differ from l in the last bit
     boundaries = [
         (one, _on_boundary(one, x, problem.rows.x_tilde)) for one in problem.discs
     ]
@@ -541,7 +541,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
-    """Add the products of the residuals to the count of products."""
+    """Return `point` with products for residuals included in the count of products."""
     products = task.problem.F.count
     if products == point.counts["P_products"]:
         return point
@@ -550,7 +550,7 @@ def _counted(task: _Task, point: Solution) -> Solution:
 
 COLUMNS = (
     "step",  # letter of the step, see `STEPS`
-    "outer",  # number of the outer iteration
+    "outer",  # index k of the outer iteration
     "products",  # number of products with F so far
     "free_gradient",  # ‖φ‖
     "chopped_gradient",  # ‖β‖
@@ -579,7 +579,7 @@ class History:
         outer: int,
         rhs: Vector,
     ) -> Note:
-        """Return the observer of one inner run with the right-hand side `rhs`.
+        """Return the observer of the steps of an inner run with right-hand side `rhs`.
 
         parts : x, g → mask of the face, gradients φ and β
         """

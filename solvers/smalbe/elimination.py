@@ -44,7 +44,8 @@ class FreeBlock(NamedTuple):
     """The block P_EE with its Cholesky factor."""
 
     matrix: Array  #: (k, k)
-    factor: Array  #: R of P_EE = RᵀR, in the upper triangle
+    #: upper triangular R (k, k) with P_EE = RᵀR; the lower triangle is arbitrary
+    factor: Array
 
 
 class Eliminated(NamedTuple):
@@ -74,7 +75,7 @@ class _Saddle:
         return w - self.PG @ y, y
 
     def complement(self, P_EI: Array, P_II: Array, G_I: Array) -> Array:
-        """Return the Schur complement (n − k, n − k) of the saddle point matrix."""
+        """Return the Schur complement (n − k, n − k) of the saddle-point matrix."""
         W = dtrtrs(self.factor, P_EI, trans=1)[0]
         S: Array = P_II - W.T @ W
         if len(G_I):
@@ -165,7 +166,8 @@ def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Ar
         return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
     at, of = _as_slice(columns), _as_slice(rows)
     if isinstance(at, slice) and isinstance(of, slice):
-        return P[at, of].astype(float, copy=False).T  # as LAPACK stores it
+        # in column-major order, for LAPACK
+        return P[at, of].astype(float, copy=False).T
     return P[np.ix_(columns, rows)].astype(float, copy=False).T
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from mortarbench.harness import Vector
 
-#: v (n,) → Mv (n,) with a symmetric positive definite M that approximates P⁻¹
+#: function v (n,) ↦ Mv (n,) with a symmetric positive definite M ≈ P⁻¹
 Operator: TypeAlias = Callable[[Vector], Vector]
 
 
@@ -42,9 +42,10 @@ class Step(NamedTuple):
     alpha_bar: float  #: length ᾱ of a gradient projection step, 1.9/‖H‖ by default
 
 
-#: Step → trial point (n,). It is projected onto the bounds, and accepted if the cost
-#: decreases by at least φ̃ᵀφ/(2‖H‖), on which the convergence rate of MPRGP is based
-#: (Dostál and Schöberl 2005); otherwise the standard expansion is taken.
+#: function of a `Step` that returns a trial point (n,). It is projected onto the
+#: bounds, and accepted if the cost decreases by at least φ̃ᵀφ/(2‖H‖), on which the
+#: convergence rate of MPRGP is based (Dostál and Schöberl 2005); otherwise the standard
+#: expansion is taken.
 StepRule: TypeAlias = Callable[[Step], Vector]
 
 

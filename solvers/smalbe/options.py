@@ -14,15 +14,14 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 
 #: Rule of the expansion step; the number of products with F is in brackets.
 #: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: projcg: x ← P(x − α_cg p), even if the cost rises (PERMON; 2)
-#: mixed: projcg; std if the cost would rise (ESPRESO; 2 or 3)
-#: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
-#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
-#: decrease is below that of gradient projection) spectral: a step to the boundary and,
-#: unless it is most of the CG step, a projected Barzilai-Borwein step with a
-#: nonmonotone line search (1 or 2). Such steps also replace every proportioning, and CG
-#: if its first step would leave the set (1). With discs, the value model selects
-#: spectral, since model steps require bounds
+#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2) mixed: projcg; std if
+#: the cost would rise (ESPRESO; 2 or 3) model: the CG point, projected in the metric of
+#: the model (new; 2, or 1 if the step to the boundary is the whole step; plus 1 per CG
+#: step beyond the box, plus 1 if the decrease is below that of gradient projection)
+#: spectral: a step to the boundary and, unless it is most of the CG step, a projected
+#: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
+#: replace every proportioning, and CG if its first step would leave the set (1). With
+#: discs, the value model selects spectral, since model steps require bounds
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
 #: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
@@ -45,10 +44,13 @@ class Options:
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
     #: preconditioner, else 1e4
     rho: float = 0.0
-    rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grew too little
-    M: float = 1.0  #: initial precision of the inner runs, relative to ‖𝒫F𝒫‖
-    beta: float = 0.5  #: factor of M if the Lagrangian grew too little
-    eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
+    #: factor of ρ after an outer iteration in which the Lagrangian grew too little
+    rho_growth: float = 1.0
+    M: float = 1.0  #: initial M, in units of ‖𝒫F𝒫‖: inner runs end at ‖g^P‖ ≤ M‖Cν‖
+    #: factor of M after an outer iteration in which the Lagrangian grew too little
+    beta: float = 0.5
+    #: limit of ‖g^P‖/‖b‖, the relative projected gradient, at the end of an inner run
+    eta: float = 0.1
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # for a sparse P, conjugation to all directions would cost more than a product
     #: make CG directions conjugate to all earlier ones on a face, unless P is sparse
@@ -60,11 +62,12 @@ class Options:
     # n/10 applies to bounds alone
     lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others require the original P
-    eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
+    #: when free variables are eliminated with a Cholesky factor
+    eliminate: Eliminate = "sequences"
     #: limit of the estimated energy error, in units of tol; 0 for no limit
     energy: float = 50.0
     history: bool = False  #: True to record each step
-    max_steps: int = 200_000  #: limit of MPRGP steps and outer iterations, in total
+    max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
     def __post_init__(self) -> None:
         check_positive(

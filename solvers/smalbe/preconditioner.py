@@ -80,7 +80,7 @@ def preconditioned_operator(qp: QP) -> Preconditioned | None:
 
 
 class Sparsity(NamedTuple):
-    """Size and difficulty of a sparse P, for the choice of a preconditioner."""
+    """Properties of a sparse P that determine the choice of a preconditioner."""
 
     #: number of pairs of entries below the diagonal in the same column: the steps of an
     #: incomplete factorisation. inf if a diagonal entry is not a finite positive number
@@ -180,10 +180,10 @@ def structural_preconditioner(qp: QP, kind: Preconditioner) -> Operator | None:
 def _of_stiffness(
     structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
 ) -> Operator:
-    """Return v ↦ B_D S B_Dᵀ v with the stiffness S of the interface."""
+    """Return v ↦ B_D S B_Dᵀ v, where S is K_bb or S_bb from `of_interface`."""
     from sksparse.cholmod import (
         cholesky,
-    )  # the other preconditioners do not need CHOLMOD
+    )  # imported here because other preconditioners do not need CHOLMOD
 
     acting = np.ones(structure.K.shape[0], dtype=bool)
     acting[structure.fixed] = False

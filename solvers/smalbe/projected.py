@@ -27,7 +27,7 @@ from mortarbench.solvers.smalbe.spectrum import Ritz, power_method, random_start
 
 
 class Spectrum(NamedTuple):
-    """The norm and the upper end of the spectrum of 𝒫F𝒫."""
+    """Norm and upper end of the spectrum of 𝒫F𝒫."""
 
     norm: float  #: ‖𝒫F𝒫‖, positive
     ritz: Ritz | None  #: upper Ritz pairs; None if they were not computed
@@ -53,7 +53,7 @@ class Projected:
     bounds: tuple[Vector, Vector]  #: bounds of ν = x − x̃
     q: Vector  #: q of the original QP
     diagonal: Vector  #: diagonal of F; empty for an operator F without a known diagonal
-    #: counts other than products with F
+    #: counts of operations other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: preconditioner on the face; None to use the option `preconditioner`
     preconditioner: Preconditioner | None = None
@@ -151,7 +151,7 @@ def by_lanczos(
 
 
 def by_power(F: Product, C: compiled.Rows) -> Spectrum:
-    """Estimate the norm by PERMON's power method; up to 50 products."""
+    """Estimate the norm by PERMON's power method, with at most 50 products."""
     rows = C.source
     norm = power_method(partial(times_projected, F, rows), rows.x_tilde.size)
     return Spectrum(norm or 1.0, None)

@@ -87,7 +87,7 @@ class Rows(ABC):
     least_pivot: float
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
     consistent: bool  #: True if Gx = e has a solution
-    multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
+    multipliers: Callable[[Vector], Vector]  #: function a (r,) ↦ y (m,) with Gᵀy = Cᵀa
 
     def project(self, v: Vector) -> Vector:
         """Return 𝒫v with 𝒫 = I − CᵀC."""
@@ -104,7 +104,7 @@ class Rows(ABC):
 
     @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        """Return the a (r,) with the least ‖(r + Cᵀa)_F‖ on the free components F."""
+        """Return the a (r,) that minimises ‖(r + Cᵀa)_F‖ on the free components F."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class SparseRows(Rows):
     unit: SparseColumns  #: (r, n) rows of G divided by their norms
     gram: GramFactor  #: Cholesky factor of the Gram matrix of `unit`
     bounded: NDArray[np.int64]  #: (b,) components with a bound
-    of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
+    of_bounded: SparseColumns  #: (r, b) columns of `unit` for these components
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         return self.combined_rows(s, v, t, self.gram.backward(a))
@@ -187,12 +187,13 @@ class WholeGram:
     complement is factorised again.
     """
 
-    unit: LocalRows | DistributedColumns  #: G
+    unit: LocalRows | DistributedColumns  #: normalised rows G (r, n)
     matrix: Matrix  #: GGᵀ
     factor: BorderedFactor
     has_border: bool  #: False if more than `MAX_BORDER` rows have bounded components
     bounded: NDArray[np.int64]  #: (b,) components with a bound
-    of_bounded: LocalRows | DistributedColumns  #: (r, b) columns of G at these
+    #: (r, b) columns of G for these components
+    of_bounded: LocalRows | DistributedColumns
 
     def product(self, y: Vector) -> Vector:
         return np.asarray(self.matrix @ y)
@@ -238,7 +239,7 @@ class _OverRanks:
     local: LocalFactor
     factor: SummedFactor
     bounded: NDArray[np.int64]  #: (b,) components of rank p with a bound
-    of_bounded: LocalRows  #: (k, b) columns of G_p at these
+    of_bounded: LocalRows  #: (k, b) columns of G_p for these components
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)

@@ -31,10 +31,11 @@ class Scaled:
     diagonal: Vector  #: (n,) diagonal of this P
     qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
-    norm: float  #: upper bound of the norm of its matrix: the largest row sum Σⱼ|Hᵢⱼ|
+    #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
+    norm: float
     weights: Vector  #: (n,) w > 0; Pw ≥ 0 up to rounding if `has_weights`
     has_weights: bool
-    with_factor: bool  #: True to precondition by an incomplete factor
+    with_factor: bool  #: True to use an incomplete factor as preconditioner
 
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
