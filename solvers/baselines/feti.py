@@ -75,8 +75,7 @@ class FETI:
     preconditioner: Kind = (
         "auto"  #: "auto": the Dirichlet preconditioner if P provides one, else none
     )
-    #: weights of the copies of an interface node in the preconditioner
-    scaling: Scaling = "stiffness"
+    scaling: Scaling = "stiffness"  #: weights of copies of a node, in M
     Q: Weight = "identity"  #: weight Q in the projector P_Q
     max_iter: int = 2000
 

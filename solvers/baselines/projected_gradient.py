@@ -59,8 +59,7 @@ class ProjectedGradient:
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    #: M of the line search; with 1 the objective decreases monotonically
-    memory: int = 10
+    memory: int = 10  #: M of the line search; 1: monotone decrease
     max_iter: int = 50_000
 
     about: ClassVar[About] = About(

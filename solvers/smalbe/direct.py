@@ -47,8 +47,7 @@ class Direct:
     decrease. The point is claimed solved if they are within 5·tol.
     """
 
-    #: limit of the total number of solves with factors of faces
-    max_solves: int = 10_000
+    max_solves: int = 10_000  #: limit of all solves with factors of faces
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",

@@ -44,28 +44,21 @@ class Options:
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
     #: preconditioner, else 1e4
     rho: float = 0.0
-    #: factor of ρ after an outer iteration in which the Lagrangian grew too little
-    rho_growth: float = 1.0
+    rho_growth: float = 1.0  #: factor of ρ when the Lagrangian grows too little
     M: float = 1.0  #: initial M, in units of ‖𝒫F𝒫‖: inner runs end at ‖g^P‖ ≤ M‖Cν‖
-    #: factor of M after an outer iteration in which the Lagrangian grew too little
-    beta: float = 0.5
-    #: limit of ‖g^P‖/‖b‖, the relative projected gradient, at the end of an inner run
-    eta: float = 0.1
+    beta: float = 0.5  #: factor of M when the Lagrangian grows too little
+    eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # for a sparse P, conjugation to all directions would cost more than a product
-    #: make CG directions conjugate to all earlier ones on a face, unless P is sparse
-    recycle: bool = True
+    recycle: bool = True  #: conjugate to all CG directions on a face, unless P is sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
-    #: ᾱ‖H‖ of gradient projection steps; relaxation factor of model steps
-    alpha: float = 1.9
+    alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 applies to bounds alone
     lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others require the original P
-    #: when free variables are eliminated with a Cholesky factor
-    eliminate: Eliminate = "sequences"
-    #: limit of the estimated energy error, in units of tol; 0 for no limit
-    energy: float = 50.0
+    eliminate: Eliminate = "sequences"  #: when to eliminate free variables
+    energy: float = 50.0  #: limit of the energy error estimate, times tol; 0: none
     history: bool = False  #: True to record each step
     max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
