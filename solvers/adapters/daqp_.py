@@ -41,7 +41,7 @@ MESSAGES = {
     -7: "time limit",
 }
 INFINITE = 1e30  #: DAQP's value for an absent bound
-EQUALITY = 5  #: DAQP's flag of an equality
+EQUALITY = 5  #: DAQP's flag for an equality
 TOL_FACTOR = 1e-3  #: tolerances passed to DAQP, relative to tol
 #: smallest tolerance passed to DAQP: with 1e-12 its proximal iterations stop early or
 #: cycle

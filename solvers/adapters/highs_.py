@@ -71,8 +71,8 @@ class HiGHS:
             "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
             "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
             "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
-            "260 (suites/friction.toml).",
-            "Without the free row, the answer for a membrane of 225 nodes has a "
+            "number 260 (suites/friction.toml).",
+            "Without the free row, the result for a membrane of 225 nodes has a "
             "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
             "400 nodes touches').",
             "Without highspy-extras HiGHS silently runs qpasm in place of hipo; the "

@@ -63,7 +63,7 @@ class QTQP:
             "of the claimed point is 2.0e-8, twice the limit of a verified one.",
             "When its own test is met, the complementarity may exceed 10·tol: on "
             "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
-            "and 1.7e-7 at 1e-8 (step 5, cold).",
+            "and 1.7e-7 at 1e-8 (step 5, cold start).",
         ),
     )
 

@@ -75,7 +75,7 @@ class FETI:
     preconditioner: Kind = (
         "auto"  #: "auto": the Dirichlet preconditioner if P provides one, else none
     )
-    scaling: Scaling = "stiffness"  #: weights of copies of a node, in M
+    scaling: Scaling = "stiffness"  #: weights of the copies of a node in M
     Q: Weight = "identity"  #: weight Q in the projector P_Q
     max_iter: int = 2000
 

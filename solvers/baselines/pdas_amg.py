@@ -60,8 +60,8 @@ class PDASAMG(PDAS):
         sequence="active set and point",
         package="pyamg",
         limits=(
-            "rotations are missing in the near-kernel: a QP has no coordinates",
-            "rows that couple several nodes need more steps: 30 to 80 a solve on "
+            "rotations are missing in the near-kernel: a QP contains no coordinates",
+            "rows that couple several nodes need more steps: 30 to 80 per solve on "
             "beam-ring, 9 to 22 on cube-wall",
         ),
     )

@@ -1,4 +1,4 @@
-"""Backends of qpsolvers and cvxpy, listed without importing these libraries.
+"""Lists of the backends of qpsolvers and cvxpy, without importing these libraries.
 
 Importing either library imports every installed backend, which takes a second. The
 backends are therefore listed from the adapter files inside the library, and the

@@ -25,7 +25,7 @@ from mortarbench.harness.sets.discs import Discs
 #: absolute tolerance for solvers that require residual ≤ absolute + relative·size; so
 #: small that the relative tolerance decides
 NEGLIGIBLE = 1e-14
-#: convex sets that have rows in second-order cones
+#: types of sets that have a conic form
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: a claimed solution with a larger ‖x‖∞ counts as diverged: the terms of its residuals
 #: are so large that every relative residual is small
@@ -77,7 +77,7 @@ def resolve_backend(backend: str, qp: QP) -> str:
 
 
 def has_bound(qp: QP) -> NDArray[np.bool_]:
-    """Return the mask (n,) of variables with a finite bound."""
+    """Return the mask (n,) of variables with at least one finite bound."""
     return np.isfinite(qp.lb) | np.isfinite(qp.ub)
 
 
@@ -120,8 +120,8 @@ class ConicForm:
     qp: QP
     rows: csc_matrix  #: R
     rhs: Vector  #: r
-    equalities: int  #: rows with s = 0
-    inequalities: int  #: rows with s ≥ 0
+    equalities: int  #: number of rows with s = 0
+    inequalities: int  #: number of rows with s ≥ 0
     cones: NDArray[np.int64]  #: number of rows of each second-order cone
 
     @property
@@ -207,11 +207,12 @@ def to_cone(qp: QP) -> ConicForm:
 class _ConicBlocks(NamedTuple):
     """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]  for i < k."""
 
-    tail: NDArray[np.int64]  #: (k, d)
+    #: (k, d) indices of the variables bounded in norm, for each block
+    tail: NDArray[np.int64]
     side: Vector  #: (k,)
     head: NDArray[np.int64]  #: (k,)
-    slope: Vector  #: (k,) zero without heads
-    has_head: bool  #: False for discs
+    slope: Vector  #: (k,) zero for discs
+    has_head: bool  #: False for discs, whose `head` is unused
 
     @property
     def is_flat(self) -> NDArray[np.bool_]:
@@ -250,7 +251,7 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
 
 
 def same_cones(one: QP, other: QP) -> bool:
-    """Return True if both QPs have bounds only, or conic forms with equal rows R."""
+    """Return True if both QPs have bounds only or conic forms with equal rows."""
     if len(one.sets) == len(other.sets) == 1:
         return True
     R, S = to_cone(one), to_cone(other)

@@ -41,8 +41,8 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
     Raises
     ------
     InputError
-        If `sides` is not an integer from 3 to 10 000, or a disc or the
-        tangential part of a cone does not have two variables.
+        If `sides` is not an integer from 3 to 10 000, or if a disc or the tangential
+        part of a cone does not have exactly two variables.
 
     Examples
     --------

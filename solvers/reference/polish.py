@@ -30,7 +30,7 @@ from mortarbench.solvers.reference.saddle import saddle
 
 Extended = NDArray[np.longdouble]
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
-MAX_REFINEMENTS = 40  #: steps of refinement with one active set
+MAX_REFINEMENTS = 40  #: limit of refinement steps per active set
 #: refinement ends if a step is longer than this times the previous step
 MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
@@ -61,7 +61,7 @@ class _Problem:
     G: Matrix
 
     def gradient(self, at: _Point) -> Extended:
-        """Return Px + q + Aᵀy + Gᵀz."""
+        """Return the gradient Px + q + Aᵀy + Gᵀz in extended precision."""
         g = self.P @ at.x + self.qp.q + self.A.T @ at.y + self.G.T @ at.z
         return np.asarray(g, dtype=np.longdouble)
 

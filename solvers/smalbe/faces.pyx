@@ -261,15 +261,15 @@ cdef class Faces:
 
         1. x ← the minimum on its face, reduced until no component leaves the box.
         2. If no component at a bound has a feasible descent direction, x is the minimum.
-        3. Free those whose gradient, relative to √Pᵢᵢ, is at least a share of the
-           largest, and repeat 1. If the cost has decreased, go to 2. The share is halved
+        3. Release those whose gradient, divided by √Pᵢᵢ, is at least `share` times the
+           largest, and repeat 1. If the cost has decreased, go to 2. `share` is halved
            if no component left the face, and reset to RELEASE_SHARE otherwise.
-        4. Otherwise free only the component with the largest gradient. Step to the
+        4. Otherwise release only the component with the largest gradient. Step to the
            minimum on that face or to the first bound, fix the component that reached it,
            and repeat; go to 2.
 
         Steps 3 and 4 decrease the cost, and each ends at the minimum on a face. So no
-        face occurs twice, and there are finitely many.
+        face occurs twice, and the method is finite.
         """
         cdef long left
         self.share = RELEASE_SHARE

@@ -286,7 +286,7 @@ cdef class IncompleteFactor:
 
     cdef Py_ssize_t widen(self, double *free, Py_ssize_t count, long layers) noexcept:
         """Add to `free` all components within `layers` edges of `queue` (count,) in the
-        graph of P; return the new length of the queue, which contains them too."""
+        graph of P, and append them to the queue; return its new length."""
         cdef Py_ssize_t first = 0, last = count, i, k
         cdef long layer
         for layer in range(layers):

@@ -545,7 +545,7 @@ cdef class MPRGP:
         return 0
 
     cdef bint spectral_step_leaves(self, bint begun) except -1:
-        """Return True if x − αφ is not in the set; False without an α.
+        """Return True if x − αp is not in the set for the length α of spectral steps.
 
         begun : false if CG has no first direction yet on this face
         """

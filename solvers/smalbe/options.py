@@ -50,7 +50,7 @@ class Options:
     eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # for a sparse P, conjugation to all directions would cost more than a product
-    recycle: bool = True  #: conjugate to all CG directions on a face, unless P is sparse
+    recycle: bool = True  #: conjugate to all CG directions on a face if P is not sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
