@@ -114,8 +114,8 @@ class QPSolvers:
         "as solving",
         limits=(
             "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs with its "
-            "own code, which claims that strictly convex ones are unbounded (conformance, "
-            "shape 'unconstrained'); such QPs are declined.",
+            "own code, which claims that strictly convex ones are unbounded "
+            "(conformance, shape 'unconstrained'); such QPs are declined.",
             "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
             "ecos reaches half of the digits (use our adapter `ecos`). pyqpmad, which "
             "is not installed, returns wrong multipliers for fixed variables.",
