@@ -1,4 +1,4 @@
-"""Registry of all solvers, one entry each."""
+"""Registry of the built-in solvers."""
 
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import Registry, entry

@@ -1,1 +1,1 @@
-"""Adapters of solver libraries to our protocol, one file for each library."""
+"""Adapters from solver libraries to our protocol, one file for each library."""

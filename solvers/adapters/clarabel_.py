@@ -30,14 +30,14 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PrimalInfeasible"  #: the status that has a certificate
+PRIMAL = "PrimalInfeasible"  #: status for which Clarabel returns a certificate
 CLAIMS = {
     "Solved": Status.SOLVED,
     "MaxIterations": Status.ITERATION_LIMIT,
     "MaxTime": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "DualInfeasible": Status.INFEASIBLE,
-}  #: anything else (AlmostSolved, InsufficientProgress, …) is FAILED
+}  #: all others (AlmostSolved, InsufficientProgress, …) count as FAILED
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,10 @@ class Clarabel:
     """https://clarabel.org, one thread.
 
     Clarabel divides its residuals by max(1, size of their terms), and accepts a gap
-    below tol, absolute *or* relative to max(1, |objective|). For a QP with a small
-    objective these tests are absolute, and tol = 1e-6 loses five digits at an energy of
-    1e-5. With the objective scaled to ‖q‖∞ = 1e4, each test is relative if x is of
-    order one, as in every QP of this project, and tol is passed on. (The steps hardly
+    below tol, absolute *or* relative to max(1, |objective|). For a small objective
+    these tests are absolute, and tol = 1e-6 loses five digits at an energy of 1e-5.
+    With the objective scaled to ‖q‖∞ = 1e4, each test is relative if x is of order one,
+    as in every QP of this project, and tol is passed unchanged. (The steps hardly
     change, since Clarabel equilibrates the objective.) In units in which x is tiny,
     Clarabel may stop early.
 
@@ -64,10 +64,10 @@ class Clarabel:
         method="interior point (homogeneous embedding)",
         licence="Apache-2.0",
         package="clarabel",
-        linear_solver="QDLDL or faer (sparse LDLᵀ), as Clarabel chooses; one "
+        linear_solver="QDLDL or faer (sparse LDLᵀ), chosen by Clarabel; one "
         "factorisation per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; it cannot start warm",
+        sequence="`update` of vectors keeps the analysis; no warm starts",
     )
 
     def __post_init__(self) -> None:

@@ -26,10 +26,10 @@ from mortarbench.solvers.common.conversion import (
 
 @dataclass(frozen=True)
 class CVXOPT:
-    """https://cvxopt.org, dense where P is dense, else sparse.
+    """https://cvxopt.org, dense if P is dense, else sparse.
 
-    CVXOPT divides the residuals by max(1, ‖q‖) and max(1, size of the right-hand
-    sides), in 2-norms, and tests the gap in absolute terms (abstol) or relative to the
+    CVXOPT divides the 2-norms of residuals by max(1, ‖q‖) and max(1, norm of the
+    right-hand sides), and tests the gap in absolute terms (abstol) or relative to the
     objective (reltol). So feastol = reltol = tol, abstol is negligible, and the
     objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
     """
@@ -46,8 +46,8 @@ class CVXOPT:
         "per iteration",
         phases="preparing converts only; solving does everything else",
         limits=(
-            "Dependent equality rows end in an error or as 'unknown' (conformance, "
-            "shape 'redundant'): declined.",
+            "Declines dependent equality rows, which end in an error or as 'unknown' "
+            "(conformance, shape 'redundant').",
             "Bodies supported by equality rows only (an exactly singular P) end as "
             "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
             "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",

@@ -1,4 +1,4 @@
-"""Every backend of cvxpy, through its modelling language.
+"""Every backend of cvxpy, called through its modelling language.
 
 Reference: S. Diamond, S. Boyd, CVXPY: a Python-embedded modeling language for convex
 optimization, J. Mach. Learn. Res. 17(83) (2016) 1-5.
@@ -27,7 +27,7 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: calls of backends; a backend that is not listed runs with cvxpy's defaults
+#: arguments for backends; backends that are not listed run with cvxpy's defaults
 CALLS: Mapping[str, Call] = {
     "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
@@ -52,7 +52,7 @@ CALLS: Mapping[str, Call] = {
     "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
 }
 
-SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends for discs and cones
+SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends that accept discs and cones
 CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
 LINEAR = "takes linear programs only"
 DECLINED_BACKENDS: Mapping[str, str] = {
@@ -71,19 +71,19 @@ CLAIMS = {
     "infeasible": Status.INFEASIBLE,
     "unbounded": Status.INFEASIBLE,
     "infeasible_or_unbounded": Status.INFEASIBLE,
-}  #: anything else (optimal_inaccurate, …) is FAILED
+}  #: all others (optimal_inaccurate, …) count as FAILED
 
 
 @dataclass(frozen=True)
 class CVXPY:
-    """One backend of cvxpy, whose setup is timed as solving; compilation as preparing.
+    """One backend of cvxpy; compilation is timed as preparing, its setup as solving.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
-    where a test adds an absolute and a relative tolerance. A backend that is not listed
+    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
+    absolute and a relative tolerance, it is the relative one. A backend not listed
     there runs with cvxpy's defaults. As in the native adapters, the objective is scaled
     to ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (HIGHS, DAQP). Backends to
-    which cvxpy passes a cone program are declined, and so is ProxQP, whose test of the
-    gap cvxpy cannot enable.
+    which cvxpy passes a cone program are declined, and so is ProxQP, because cvxpy
+    cannot enable its gap test.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME
@@ -100,8 +100,8 @@ class CVXPY:
             "CVXOPT and ECOS are declined: they would receive a cone program, which "
             "costs half of the digits (dual residuals of 1e-5 at tol 1e-6, by the "
             "conformance suite).",
-            "PROXQP is declined: without its gap test it claims a complementarity of "
-            "2e-6 at tol 1e-9 (conformance, shape 'bounds').",
+            "PROXQP is declined: without its gap test, a claimed solution has a "
+            "complementarity of 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
         ),
     )
 
@@ -134,7 +134,7 @@ class CVXPY:
         )
 
         def solve() -> Solution:
-            with warnings.catch_warnings():  # warnings repeat the status
+            with warnings.catch_warnings():  # cvxpy's warnings only repeat the status
                 warnings.simplefilter("ignore")
                 try:
                     raw = chain.solve_via_data(
@@ -163,7 +163,7 @@ def _files() -> dict[str, Path]:
 def _model(
     cvxpy: Any, qp: QP, form: ConicForm, scale: float
 ) -> tuple[Any, Any, list[tuple[NDArray[np.int64], Any]]]:
-    """Return the problem, its variable, and constraints with the rows of each."""
+    """Return the problem, its variable, and the constraints with their row indices."""
     x, rows = cvxpy.Variable(qp.q.size), form.rows.tocsr()
     # assume_PSD: otherwise cvxpy computes eigenvalues of P to prove convexity
     energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
@@ -174,7 +174,7 @@ def _model(
         constraints.append((equal, rows[equal] @ x == form.rhs[equal]))
     if less.size:
         constraints.append((less, rows[less] @ x <= form.rhs[less]))
-    for size in np.unique(form.cones):  # cvxpy takes many cones of one size at a time
+    for size in np.unique(form.cones):  # one cvxpy constraint for all cones of a size
         heads = form.heads[form.cones == size]
         tails = (heads[:, None] + np.arange(1, size)).ravel()
         t, w = (form.rhs[place] - rows[place] @ x for place in (heads, tails))

@@ -24,11 +24,11 @@ from mortarbench.solvers.common.sequence import Session, chain
 
 CLAIMS = {
     1: Status.SOLVED,
-    2: Status.FAILED,  # solved a softened problem
+    2: Status.FAILED,  # solution of a problem with softened constraints
     -1: Status.INFEASIBLE,
     -3: Status.INFEASIBLE,  # unbounded
     -4: Status.ITERATION_LIMIT,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 MESSAGES = {
     1: "optimal",
     2: "soft optimal",
@@ -41,9 +41,10 @@ MESSAGES = {
     -7: "time limit",
 }
 INFINITE = 1e30  #: DAQP's value for an absent bound
-EQUALITY = 5  #: DAQP's flag of an equality
-TOL_FACTOR = 1e-3  #: tolerances of DAQP, relative to tol
-#: smallest tolerance for DAQP: with 1e-12 its proximal iterations stop early or cycle
+EQUALITY = 5  #: DAQP's flag for an equality
+TOL_FACTOR = 1e-3  #: tolerances passed to DAQP, relative to tol
+#: smallest tolerance passed to DAQP: with 1e-12 its proximal iterations stop early or
+#: cycle
 MIN_TOLERANCE = 1e-11
 
 
@@ -51,13 +52,13 @@ MIN_TOLERANCE = 1e-11
 class DAQP:
     """https://darnstrom.github.io/daqp, dense.
 
-    An active-set method ends with an active set for which the KKT conditions hold to
-    rounding; primal_tol and dual_tol only decide which violations and multiplier signs
-    count. Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are
-    tol/1000, at least 1e-11. A larger tol would not save steps.
+    DAQP ends with an active set for which the KKT conditions hold to rounding;
+    primal_tol and dual_tol only decide which violations and multiplier signs count.
+    Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are set to
+    tol/1000, but at least 1e-11. Larger values would not save steps.
 
-    If the Cholesky factorisation of the Hessian breaks down, DAQP runs its own
-    proximal-point iterations (eps_prox < 0, its automatic choice).
+    If the Cholesky factorisation of P breaks down, DAQP runs its own proximal-point
+    iterations (eps_prox < 0: automatic).
     """
 
     max_iter: int = 100_000
@@ -69,9 +70,9 @@ class DAQP:
         package="daqp",
         linear_solver="its own dense LDLᵀ, updated as rows become active",
         phases="preparing converts to dense matrices and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factor and the active set",
+        sequence="`update` of vectors keeps the factors and the active set",
         limits=(
-            "Longer than 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
+            "Takes over 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
             "(suites/fleet.toml).",
             "With tolerances of 1e-12 its proximal iterations end with residuals of "
             "7e-7 on singular QPs, so its tolerances are at least 1e-11.",
@@ -137,7 +138,7 @@ class DAQP:
 
 
 def _sides(qp: QP) -> tuple[Vector, Vector]:
-    """Return low and high of bounds, equalities and inequalities, stacked."""
+    """Return lower and upper limits, stacked: bounds, equalities, inequalities."""
     no_low = np.full(qp.h.size, -INFINITE)
     low = np.concatenate([np.maximum(qp.lb, -INFINITE), qp.b, no_low])
     return low, np.concatenate([np.minimum(qp.ub, INFINITE), qp.b, qp.h])

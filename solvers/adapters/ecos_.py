@@ -29,15 +29,15 @@ CLAIMS = {
     1: Status.INFEASIBLE,
     2: Status.INFEASIBLE,  # unbounded
     -1: Status.ITERATION_LIMIT,
-}  #: claims by exit flag; anything else is FAILED
-PRIMAL = 1  #: the exit flag that has a certificate
-#: Eigenvalues of P below this fraction of the largest count as zero.
+}  #: claims by exit flag; all others count as FAILED
+PRIMAL = 1  #: exit flag for which ECOS returns a certificate
+#: eigenvalues of P below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-14
-#: Sizes of the unknowns of corrections, relative to ‖x‖∞. Which of them helps depends
-#: on the QP, as ECOS breaks down near the optimum at a residual that varies by two
-#: orders of magnitude between neighbouring sizes: four per decade.
+#: Units of the corrections, relative to ‖x‖∞, tried in turn, four per decade. Which of
+#: them helps depends on the QP: ECOS breaks down near the optimum, at a residual that
+#: varies by two orders of magnitude between neighbouring units.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
-#: largest KKT residual, relative to tol, of a point that is claimed solved
+#: a point is claimed solved if its KKT residuals are at most this times tol
 CLAIM_FACTOR = 10.0
 
 
@@ -46,7 +46,7 @@ class ECOS:
     """https://github.com/embotech/ecos.
 
     ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues of P. A gap
-    of tol permits errors of √tol in x, so ECOS solves again for corrections.
+    of tol permits errors of √tol in x, so ECOS is called again for corrections of x.
     """
 
     max_iter: int = 200
@@ -84,7 +84,7 @@ class ECOS:
         root = (vectors * roots).T / np.sqrt(energy)
 
         def correct(x: Vector, sigma: float) -> tuple[dict[str, Any], Vector, Vector]:
-            """Return ECOS' answer, the point x + σe, and multipliers of rows."""
+            """Solve for e; return ECOS's result, x + σe and multipliers of rows."""
             factor = energy * (sigma / size) ** 2
             cost = (P @ x + qp.q) * sigma / factor
             answer = _solve(
@@ -140,7 +140,7 @@ def _solve(
     rhs: Vector,
     options: dict[str, Any],
 ) -> dict[str, Any]:
-    """Minimise ½‖root·e‖² + costᵀe subject to rhs − Re in the cones, by ECOS.
+    """Minimise ½‖root·e‖² + costᵀe with ECOS, subject to rhs − Re in the cones.
 
     ½‖root·e‖² ≤ t is the second-order cone  ‖(√2·root·e, t − 1)‖ ≤ t + 1.
     """

@@ -23,7 +23,7 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-PRIMAL = "kInfeasible"  #: the status that may have a certificate
+PRIMAL = "kInfeasible"  #: status for which HiGHS may return a certificate
 CLAIMS = {
     "kOptimal": Status.SOLVED,
     "kIterationLimit": Status.ITERATION_LIMIT,
@@ -31,9 +31,9 @@ CLAIMS = {
     PRIMAL: Status.INFEASIBLE,
     "kUnbounded": Status.INFEASIBLE,
     "kUnboundedOrInfeasible": Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 MIN_TOLERANCE = 1e-10  #: smallest tolerance that HiGHS accepts
-MIN_ENTRY = 1e-12  #: smallest threshold of dropped entries that HiGHS accepts
+MIN_ENTRY = 1e-12  #: smallest value of small_matrix_value that HiGHS accepts
 
 
 @dataclass(frozen=True)
@@ -41,16 +41,15 @@ class HiGHS:
     """https://highs.dev, one thread: active set (qpasm) or interior point (hipo).
 
     HiGHS tests violations and multiplier signs in absolute terms. So the objective is
-    scaled to ‖q‖∞ = 1, and all tolerances are tol/100, at least 1e-10, the smallest
-    that HiGHS accepts. The smaller tolerances cost an active-set method few additional
-    steps.
+    scaled to ‖q‖∞ = 1, and all tolerances are set to tol/100, but at least 1e-10, the
+    smallest value that HiGHS accepts. An active-set method needs few additional steps
+    for it.
 
-    Three properties of HiGHS are worked around. qpasm claims an optimum after 0
-    iterations on QPs with bounds only, so one free row is added to them. HiGHS adds
-    1e-7 to the diagonal of the Hessian (qp_regularization_value), which leaves
-    residuals of 1e-6 on a singular QP of order one at any tolerance; this is set to 0.
-    Entries below 1e-9 would be dropped (small_matrix_value); the threshold is lowered
-    to 1e-12.
+    The adapter works around three properties of HiGHS. On QPs with bounds only, qpasm
+    claims an optimum after 0 iterations, so a free row is added. HiGHS adds
+    qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which leaves
+    residuals of 1e-6 on a singular QP of order one; it is set to 0. HiGHS drops entries
+    below small_matrix_value (default 1e-9), which is lowered to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -72,14 +71,14 @@ class HiGHS:
             "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
             "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
             "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
-            "260 (suites/friction.toml).",
-            "Without the free row, the answer for a membrane of 225 nodes has a "
+            "number 260 (suites/friction.toml).",
+            "Without the free row, the result for a membrane of 225 nodes has a "
             "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
             "400 nodes touches').",
             "Without highspy-extras HiGHS silently runs qpasm in place of hipo; the "
             "adapter reports a failure.",
-            "qpasm stores a dense Hessian on the null space of active rows; a QP is "
-            "declined if it would not fit into memory.",
+            "qpasm stores a dense Hessian on the null space of active rows; a QP for "
+            "which it would not fit into memory is declined.",
         ),
     )
 
@@ -155,7 +154,7 @@ class HiGHS:
 
 
 def _model(highspy: Any, qp: QP, scale: float) -> Any:
-    """Return `qp` as a HighsModel, with a free row if it has no rows."""
+    """Return `qp` as a HighsModel, with one free row if `qp` has no rows."""
     n = qp.q.size
     rows = csc(vstack([csc(qp.A), csc(qp.G)]))
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf)])

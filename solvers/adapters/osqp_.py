@@ -24,24 +24,25 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: the status that has a certificate
+PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status for which OSQP returns a certificate
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
     "OSQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,  # at the limit, 10·tol holds
+    # iteration limit, but within 10·tol
+    "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,
     "OSQP_TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "OSQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 
 
 @dataclass(frozen=True)
 class OSQP:
-    """https://osqp.org, in its own algebra (QDLDL), one thread.
+    """https://osqp.org, with its built-in algebra (QDLDL), one thread.
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
-    are below eps_abs + eps_rel·(their largest term). That is the harness's relative
-    test, so eps_rel = tol and eps_abs is negligible. The test is evaluated every 25
+    are below eps_abs + eps_rel·(their largest term). With a negligible eps_abs, this is
+    the relative test of the harness, so eps_rel = tol. It is evaluated every 25
     iterations. Bounds become rows of the identity, one per bounded variable.
 
     If the dual residual is below 1e-10 (absolute) before polishing, OSQP accepts any
@@ -58,8 +59,8 @@ class OSQP:
         licence="Apache-2.0",
         package="osqp",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per change of ρ",
-        phases="preparing scales and factorises; solving iterates, and polishes",
-        sequence="`update` of vectors keeps the factor; starts from the last point",
+        phases="preparing scales and factorises; solving iterates and polishes",
+        sequence="`update` of vectors keeps the factors; starts from the last point",
         limits=(
             "Polishing made residuals worse on QPs with a small objective: without "
             "the scaling, a dual residual of 3e-3 at a tolerance of 1e-6 "

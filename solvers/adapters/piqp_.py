@@ -31,7 +31,7 @@ CLAIMS = {
     "PIQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "PIQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PIQP:
         package="piqp",
         linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; it cannot start warm",
+        sequence="`update` of vectors keeps the analysis; no warm starts",
     )
 
     def __post_init__(self) -> None:

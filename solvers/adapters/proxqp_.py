@@ -28,14 +28,14 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: the status that has a certificate
+PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status for which ProxQP returns a certificate
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "PROXQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
 
 
@@ -45,11 +45,11 @@ class ProxQP:
 
     ProxQP stops when the max norms of the primal and dual residuals are below
     eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The test of the duality gap is off by default and turned on here. ProxQP
-    does not test the sign of multipliers, and its default start, which takes every row
-    as an equality, often passes all tests with negative ones (primal forms, tol ≥
-    1e-4). Here it therefore starts from zero: negative multipliers become rare, and
-    fewer iterations are needed.
+    eps_abs. The test of the duality gap is off by default and enabled here. ProxQP does
+    not test the signs of multipliers. Its default start, which treats every row as an
+    equality, often passes all tests with negative multipliers (primal forms, tol ≥
+    1e-4). The adapter starts from zero: negative multipliers become rare, and fewer
+    iterations are needed.
 
     Certificates of infeasibility are tested in absolute terms: at the default 1e-4,
     feasible QPs with multipliers of that size are claimed infeasible. At 1e-8 they are
@@ -74,7 +74,7 @@ class ProxQP:
             "At tol 1e-3 it claims points with residuals of 1e-2 to 2e-2 on duals with "
             "friction (greco/dual-bounds, beam-ring/steps=1/friction=tresca/bound=1e8/"
             "dual); at 1e-6 and 1e-9 all are verified.",
-            "It has no time limit and does not release Python's lock: only killing the "
+            "Has no time limit and does not release Python's GIL: only killing the "
             "process ends it.",
         ),
     )
@@ -155,7 +155,7 @@ class ProxQP:
 
 
 class _Dense:
-    """Dense backend: takes bounds; n multipliers of bounds follow those of G."""
+    """Dense backend: accepts bounds; their n multipliers follow those of G."""
 
     def __init__(self, qp: QP) -> None:
         self.qp, self.has_box = qp, bool(has_bound(qp).any())
@@ -181,7 +181,7 @@ class _Dense:
 
 
 class _Sparse:
-    """Sparse backend: takes no bounds; they become rows of the identity."""
+    """Sparse backend: bounds become rows of the identity."""
 
     def __init__(self, qp: QP) -> None:
         self.qp = qp

@@ -27,7 +27,7 @@ from mortarbench.solvers.common.sequence import Session, chain
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
     "QOCO_MAX_ITER": Status.ITERATION_LIMIT,
-}  #: anything else (QOCO_SOLVED_INACCURATE, …) is FAILED
+}  #: all others (QOCO_SOLVED_INACCURATE, …) count as FAILED
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class QOCO:
     """https://qoco-org.github.io/qoco.
 
     QOCO stops when the max norms of the residuals are below abstol + reltol·(their
-    largest term) and the gap is below abstol + reltol·max(1, |objective|). Therefore
-    abstol is set to a negligible value, reltol to tol, and the objective is scaled to
-    ‖q‖∞ = 1e4, where the 1 has no effect. QOCO computes no certificates: on an
-    unbounded QP its iterates grow until every relative residual is small, and QOCO
-    reports success. A claim with ‖x‖∞ > 1e12 therefore counts as failed.
+    largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
+    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
+    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
+    every relative residual is small, and QOCO reports success. A claim with ‖x‖∞ > 1e12
+    therefore counts as failed.
     """
 
     max_iter: int = 200
@@ -53,7 +53,7 @@ class QOCO:
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
         sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
-        "takes no starting point",
+        "accepts no starting point",
         limits=(
             "No certificates of infeasibility (conformance check 'unbounded': claimed "
             "solved with ‖x‖∞ = 1e16).",

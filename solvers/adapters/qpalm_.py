@@ -23,14 +23,14 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PRIMAL_INFEASIBLE"  #: the status that has a certificate
+PRIMAL = "PRIMAL_INFEASIBLE"  #: status for which QPALM returns a certificate
 CLAIMS = {
     "SOLVED": Status.SOLVED,
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 INFINITE = 1e20  #: QPALM's value for an absent bound
 
 
@@ -39,22 +39,22 @@ class QPALM:
     """https://kul-optec.github.io/QPALM.
 
     QPALM stops when the max norms of the primal and dual residuals are below eps_abs +
-    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. It does
-    not test the duality gap. Bounds become rows of the identity.
+    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. QPALM
+    does not test the duality gap. Bounds become rows of the identity.
     """
 
     max_iter: int = 10_000
 
     about: ClassVar[About] = About(
         title="QPALM",
-        method="proximal augmented Lagrangian, semismooth Newton inside",
+        method="proximal augmented Lagrangian with semismooth Newton steps",
         licence="LGPL-3.0-or-later",
         package="qpalm",
         linear_solver="LADEL (sparse LDLᵀ, updated as rows become active)",
         phases="preparing scales; solving does all factorisations",
         sequence="`update` of vectors; starts from the last point",
         limits=(
-            "No duality-gap test: it may stop early where primal and dual residuals "
+            "No duality-gap test: it may stop early if primal and dual residuals "
             "are small and the gap is not.",
         ),
     )

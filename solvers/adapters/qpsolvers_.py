@@ -1,4 +1,4 @@
-"""Every backend of qpsolvers, through its unified interface.
+"""Every backend of qpsolvers, called through its unified interface.
 
 Reference: S. Caron et al., qpsolvers: quadratic programming solvers in Python,
 https://github.com/qpsolvers/qpsolvers.
@@ -35,7 +35,7 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-#: calls of backends; a backend that is not listed runs with its defaults
+#: arguments for backends; backends that are not listed run with their defaults
 CALLS: Mapping[str, Call] = {
     "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "cvxopt": Call(("feastol", "abstol", "reltol")),
@@ -75,13 +75,13 @@ CALLS: Mapping[str, Call] = {
     "sip": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
 }
 
-#: backends that take dense matrices only
+#: backends that accept dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
-#: backends for which qpsolvers solves unconstrained QPs by its own code, which is wrong
+#: backends for which qpsolvers solves unconstrained QPs itself, with a wrong result
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
-#: claims for the statuses of backends without a solution; the first match counts
+#: claims for the status message if there is no solution; the first match counts
 STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
     (r"time", Status.TIME_LIMIT),
@@ -94,11 +94,11 @@ STATUS_PATTERNS = (
 class QPSolvers:
     """One backend of qpsolvers; all work except the conversion is timed as solving.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
-    where a test adds an absolute and a relative tolerance. A backend that is not listed
+    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
+    absolute and a relative tolerance, it is the relative one. A backend not listed
     there runs with its defaults. As in the native adapters, the objective is scaled to
     ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (highs, daqp). Backends that
-    accept both dense and sparse matrices get dense ones if P is dense. qpsolvers
+    accept both dense and sparse matrices receive dense ones if P is dense. qpsolvers
     reports iterations only for some backends.
     """
 
@@ -113,12 +113,12 @@ class QPSolvers:
         phases="preparing converts only; the backend's setup and factorisation count "
         "as solving",
         limits=(
-            "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs by its own "
-            "code, which claims that strictly convex ones are unbounded (conformance, "
-            "shape 'unconstrained'); such QPs are declined.",
+            "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs with its "
+            "own code, which claims that strictly convex ones are unbounded "
+            "(conformance, shape 'unconstrained'); such QPs are declined.",
             "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
-            "ecos reaches half of the digits (use our adapter `ecos`), and pyqpmad, "
-            "not installed, gives wrong multipliers for fixed variables.",
+            "ecos reaches half of the digits (use our adapter `ecos`). pyqpmad, which "
+            "is not installed, returns wrong multipliers for fixed variables.",
         ),
     )
 
@@ -132,7 +132,7 @@ class QPSolvers:
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:
-            return "needs a row or a bound: qpsolvers solves QPs without one by itself"
+            return "needs a row or a bound: qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
@@ -150,14 +150,15 @@ class QPSolvers:
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)
         convert = dense if as_dense or self.backend in DENSE_BACKENDS else csc
         problem = qpsolvers.Problem(**_arguments(qp, convert, scale))
-        if self.backend == "sip":  # it refuses a P whose asymmetry is rounding
+        if self.backend == "sip":  # sip rejects a P that is asymmetric by rounding
             problem.P = csc((problem.P + problem.P.T) / 2)
         if self.backend == "highs" and not qp.b.size + qp.h.size:
             # with bounds only, HiGHS claims an optimum after 0 iterations
             problem.G, problem.h = convert(np.eye(1, qp.q.size)), np.array([np.inf])
 
         def solve() -> Solution:
-            with warnings.catch_warnings():  # warnings repeat the status
+            # qpsolvers' warnings only repeat the status
+            with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 try:
                     result = qpsolvers.solve_problem(problem, self.backend, **options)
@@ -177,7 +178,7 @@ def _files() -> dict[str, Path]:
 def _arguments(
     qp: QP, convert: Callable[[Matrix], Matrix], scale: float
 ) -> dict[str, Any]:
-    """Return the arguments of qpsolvers.Problem, without those for absent parts."""
+    """Return the arguments of qpsolvers.Problem; absent rows and bounds are omitted."""
     arguments = {"P": convert(qp.P) * scale, "q": qp.q * scale}
     if qp.h.size:
         arguments |= {"G": convert(qp.G), "h": qp.h.copy()}
@@ -190,7 +191,7 @@ def _arguments(
 
 
 def _solution(qp: QP, result: Any, scale: float) -> Solution:
-    """Convert a qpsolvers.Solution; its sign convention is that of `Solution`."""
+    """Convert a qpsolvers.Solution, which has the sign convention of `Solution`."""
     info = result.extras.get("info", result.extras)
     info = info if isinstance(info, Mapping) else _attributes(info)
     message = str(info.get("status", "found" if result.found else "not found"))
@@ -223,7 +224,7 @@ def _claim(message: str) -> Status:
 
 
 def _vector(v: Any, size: int, *, absent: bool = False) -> Vector:
-    """Return `v` as a vector; zeros if its block is absent, NaN if `v` is missing."""
+    """Return `v` as a vector; zeros if `absent`, NaN if it has another size."""
     if absent:
         return np.zeros(size)
     if v is None or np.size(v) != size:

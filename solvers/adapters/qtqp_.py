@@ -21,13 +21,13 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "infeasible"  #: the status that has a certificate
+PRIMAL = "infeasible"  #: status for which QTQP returns a certificate
 CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "unbounded": Status.INFEASIBLE,
-}  #: anything else (almost_solved, …) is FAILED
+}  #: all others (almost_solved, …) count as FAILED
 LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 
 
@@ -36,12 +36,12 @@ class QTQP:
     """https://github.com/google-deepmind/qtqp.
 
     QTQP compares its residuals with max(1, size of their terms), and accepts a gap
-    below tol that is absolute or relative to max(1, |objective|). The objective is
-    therefore scaled to ‖q‖∞ = 1e4, where the 1 has no effect, and tol is passed on.
+    below tol, absolute or relative to max(1, |objective|). So the objective is scaled
+    to ‖q‖∞ = 1e4, where the 1 has no effect, and tol is passed unchanged.
 
-    In sequences it starts from the last point. QTQP moves that point into the interior
-    and falls back to a cold start if the residuals there are too large. The count
-    `accepted_starts` is 1 or 0 accordingly.
+    In sequences QTQP starts from the last point, shifted into the interior. If the
+    residuals there are too large, it starts cold. The count `accepted_starts` is 1 or 0
+    accordingly.
     """
 
     linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"
@@ -58,12 +58,12 @@ class QTQP:
         limits=(
             "Needs an inequality row or a bound: without one it divides by zero.",
             "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
-            "Nr=30/Nh=15/primal and ends at its iteration limit, close to the answer; "
+            "Nr=30/Nh=15/primal and ends at its iteration limit, near the solution; "
             "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
             "of the claimed point is 2.0e-8, twice the limit of a verified one.",
             "When its own test is met, the complementarity may exceed 10·tol: on "
             "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
-            "and 1.7e-7 at 1e-8 (step 5, cold).",
+            "and 1.7e-7 at 1e-8 (step 5, cold start).",
         ),
     )
 

@@ -22,7 +22,7 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: smallest pivot, relative to the largest, of a Hessian that counts as definite
+#: a Hessian counts as singular if its smallest pivot is below this times the largest
 MIN_PIVOT = 1e-12
 
 
@@ -30,13 +30,13 @@ MIN_PIVOT = 1e-12
 class Quadprog:
     """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
 
-    quadprog has no tolerance, and `tol` is not used: after finitely many changes of the
-    active set the KKT conditions hold to rounding.
+    quadprog has no tolerance, so `tol` is not used: after finitely many changes of the
+    active set, the KKT conditions hold to rounding.
 
-    A Hessian that is not positive definite, or whose smallest Cholesky pivot is below
-    1e-12 of the largest, is declined after its factorisation. QPs with dependent
-    equality rows are declined as well, because quadprog claims that such rows are
-    inconsistent.
+    A QP is declined after the factorisation of its Hessian if this is not positive
+    definite or its smallest Cholesky pivot is below 1e-12 of the largest. QPs with
+    dependent equality rows are also declined, because quadprog reports that such rows
+    are inconsistent.
     """
 
     about: ClassVar[About] = About(
@@ -49,8 +49,8 @@ class Quadprog:
         limits=(
             "Strictly convex QPs only: the dual with Dirichlet rows, whose F is "
             "singular, is declined.",
-            "Consistent equality rows of which one is the sum of others are claimed "
-            "infeasible (conformance, shape 'redundant'): declined.",
+            "Declines dependent equality rows, which quadprog claims infeasible even "
+            "if they are consistent (conformance, shape 'redundant').",
         ),
     )
 

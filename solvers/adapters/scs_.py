@@ -23,13 +23,13 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = -2  #: the status that has a certificate
+PRIMAL = -2  #: status for which SCS returns a certificate
 CLAIMS = {
     1: Status.SOLVED,
-    2: Status.ITERATION_LIMIT,  # inaccurate, as at the limit
+    2: Status.ITERATION_LIMIT,  # inaccurate, at the iteration limit
     -1: Status.INFEASIBLE,  # unbounded
     PRIMAL: Status.INFEASIBLE,
-}  #: anything else is FAILED
+}  #: all others count as FAILED
 CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
 
@@ -56,7 +56,7 @@ class SCS:
         linear_solver="MKL Pardiso, bundled (or QDLDL), one factorisation per change "
         "of scale",
         phases="preparing equilibrates and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factor; starts from the last point",
+        sequence="`update` of vectors keeps the factors; starts from the last point",
         limits=("Needs a row or a bound, because its cone must not be empty.",),
     )
 

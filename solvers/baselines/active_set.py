@@ -14,23 +14,25 @@ from mortarbench.harness import QP, Matrix, Vector
 from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
 
-DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
-KAPPA = 1e4  #: ρ·aD⁻¹aᵀ, penalty of a row a relative to the curvature along it
-#: Number of changes of the active set without fewer wrong constraints after which
-#: constraints are exchanged one at a time.
+DELTA = 1e-9  #: δᵢ/Dᵢ: weight of the proximal term of xᵢ, relative to its curvature Dᵢ
+#: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to the curvature along it, with D
+#: = diag P
+KAPPA = 1e4
+#: Number of consecutive changes of the active set that may fail to reduce the number of
+#: wrong constraints; after these, constraints are exchanged one at a time.
 PATIENCE = 10
-SIGN_ROUNDING = 1e-13  #: relative errors of signs and bounds below this are rounding
+SIGN_ROUNDING = 1e-13  #: smaller relative errors of signs and bounds count as rounding
 
 
 class Active(NamedTuple):
-    """Active set: the constraints that the Newton system takes as equations."""
+    """Active set: the constraints that are equations in the Newton system."""
 
     side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 free
     rows: NDArray[np.bool_]  #: (p,) active rows of G
 
 
 class Point(NamedTuple):
-    """Point with the multipliers of its rows."""
+    """Point with the multipliers of the equality and inequality rows."""
 
     x: Vector
     y: Vector
@@ -38,7 +40,7 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Result of the inner iterations."""
+    """Result of the inner iterations, with the final face and its solution operator."""
 
     active: Active
     solve: Solve
@@ -49,12 +51,12 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """QP with the weights of its proximal terms."""
+    """QP with the weights of the proximal terms and the Newton systems of its faces."""
 
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) diag P, with a typical value in place of zeros
+    D: Vector  #: (n,) diagonal of P, with its mean positive entry in place of zeros
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise
@@ -62,7 +64,7 @@ class Problem:
     counts: Counter[str]
 
     def gradient(self, at: Point, centre: Point) -> Vector:
-        """Return Px + δ(x − x_k) + q + Aᵀy + Gᵀz."""
+        """Return Px + δ(x − x_k) + q + Aᵀy + Gᵀz with the proximal centre x_k."""
         self.counts["P_products"] += 1
         force = self.qp.P @ at.x + self.A.T @ at.y + self.G.T @ at.z
         return np.asarray(force + self.qp.q + DELTA * self.D * (at.x - centre.x))
@@ -71,12 +73,13 @@ class Problem:
 def penalise(
     qp: QP, counts: Counter[str], factorise: Factorise, kappa: float = KAPPA
 ) -> Problem:
-    """Weight each row a by ρ = κ/(a D⁻¹aᵀ); factorise the part that faces share.
+    """Weight each row a by κ/(a D⁻¹aᵀ); factorise the block that all faces share.
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If P is not positive semidefinite and this factorisation already shows it.
+        If P is not positive semidefinite and this factorisation breaks down. (Otherwise
+        a factorisation of a face may.)
 
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc
@@ -109,8 +112,8 @@ def solve_subproblem(
 ) -> Run:
     """Update the active set until it no longer changes (steps 1 and 2 of `pdas`).
 
-    start : active set and, if available, the solve of its factorised face
-    slack : relative errors of signs and bounds that are accepted
+    start : active set, and the solution operator of its face if already factorised
+    slack : largest relative errors of signs and bounds that are accepted
     """
     active, solve = start
     fewest, patience = np.inf, PATIENCE
@@ -156,13 +159,13 @@ def _newton(
 
 
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
-    """Drop constraints with a multiplier of the wrong sign; add violated ones.
+    """Drop active constraints with multipliers of the wrong sign; add violated ones.
 
-    Errors are measured in √D·x, whose unit is √energy, so that they do not depend on
-    the units of the variables.
+    Errors of variables are measured in √D·x, whose unit is √energy, so that the result
+    does not depend on the units of the variables.
 
-    at : x (n,); in place of y, the gradient without the multipliers of bounds; in
-        place of z, the trial multipliers of all inequality rows
+    at : x (n,); in the field y, the gradient without the multipliers of bounds; in the
+        field z, the trial multipliers of all inequality rows
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)
@@ -180,7 +183,7 @@ def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Activ
 
 
 def _exchange(active: Active, new: Active, index: int) -> Active:
-    """Return `active` with the constraint of this index taken from `new`.
+    """Return `active` with the state of a single constraint taken from `new`.
 
     index : i for the bounds of variable i < n; n + i for row i of G
     """

@@ -1,14 +1,15 @@
-"""Accelerated projected gradients on convex sets, a baseline of granular dynamics.
+"""Accelerated projected gradients on convex sets, as used in granular dynamics.
 
 With the projection Π on the product of sets and a curvature L,
 
     x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x)
 
-with Nesterov's weights β, which are restarted when the objective would rise. L grows
+with Nesterov's weights β, which restart from 0 when the objective would rise. L grows
 until it bounds the curvature along the step, and shrinks after each step (Mazhar, Heyn,
 Negrut and Tasora, Using Nesterov's method to accelerate multibody dynamics with
-friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a combination of
-two products with x, so that a step takes one product, plus one for each growth of L.
+friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a linear
+combination of the last two products Px, so that a step takes one product, plus one each
+time L grows.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ ROUNDING = 1e-12  #: relative rounding error of a curvature
 class AcceleratedGradient:
     """In-house accelerated projected gradient method (APGD).
 
-    `tol` bounds the natural map, relative to ‖q‖. If the KKT residuals on the QP are
-    then not within 5·tol, this bound is lowered; no other point is claimed solved. The
-    start is the feasible point nearest to zero. Iterations are steps; all products with
-    P are counted.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
+    residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
+    claimed solved. The start is the feasible point nearest to zero. Iterations are
+    steps; all products with P are counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
     shrink: float = 0.9  #: factor of L after each step; 1 for a fixed step
-    #: least factor by which L grows; L grows to the curvature along the step if that is
-    #: larger
+    #: smallest factor by which L grows; L grows to the curvature along the step if that
+    #: curvature is larger
     growth: float = 2.0
     max_iter: int = 50_000
 
@@ -77,15 +78,15 @@ class AcceleratedGradient:
 class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
-    y: Vector  #: x, extrapolated
+    y: Vector  #: extrapolated point
     g_y: Vector  #: Py + q
-    weight: float  #: θ, from which β follows; 1 at a start
+    weight: float  #: θ, which determines β; 1 at the start and after a restart
     L: float
-    most: float  #: largest curvature so far
+    most: float  #: largest curvature dᵀPd/dᵀd so far
 
 
 def _start(problem: Problem) -> _State:
-    """Start with the curvature along q, or along ones."""
+    """Return the start; L = ‖Pd‖/‖d‖ with d = q, or a vector of ones if q = 0."""
     q = problem.qp.q
     x = problem.project(np.zeros(q.size))
     d = q if q.any() else np.ones(q.size)
@@ -107,7 +108,7 @@ def _step(problem: Problem, options: AcceleratedGradient, s: _State) -> _State:
         square, work = float(d @ d), float(d @ (g - s.g_y))
         curvature = work / square if square else 0.0
         most = max(most, curvature)
-        # rounding of g hides the curvature along tiny steps
+        # the rounding of g would spoil the curvature along tiny steps
         rounding = ROUNDING * float(np.linalg.norm(g)) * np.sqrt(square)
         if work <= L * square + rounding:
             break

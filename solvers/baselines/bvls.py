@@ -3,7 +3,7 @@
 With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖²,  so that a strictly convex QP
 with bounds is a least-squares problem. Problems with lower bounds only are solved by
 the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974,
-Chapter 23), others by its extension of Stark and Parker (Comput. Stat. 10, 1995).
+Chapter 23), others by the extension due to Stark and Parker (Comput. Stat. 10, 1995).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mortarbench.harness import (
 )
 from mortarbench.solvers.common.conversion import check_positive, dense
 
-MAX_COMPONENTS = 5_000  #: P is converted to a dense matrix
+MAX_COMPONENTS = 5_000  #: limit of n, because P is converted to a dense matrix
 CLAIM_FACTOR = (
     5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
 )
@@ -36,10 +36,10 @@ CLAIM_FACTOR = (
 class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") otherwise.
 
-    Both end with the exact active set. `tol` goes to the optimality test of bvls, and a
-    point is claimed solved if its KKT residuals are within 5·tol. Fixed variables are
-    eliminated; the objective is scaled, because the test of bvls is absolute. scipy
-    reports the iterations of bvls but not those of nnls.
+    Both routines end with the exact active set. `tol` bounds the optimality test of
+    bvls, and a point is claimed solved if its KKT residuals are within 5·tol. Fixed
+    variables are eliminated, and the objective is scaled, because the test of bvls is
+    absolute. scipy reports the iterations of bvls but not those of nnls.
     """
 
     max_iter: int = 10_000
@@ -95,7 +95,7 @@ class BVLS:
 def _least_squares(
     C: Vector, rhs: Vector, box: tuple[Vector, Vector], tol: float, limit: int
 ) -> tuple[Vector, Vector, int | None]:
-    """Minimise ‖Cx − rhs‖ in the box; return x, sides (−1, 0, 1) and iterations."""
+    """Minimise ‖Cx − rhs‖ in the box; return x, active sides and iterations."""
     from scipy.optimize import lsq_linear, nnls
 
     if not rhs.size:
@@ -110,7 +110,7 @@ def _least_squares(
 def _point(
     qp: QP, P: Vector, x: Vector, side: Vector, steps: int | None, tol: float
 ) -> Solution:
-    """Return the point after a direct solve in its face.
+    """Return the solution, with the free components recomputed by a direct solve.
 
     The multipliers of active bounds are the components of −(Px + q).
     """

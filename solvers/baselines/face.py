@@ -1,12 +1,15 @@
 """Newton systems of the primal-dual active set method, one per face.
 
-In the face where the components F are free and the inequality rows R are active,
+On the face with free components F and active inequality rows R, the system for the
+Newton step dx with right-hand side r,
 
     (M + G_RᵀρG_R)_FF dx_F = r_F
 
-is solved by a Cholesky factor; M is positive definite. A dense M is first condensed
-onto the bounded components E̅, where E are the components without bounds. That costs
-about one factorisation, and faces then factorise bounded components only:
+is solved with a Cholesky factor. M is positive definite, and ρ is the diagonal matrix
+of the penalties of rows. If M is dense and there are no inequality rows, the components
+E without bounds are first eliminated. That costs about one factorisation; each face
+then needs only a factor of the free part of the Schur complement S on the bounded
+components E̅:
 
     S = M_E̅E̅ − W ᵀW,   W = L⁻¹M_EE̅,   M_EE = LLᵀ.
 """
@@ -25,28 +28,31 @@ from sksparse.cholmod import cholesky as sparse_cholesky
 from mortarbench.harness import Matrix, Vector
 
 Mask = NDArray[np.bool_]
-Solve = Callable[[Vector], Vector]  #: r (n,) ↦ dx (n,), zero outside F; uses r_F only
-#: free components (n,), active rows (p,) ↦ solve of that face
+#: r (n,) ↦ dx (n,), zero outside F; only r_F is used
+Solve = Callable[[Vector], Vector]
+#: mask of free components (n,), mask of active rows (p,) ↦ solution operator of that
+#: face
 Faces = Callable[[Mask, Mask], Solve]
-#: M, G, ρ and the mask of components without bounds ↦ faces; see `factoriser`
+#: M, G, ρ, mask of components without bounds ↦ `Faces`, as in `factoriser`
 Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
 
 
 class InnerSolveError(ArithmeticError):
-    """An iterative solve of a face that did not converge."""
+    """Failure of an iterative solve on a face to converge."""
 
 
 def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
-    """Return a function that factorises the system of one face.
+    """Return a function that factorises the Newton system of a face.
 
     M : (n, n) dense or sparse, positive definite
-    G, rho : (p, n) inequality rows and (p,) their weights
+    G, rho : inequality rows (p, n) and their weights (p,)
     always_free : (n,) mask of components without bounds
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If M is not positive definite; the returned function may raise them as well.
+        If M is not positive definite. The returned function may also raise these
+        errors.
 
     """
     if not isinstance(M, np.ndarray):

@@ -1,19 +1,19 @@
 """FETI: projected preconditioned conjugate gradients for equality rows only.
 
-Minimises ½xᵀFx − dᵀx subject to Gx = e. For the dual of bodies decomposed into
-subdomains this is the linear problem without contact (Farhat and Roux 1991). The steps
-are those of Farhat, Mandel and Roux (1994). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a
+Minimises ½xᵀFx − dᵀx subject to Gx = e. On the dual of bodies decomposed into
+subdomains, this is the linear problem without contact (Farhat and Roux 1991). The
+algorithm is that of Farhat, Mandel and Roux (1994). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a
 preconditioner M:
 
 1. x = QGᵀ(GQGᵀ)⁻¹e, r = d − Fx
-2. w = P_Qᵀr; done where ‖w‖ ≤ tol ‖w₀‖
+2. w = P_Qᵀr; stop if ‖w‖ ≤ tol ‖w₀‖
 3. y = P_Q M w
-4. p = y − Σ pᵢ (yᵀFpᵢ)/(pᵢᵀFpᵢ) over all directions so far
-5. x ← x + αp, r ← r − αFp, α = pᵀw/pᵀFp; back to 2
+4. p = y − Σ pᵢ (yᵀFpᵢ)/(pᵢᵀFpᵢ) over all previous directions pᵢ
+5. x ← x + αp, r ← r − αFp with α = pᵀw/pᵀFp; go to 2
 
 Any Q that is positive definite on the range of Gᵀ is admissible. Q = I needs only G;
-Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if stiffnesses jump
-inside a body.
+Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if the stiffness
+jumps within a body.
 """
 
 from __future__ import annotations
@@ -51,30 +51,32 @@ Weight = Literal["identity", "preconditioner"]
 CLAIM_FACTOR = (
     5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
 )
-MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
+#: the solve gives up if its stopping bound falls below this times tol
+MIN_TOL_FACTOR = 1e-4
 PATIENCE = (
-    100  #: number of steps in a row without halving ‖w‖, after which the solve gives up
+    #: number of consecutive steps without halving ‖w‖ after which the solve gives up
+    100
 )
 STAGNATED = "no further progress: rounding, or the objective is unbounded below"
-#: pivots of GQGᵀ below this, relative to the largest, mean dependent rows
+#: rows count as dependent if a pivot of GQGᵀ is below this times the largest
 MIN_PIVOT = 1e-13
-BATCH = 256  #: columns of Gᵀ to which the preconditioner is applied at once
+BATCH = 256  #: number of columns of Gᵀ per application of the preconditioner
 
 
 @dataclass(frozen=True)
 class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
-    `tol` bounds ‖P_Qᵀ(d − Fx)‖ relative to its first value. If the KKT residuals on the
-    QP are then not within 5·tol, this bound is lowered; no other point is claimed
-    solved. Iterations are CG steps; all products with P are counted.
+    The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If
+    the KKT residuals exceed 5·tol there, this bound is lowered; only a point within
+    5·tol is claimed solved. Iterations are CG steps; all products with P are counted.
     """
 
     preconditioner: Kind = (
-        "auto"  #: "auto": the Dirichlet preconditioner if P offers it, else none
+        "auto"  #: "auto": the Dirichlet preconditioner if P provides one, else none
     )
-    scaling: Scaling = "stiffness"  #: weights of copies of a node in the preconditioner
-    Q: Weight = "identity"  #: weight of the projector
+    scaling: Scaling = "stiffness"  #: weights of the copies of a node in M
+    Q: Weight = "identity"  #: weight Q in the projector P_Q
     max_iter: int = 2000
 
     about: ClassVar[About] = About(
@@ -120,7 +122,7 @@ class FETI:
         return lambda: _solve(_Task(qp, coarse, apply, counts), tol, self.max_iter)
 
     def _preconditioner(self, qp: QP) -> Product | None:
-        """Return x ↦ Mx, or None for M = I."""
+        """Return the preconditioner x ↦ Mx, or None for M = I."""
         operator = preconditioner_source(qp)
         if operator is None or self.preconditioner == "none":
             return None
@@ -129,7 +131,7 @@ class FETI:
 
 
 def preconditioner_source(qp: QP) -> Preconditioned | None:
-    """Return the operator of P that has preconditioners, or None."""
+    """Return P as an operator that provides preconditioners, or None."""
     if not isinstance(qp.P, SerialisableOperator):
         return None
     product = qp.P.build()
@@ -138,22 +140,22 @@ def preconditioner_source(qp: QP) -> Preconditioned | None:
 
 @dataclass(frozen=True, eq=False)
 class _Coarse:
-    """Projector P_Q with its coarse problem GQGᵀ."""
+    """Projector P_Q with the coarse matrix GQGᵀ."""
 
     G: csr_array  #: (r, m)
     QGT: Any  #: QGᵀ (m, r), sparse or dense
-    solve: Callable[[Vector], Vector]  #: (GQGᵀ)⁻¹
+    solve: Callable[[Vector], Vector]  #: t ↦ (GQGᵀ)⁻¹t
 
     def feasible(self, e: Vector) -> Vector:
-        """Return the x with Gx = e in the span of QGᵀ."""
+        """Return the x in the span of QGᵀ with Gx = e."""
         return np.asarray(self.QGT @ self.solve(e))
 
     def project(self, v: Vector) -> Vector:
-        """Apply P_Q."""
+        """Return P_Q v."""
         return np.asarray(v - self.QGT @ self.solve(self.G @ v))
 
     def multipliers(self, r: Vector) -> Vector:
-        """Return the y with Gᵀy = r − P_Qᵀr."""
+        """Return the multipliers y (r,) with Gᵀy = r − P_Qᵀr."""
         return self.solve(self.QGT.T @ r)
 
 
@@ -202,14 +204,14 @@ class _State(NamedTuple):
 
 @dataclass(eq=False)
 class _Directions:
-    """F-orthonormal directions p of all steps, with Fp, as rows of two arrays."""
+    """F-orthonormal directions p of all steps and the products Fp, stored as rows."""
 
     P: NDArray[np.float64]
     FP: NDArray[np.float64]
     count: int = 0
 
     def add(self, p: Vector, Fp: Vector) -> None:
-        """Append a direction; double the arrays if they are full."""
+        """Append a direction p and Fp; double the arrays if they are full."""
         if self.count == len(self.P):
             self.P, self.FP = (
                 np.vstack([M, np.empty_like(M)]) for M in (self.P, self.FP)
@@ -218,13 +220,13 @@ class _Directions:
         self.count += 1
 
     def conjugate(self, y: Vector) -> Vector:
-        """Return y made F-orthogonal to all directions."""
+        """Return the component of y that is F-orthogonal to all directions."""
         P, FP = self.P[: self.count], self.FP[: self.count]
         return np.asarray(y - P.T @ (FP @ y))
 
 
 def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
-    """Lower the bound of ‖w‖ until the KKT residuals are within 5·tol."""
+    """Iterate, lowering the bound on ‖w‖, until the KKT residuals are within 5·tol."""
     qp, tighter = task.qp, 1.0
     at = _state(task, task.coarse.feasible(qp.b))
     directions = _Directions(np.empty((16, qp.q.size)), np.empty((16, qp.q.size)))
@@ -253,7 +255,7 @@ def _iterate(
     accuracy: float,
     max_iter: int,
 ) -> tuple[_State, str]:
-    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; the text is the reason of an earlier end."""
+    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; return the state and why it failed, or ""."""
     least, stalled = norms[-1], 0
     while norms[-1] > accuracy * norms[0]:
         if directions.count >= max_iter:
@@ -270,19 +272,20 @@ def _iterate(
 
 def _state(task: _Task, x: Vector) -> _State:
     """Return the state at x with the residual recomputed."""
-    # twice: the rounding of a large y in the first projection is removed by the second
+    # project twice: the second projection removes the rounding errors of a large y in
+    # the first
     once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
     return _project(task, *once)
 
 
 def _project(task: _Task, x: Vector, y: Vector, r: Vector) -> _State:
-    """Project the residual r; add the multipliers of the projection to y."""
+    """Return the state with r projected and y increased by the multipliers."""
     change = task.coarse.multipliers(r)
     return _State(x, y + change, np.asarray(r - task.qp.A.T @ change))
 
 
 def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
-    """Return the next state, or None if the curvature along the direction is ≤ 0."""
+    """Return the next state, or None if the curvature along its direction is ≤ 0."""
     p = directions.conjugate(task.preconditioned(at.w))
     Fp = task.product(p)
     curvature = float(p @ Fp)
@@ -297,7 +300,8 @@ def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
 
 def _point(task: _Task, at: _State, norms: list[float]) -> Solution:
     n, m = task.qp.q.size, len(norms)
-    task.counts["P_products"] += 1  # of the residuals that follow
+    # the caller's evaluation of residuals takes one product
+    task.counts["P_products"] += 1
     return Solution(
         status=Status.SOLVED,
         x=at.x,

@@ -1,14 +1,14 @@
-"""Projected Gauss–Seidel by discs and cones, a baseline of granular dynamics.
+"""Projected Gauss–Seidel over discs and cones, as used in granular dynamics.
 
 A sweep minimises the objective over one block of variables at a time, with all others
 fixed. A block is a disc, a cone, or a single variable of the box. The method is
 known as NSGS (nonsmooth Gauss–Seidel: Jourdan, Alart and Jean, Comput. Methods Appl.
-Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008, Chapter 13). A block problem is
-solved by projected gradient steps of length 1/λ until they become short, where λ is the
-largest eigenvalue of its diagonal block of P.
+Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008, Chapter 13). The problem on a
+block is solved by projected gradient steps of length 1/λ until they become short, where
+λ is the largest eigenvalue of the diagonal block of P.
 
-The gradient is updated after each change of a block by the columns of P, so that a
-sweep over all blocks costs as much as a product.
+After each change of a block, the gradient is updated with the columns of P of this
+block, so that a sweep over all blocks costs as much as a product with P.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mortarbench.harness.qp import NEEDS_MATRICES
 from mortarbench.solvers.baselines.natural_map import Problem
 from mortarbench.solvers.common.conversion import check_positive
 
-#: Length of a step, relative to the first, at which the steps in a block end. With 1,
-#: which takes one step, 30 QPs on cones take 70 sweeps on average; with this value and
-#: with 1e-6 they take 34.
+#: The steps in a block end at a step shorter than this times the first one. With 1,
+#: which means a single step, 30 QPs on cones take 70 sweeps on average; with this
+#: value, as with 1e-6, they take 34.
 SETTLED = 1e-3
-MAX_LOCAL = 100  #: steps in a block
+MAX_LOCAL = 100  #: limit of steps in a block
 
 Point = list[float]
 
@@ -41,15 +41,15 @@ Point = list[float]
 class GaussSeidel:
     """In-house projected Gauss–Seidel method (NSGS).
 
-    `tol` bounds the natural map, relative to ‖q‖, after a sweep. If the KKT residuals
-    on the QP are then not within 5·tol, this bound is lowered; no other point is
-    claimed solved. The start is the feasible point nearest to zero. Iterations are
-    sweeps; each costs about one product with P.
+    The iteration stops when the norm of the natural map after a sweep is at most
+    tol·‖q‖. If the KKT residuals exceed 5·tol there, this bound is lowered; only a
+    point within 5·tol is claimed solved. The start is the feasible point nearest to
+    zero. Iterations are sweeps; each costs about as much as one product with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    max_iter: int = 10_000  #: sweeps
+    max_iter: int = 10_000  #: limit of sweeps
 
     about: ClassVar[About] = About(
         title="Projected Gauss–Seidel (ours)",
@@ -89,20 +89,20 @@ class GaussSeidel:
 class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
-    most: float  #: largest curvature of a sweep so far
+    most: float  #: largest curvature along the change of x in a sweep so far
 
 
 class _Block(NamedTuple):
-    """Variables of a block, with its part of P."""
+    """Variables of a block, with the diagonal block A of P."""
 
     variables: NDArray[np.int64]  #: (d,)
     A: list[Point]  #: (d, d)
-    length: float  #: 1/‖A‖
+    length: float  #: step length 1/‖A‖
     project: Callable[[Point], Point]
 
 
 def _blocks(qp: QP) -> Iterator[_Block]:
-    """Yield all blocks: sets first, then single variables of the box."""
+    """Yield the discs and cones as blocks, then the single variables of the box."""
     alone = np.ones(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         alone[one.block] = False
@@ -133,7 +133,7 @@ def _part(qp: QP, index: NDArray[np.int64]) -> NDArray[np.float64]:
 def _columns(qp: QP) -> Callable[[NDArray[np.int64], Vector, Vector], None]:
     """Return a function that adds P[:, index] d to a vector g (n,)."""
     if isinstance(qp.P, np.ndarray):
-        P = qp.P if qp.P.flags.c_contiguous else qp.P.T  # it is symmetric
+        P = qp.P if qp.P.flags.c_contiguous else qp.P.T  # P is symmetric
 
         def add(index: NDArray[np.int64], d: Vector, g: Vector) -> None:
             for i, change in zip(index, d, strict=True):
@@ -175,7 +175,7 @@ def _sweep(
 
 
 def _local_change(block: _Block, x: Point, g: Point) -> Point:
-    """Return the d that minimises gᵀd + ½dᵀAd with x + d in the set of the block."""
+    """Minimise gᵀd + ½dᵀAd over d with x + d in the set of the block; return d."""
     A, length, size = block.A, block.length, range(len(x))
     at, first = x, 0.0
     for _ in range(MAX_LOCAL):

@@ -1,8 +1,9 @@
 """Certificates that a QP has no solution, checked on the data of the QP.
 
-If a QP has such a certificate, differences of successive proximal iterates converge to
-it (Banjac et al., Infeasibility detection in the alternating direction method of
-multipliers for convex optimization, JOTA 183, 2019, for a method of the same family).
+If a QP has such a certificate, the differences of successive proximal iterates converge
+to one. (Banjac et al., Infeasibility detection in the alternating direction method of
+multipliers for convex optimization, JOTA 183, 2019, prove this for ADMM, a related
+method.)
 """
 
 from __future__ import annotations
@@ -11,16 +12,18 @@ import numpy as np
 
 from mortarbench.harness import QP, Matrix, Vector
 
-ROUNDING = 1e-10  #: a sum below this times the sum of its absolute terms is zero
+#: a sum counts as zero below this times the sum of the absolute values of its terms
+ROUNDING = 1e-10
 
 
-@np.errstate(over="ignore", invalid="ignore")  # iterates of such problems diverge
+# iterates of QPs without a solution diverge
+@np.errstate(over="ignore", invalid="ignore")
 def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
     """Return True if y and z ≥ 0 are a Farkas certificate of infeasibility.
 
-    With v = Aᵀy + Gᵀz every feasible x has vᵀx ≤ bᵀy + hᵀz, while over the box
-    vᵀx ≥ Σ vᵢ·(lbᵢ if vᵢ > 0, ubᵢ if vᵢ < 0). The QP is infeasible if that sum exceeds
-    bᵀy + hᵀz (lemma of Farkas).
+    With v = Aᵀy + Gᵀz, every feasible x satisfies vᵀx ≤ bᵀy + hᵀz. On the box, vᵀx is
+    at least the sum of vᵢ·lbᵢ over vᵢ > 0 and of vᵢ·ubᵢ over vᵢ < 0. The QP is
+    infeasible if this sum exceeds bᵀy + hᵀz (Farkas' lemma).
     """
     z = np.maximum(z, 0)
     v = _times(qp.A.T, y) + _times(qp.G.T, z)
@@ -30,7 +33,7 @@ def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
     np.multiply(v, bound, out=terms, where=v != 0)
     most = qp.b @ y + qp.h @ z
     size = np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + np.abs(terms).sum()
-    # an infinite term means that v points to an absent bound: no certificate
+    # an infinite term belongs to an absent bound, so that vᵀx has no lower bound
     return bool(np.isfinite(size) and terms.sum() - most > 1e-6 * size)
 
 
@@ -38,8 +41,8 @@ def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
 def proves_unbounded(qp: QP, v: Vector) -> bool:
     """Return True if the objective is unbounded below along the feasible direction v.
 
-    The conditions are Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, and v points to no finite bound.
-    A feasible point need not exist.
+    The conditions are Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, vᵢ ≥ 0 if lbᵢ is finite and vᵢ ≤
+    0 if ubᵢ is finite. They do not imply that a feasible point exists.
     """
     if not v.any() or not np.isfinite(v).all():
         return False

@@ -1,8 +1,8 @@
-"""The natural map of a QP on convex sets, and a loop until it meets a tolerance.
+"""The natural map of a QP on convex sets, and the loop of methods that test its norm.
 
 With the projection Π on the product of sets and a curvature L, the natural map
-L(x − Π(x − g/L)) is zero exactly at solutions. With v = x − g/L, the vector L(v − Π(v))
-is normal to the sets at Π(v): the multipliers there.
+L(x − Π(x − g/L)) is zero exactly at solutions. Here g = Px + q. With v = x − g/L, the
+vector L(v − Π(v)) is normal to the sets at Π(v) and serves as the multipliers there.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 
 #: a point is claimed solved if its KKT residuals are ≤ this times tol
 CLAIM_FACTOR = 5.0
-MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
+#: the solve gives up if its stopping bound falls below this times tol
+MIN_TOL_FACTOR = 1e-4
 
 
 class Iterate(Protocol):
-    """A point, its gradient, and the curvature of its natural map."""
+    """A point, its gradient, and the curvature L for the natural map."""
 
     @property
     def x(self) -> Vector:
-        """The point (n,), in the sets."""
+        """The point x (n,), which is in all sets."""
 
     @property
     def g(self) -> Vector:
-        """Px + q."""
+        """Gradient Px + q."""
 
     @property
     def most(self) -> float:
-        """L, the largest curvature dᵀPd/dᵀd so far."""
+        """Largest curvature dᵀPd/dᵀd so far, used as L."""
 
 
 I = TypeVar("I", bound=Iterate)
@@ -42,7 +43,7 @@ I = TypeVar("I", bound=Iterate)
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A QP without rows, whose products and steps are counted."""
+    """A QP without rows, with counts of products and steps."""
 
     qp: QP
     counts: Counter[str] = field(default_factory=Counter)
@@ -53,13 +54,13 @@ class Problem:
         return np.asarray(self.qp.P @ v)
 
     def project(self, v: Vector) -> Vector:
-        """Return the point of the sets that is nearest to v."""
+        """Return Π(v), the point of the sets that is nearest to v."""
         for one in self.qp.sets:
             v = one.project(v)
         return v
 
     def natural_map(self, at: Iterate) -> float:
-        """Return the norm of the natural map."""
+        """Return the 2-norm of the natural map."""
         v = at.x - at.g / at.most
         return at.most * float(np.linalg.norm(at.x - self.project(v)))
 
@@ -73,11 +74,12 @@ class Problem:
     ) -> Solution:
         """Take steps until the KKT residuals are within 5·tol.
 
-        The residuals are evaluated when the natural map falls below tol‖q‖; if they
-        are too large, this bound is lowered. No other point is claimed solved.
+        The residuals are evaluated when the norm of the natural map falls below
+        tol·‖q‖; if they are too large, this bound is lowered. Only a point within 5·tol
+        is claimed solved.
 
-        step : iterate ↦ the next one, or a solution that ends the solve
-        restarted : iterate, x and its gradient ↦ an iterate at x
+        step : iterate ↦ the next iterate, or a solution that ends the loop
+        restarted : iterate, x and the gradient at x ↦ an iterate at x
         """
         qp, tighter = self.qp, 1.0
         size = float(np.linalg.norm(qp.q)) or float(np.linalg.norm(at.g))
@@ -93,7 +95,8 @@ class Problem:
                 self.counts["steps"] += 1
             v = at.x - at.g / at.most
             x = self.project(v)
-            at = restarted(at, x, self.product(x) + qp.q)  # steps only update g
+            # recompute g, which steps only update
+            at = restarted(at, x, self.product(x) + qp.q)
             point = self._point(x, v, at.most)
             worst = kkt_residuals(qp, point).worst
             if worst <= CLAIM_FACTOR * tol:
@@ -103,8 +106,9 @@ class Problem:
                 return _unsolved(point, "no further progress in rounding")
 
     def _point(self, x: Vector, v: Vector, most: float) -> Solution:
-        """Return x with the multipliers L(v − Π(v))."""
-        self.counts["P_products"] += 1  # for the residuals that follow
+        """Return x with the multipliers L(v − Π(v)) and L = most."""
+        # the caller's evaluation of residuals takes one product
+        self.counts["P_products"] += 1
         return Solution(
             status=Status.SOLVED,
             x=x,

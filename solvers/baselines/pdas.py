@@ -1,13 +1,14 @@
-"""Primal-dual active sets: semismooth Newton for bounds and rows.
+"""Primal-dual active set method: semismooth Newton for bounds and rows.
 
 The standard method of the mortar literature (Hintermüller, Ito and Kunisch 2003, SIAM
-J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an
-active set of bounds and inequality rows, a linear system yields x and the multipliers;
-the next active set consists of
+J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an active set of
+bounds and inequality rows, a linear system determines x and the multipliers. The next
+active set consists of the
 
-    active constraints with the right sign of the multiplier, and violated ones,
+    active constraints whose multipliers have the right sign, and violated constraints,
 
-until it no longer changes. Three measures handle QPs on which this fails:
+and the iteration ends when the active set no longer changes. Three extensions handle
+QPs on which this fails:
 
 1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
 
@@ -15,17 +16,18 @@ until it no longer changes. Three measures handle QPs on which this fails:
        active rows,
 
    so that every face has a solution even if P is singular, rows are repeated, or more
-   rows are active than components are free. Once the active set has settled, the centre
-   (x_k, y_k, z_k) moves to the solution, and the factor of that face is used again.
-   δᵢ = 1e-9·Pᵢᵢ is small and ρ = 1e4/(a D⁻¹aᵀ), D = diag P, is large; so the first
-   settled active set is usually the last. If the residuals fall too slowly, ρ grows: a
-   row whose free variables are all stiff needs a larger one.
+   rows are active than components are free. Once the active set no longer changes, the
+   centre (x_k, y_k, z_k) moves to the solution, and the factor of that face is reused.
+   δᵢ = 1e-9·Pᵢᵢ is small, and ρ = 1e4/(a D⁻¹aᵀ) for a row a, with D = diag P, is large;
+   so the active set of the first centre is usually the final one. If the residuals fall
+   too slowly, ρ grows: a row whose free variables are all stiff needs a larger ρ.
 2. Block principal pivoting (Júdice and Pires 1994, Comput. Oper. Res. 21). After ten
    changes of the active set that did not reduce the number of wrong constraints, only
-   the last wrong one changes (Murty's rule), until that number is below its minimum so
-   far. This ends, because the systems of 1. belong to a strictly convex problem.
-3. Certificates of `solvers.baselines.infeasibility_certificate`, tested on the last
-   move of (x_k, y_k, z_k).
+   the last wrong constraint changes (Murty's rule), until that number falls below its
+   previous minimum. This terminates, because the systems of step 1 belong to a strictly
+   convex problem.
+3. After each change of the centre, the difference of the last two centres is tested as
+   a certificate (`solvers.baselines.infeasibility_certificate`).
 """
 
 from __future__ import annotations
@@ -64,11 +66,12 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 )
 from mortarbench.solvers.common.conversion import check_positive
 
-#: Factor of ρ if two moves of the centre have not halved the residuals. With this
+#: Factor of ρ if two changes of the centre have not halved the residuals. With this
 #: growth all of 600 random QPs were solved, without it 522.
 RHO_GROWTH = 100.0
-MAX_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ beyond which ρ no longer grows
-PATIENCE = 10  #: moves of the centre without halved residuals before the solve gives up
+MAX_KAPPA = 1e10  #: value of ρ·aD⁻¹aᵀ beyond which ρ no longer grows
+#: changes of the centre without halving the residuals after which the solve gives up
+PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
 CLAIM_FACTOR = (
     5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
@@ -76,7 +79,7 @@ CLAIM_FACTOR = (
 
 
 class Carry(NamedTuple):
-    """Start of a run: active set and proximal centre."""
+    """Active set and proximal centre from which a run starts."""
 
     active: Active
     centre: Point
@@ -84,17 +87,18 @@ class Carry(NamedTuple):
 
 @dataclass(frozen=True)
 class PDAS:
-    """In-house primal-dual active set method, by Cholesky factors of the faces.
+    """In-house primal-dual active set method with Cholesky factors of the faces.
 
     `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
-    rounding ends the progress, a point with residuals of up to 5·tol is claimed solved.
-    Iterations are linear solves. Counts are factorisations (one per face, plus one if
-    unbounded variables are condensed), changes of single constraints, one-at-a-time
-    exchanges, moves of the proximal centre, and products with P.
+    rounding prevents further progress, a point with residuals of up to 5·tol is claimed
+    solved. Iterations are linear solves. The counts are: factorisations (one per face,
+    plus one if unbounded variables are condensed), constraints that entered or left the
+    active set, steps that exchanged a single constraint, proximal centres, and products
+    with P.
 
     The start is the point of the box nearest to zero, which means no contact in the
     primal and in the dual. (On the duals of contact problems, a start with all
-    variables free took between one solve fewer and seven more.)
+    variables free took from one solve fewer to seven solves more.)
     """
 
     max_iter: int = 5_000
@@ -125,12 +129,15 @@ class PDAS:
         return lambda: run()[0]
 
     def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
-        """Return the function that prepares the linear systems of all faces."""
+        """Return the function that prepares the factorisation of faces."""
         del qp, tol, counts
         return factoriser
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Return the `prepare` of a sequence that reuses the last point and set."""
+        """Return the `prepare` function of a sequence with warm starts.
+
+        Each QP starts from the active set and the proximal centre of the previous one.
+        """
         carry: Carry | None = None
 
         def prepare(qp: QP) -> Callable[[], Solution]:
@@ -168,7 +175,7 @@ class PDAS:
 
 
 def _start(qp: QP, carry: Carry | None) -> Carry:
-    """Return the last active set and point if their sizes fit, else no contact."""
+    """Return `carry` if its sizes fit `qp`, else the point of the box nearest to 0."""
     if carry is not None and [v.size for v in carry.centre] == [
         qp.q.size,
         qp.b.size,
@@ -189,7 +196,7 @@ def _start(qp: QP, carry: Carry | None) -> Carry:
 def _proximal(
     problem: Problem, tol: float, start: Carry, max_iter: int
 ) -> tuple[Solution, Carry | None]:
-    """Move the proximal centre until the KKT residuals are small."""
+    """Update the proximal centre until the KKT residuals are small."""
     qp, counts = problem.qp, problem.counts
     active, centre, solve = start.active, start.centre, None
     slack, best, stalled, kappa = 0.01 * tol, np.inf, 0, KAPPA
@@ -218,14 +225,14 @@ def _proximal(
 
 
 def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Return the reason why no solution exists, if a move of the centre proves it."""
+    """Return why no solution exists if the change (x, y, z) proves it, or None."""
     if proves_infeasible(qp, y, z):
         return "no point meets all constraints"
     return "the objective is unbounded below" if proves_unbounded(qp, x) else None
 
 
 def _point(problem: Problem, run: Run, centre: Point) -> Solution:
-    """Return the point, with the multipliers of its active bounds."""
+    """Return the run's point with the multipliers of its active bounds."""
     counts, (x, y, z) = problem.counts, run.at
     force = DELTA * problem.D * (x - centre.x) - run.gradient
     z = np.maximum(z, 0)
@@ -233,7 +240,7 @@ def _point(problem: Problem, run: Run, centre: Point) -> Solution:
     z_box = np.where(run.active.side > 0, np.maximum(force, 0), z_box)
     fixed = problem.qp.lb == problem.qp.ub
     z_box = np.where(fixed, force, z_box)
-    counts["P_products"] += 1  # of the residuals that follow
+    counts["P_products"] += 1  # the caller's evaluation of residuals takes one product
     other_counts = {k: v for k, v in counts.items() if k != "solves"}
     return Solution(
         status=Status.SOLVED,

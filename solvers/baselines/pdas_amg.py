@@ -1,10 +1,10 @@
-"""Primal-dual active sets whose faces are solved by multigrid: `pdas` without factors.
+"""Primal-dual active set method with multigrid on the faces: `pdas` without factors.
 
-The method is that of `solvers.baselines.pdas`. In each face, conjugate gradients solve
-the Newton system, preconditioned by smoothed aggregation (Vaněk, Mandel and Brezina
-1996, Computing 56; pyamg). A primal QP of elastic bodies has the stiffness of floating
-bodies as P, whose kernel contains the translations; they are the near-kernel of the
-aggregates. Rotations are not used: a QP has no coordinates.
+The method is that of `solvers.baselines.pdas`. On each face, the Newton system is
+solved by conjugate gradients, preconditioned by smoothed aggregation (Vaněk, Mandel and
+Brezina 1996, Computing 56; pyamg). In the primal QP of floating elastic bodies, the
+kernel of the stiffness P contains the translations, which smoothed aggregation uses as
+near-kernel vectors. Rotations are not used, because a QP contains no coordinates.
 """
 
 from __future__ import annotations
@@ -29,22 +29,26 @@ from mortarbench.solvers.baselines.face import (
 )
 from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
-KERNEL_ROUNDING = 1e-8  #: |P t| of a translation t, relative to the row sums of |P|
-#: Residual of conjugate gradients relative to the tolerance. With 1e-3, the number of
-#: solves was the same (13 on beam-ring, 6 on cube-wall/n=16), with 17 to 34 % more
-#: steps.
+#: largest |Pt| of a translation t in the kernel, relative to the largest row sum of |P|
+KERNEL_ROUNDING = 1e-8
+#: Relative residual of conjugate gradients, divided by the tolerance of the QP. With
+#: 1e-3, the number of solves was the same (13 on beam-ring, 6 on cube-wall/n=16), with
+#: 17 to 34 % more CG steps.
 CG_SHARE = 0.1
-MAX_CG = 1000  #: steps per solve; small beam-ring and cube-wall cases take 9 to 80
-COARSEST = 100  #: factorised unknowns; pyamg's default pseudo-inverse took seconds
+#: limit of steps per solve; small beam-ring and cube-wall cases take 9 to 80
+MAX_CG = 1000
+#: largest number of unknowns on the coarsest level, which is factorised: pyamg's
+#: default, a pseudo-inverse, took seconds
+COARSEST = 100
 
 
 @dataclass(frozen=True)
 class PDASAMG(PDAS):
-    """`pdas` with conjugate gradients and algebraic multigrid in the faces.
+    """`pdas` with conjugate gradients and algebraic multigrid on the faces.
 
-    It accepts sparse P. If P does not annihilate translations, constants are the
-    near-kernel. Counts are those of `pdas`, where factorisations are set-ups of
-    multigrid, and the steps of conjugate gradients.
+    P must be sparse. If P does not annihilate translations, the near-kernel vector is
+    constant. The counts are those of `pdas`, where factorisations are multigrid
+    set-ups, and the steps of conjugate gradients.
     """
 
     about: ClassVar[About] = About(
@@ -56,8 +60,8 @@ class PDASAMG(PDAS):
         sequence="active set and point",
         package="pyamg",
         limits=(
-            "rotations are missing in the near-kernel: a QP has no coordinates",
-            "rows that couple several nodes need more steps: 30 to 80 a solve on "
+            "rotations are missing in the near-kernel: a QP contains no coordinates",
+            "rows that couple several nodes need more steps: 30 to 80 per solve on "
             "beam-ring, 9 to 22 on cube-wall",
         ),
     )
@@ -92,9 +96,9 @@ class PDASAMG(PDAS):
 
 
 def _near_kernel(P: Matrix) -> NDArray[np.float64]:
-    """Return the translations (n, d) of d = 3 or 2 components per node, or constants.
+    """Return translations (n, d) of nodes with d = 3 or 2 components, or ones (n, 1).
 
-    Translations are in the kernel of P if its bodies float.
+    Translations are returned if they are in the kernel of P, as for floating bodies.
     """
     n = P.shape[0]
     scale = KERNEL_ROUNDING * abs(P).sum(axis=1).max() if n else 0.0
@@ -120,7 +124,8 @@ def _multigrid(
 
     def face(free: Mask, active: Mask) -> Solve:
         F = M + G[active].T @ (diags_array(rho[active]) @ G[active])
-        # components that are not free stay as uncoupled rows, so that nodes keep d
+        # keep components that are not free as uncoupled rows, so that nodes still have
+        # d rows
         inside = diags_array(1.0 * free)
         F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
         levels = pyamg.smoothed_aggregation_solver(

@@ -4,16 +4,17 @@ With the projection Π on the product of sets,
 
     d = Π(x − αg) − x,   x ← x + td
 
-with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988) for the last step s.
-The line search is nonmonotone: the objective may exceed its last value but not the
-largest of the last M (Birgin, Martínez and Raydan, Nonmonotone spectral projected
-gradient methods on convex sets, SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective
-is quadratic along d, so one product Pd per iteration suffices for line search and α.
+with the gradient g = Px + q and the step length α = sᵀs/sᵀPs of Barzilai and Borwein
+(1988) for the previous step s. The line search for t is nonmonotone: the objective may
+exceed its last value but not the largest of its last M values (Birgin, Martínez and
+Raydan, Nonmonotone spectral projected gradient methods on convex sets, SIAM J. Optim.
+10, 2000, Algorithm 2.2). The objective is quadratic along d, so one product Pd per
+iteration suffices for line search and α.
 
-Alternating with sᵀPs/‖Ps‖² (ABBmin) halves the steps for a string on an obstacle, but
-takes five to twenty times as many on the duals of contact problems.
+If α alternates with sᵀPs/‖Ps‖² (ABBmin), the number of steps is halved for a string on
+an obstacle, but multiplied by five to twenty on the duals of contact problems.
 
-The loop ends by the natural map (`solvers.baselines.natural_map`).
+The stopping test uses the natural map (`solvers.baselines.natural_map`).
 """
 
 from __future__ import annotations
@@ -43,22 +44,22 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 from mortarbench.solvers.baselines.natural_map import Problem
 from mortarbench.solvers.common.conversion import check_positive
 
-SUFFICIENT_DECREASE = 1e-4  #: share of the linear decrease that a step must achieve
+SUFFICIENT_DECREASE = 1e-4  #: fraction of the linear decrease that a step must achieve
 
 
 @dataclass(frozen=True)
 class ProjectedGradient:
     """In-house spectral projected gradient method.
 
-    `tol` bounds the natural map, relative to ‖q‖. If the KKT residuals on the QP are
-    then not within 5·tol, this bound is lowered; no other point is claimed solved. The
-    start is the feasible point nearest to zero, and the first α is that of the exact
-    line search. Iterations are steps; all products with P are counted.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
+    residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
+    claimed solved. The start is the feasible point nearest to zero, and the first α is
+    that of an exact line search. Iterations are steps; all products with P are counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    memory: int = 10  #: M of the line search; 1 is monotone
+    memory: int = 10  #: M of the line search; 1: monotone decrease
     max_iter: int = 50_000
 
     about: ClassVar[About] = About(
@@ -88,8 +89,9 @@ class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
     alpha: float
-    costs: tuple[float, ...]  #: objectives of the last M iterates, minus the first one
-    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if all are zero
+    #: objectives of the last M iterates, minus that of the start
+    costs: tuple[float, ...]
+    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if no curvature was positive
 
 
 def _start(problem: Problem) -> _State:
@@ -97,7 +99,7 @@ def _start(problem: Problem) -> _State:
     lower, upper = hull(qp.sets, qp.q.size)
     x = problem.project(np.zeros(qp.q.size))
     g = problem.product(x) + qp.q
-    # without the components that leave a bound at once
+    # omit the components whose descent direction points out of the box
     d = np.where(((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)), 0.0, -g)
     curvature = float(d @ problem.product(d))
     alpha = float(d @ d) / curvature if curvature > 0 else 1.0
@@ -105,13 +107,14 @@ def _start(problem: Problem) -> _State:
 
 
 def _step(problem: Problem, memory: int, s: _State) -> _State | Solution:
-    """Return the next iterate; the objective at x + td is f + t·gᵀd + t²/2·dᵀPd."""
+    """Return the next iterate, or a `Solution` if the objective is unbounded below."""
     d = problem.project(s.x - s.alpha * s.g) - s.x
     w = problem.product(d)
     slope, curvature, square = float(s.g @ d), float(d @ w), float(d @ d)
     rise, t = max(s.costs) - s.costs[-1], 1.0
     if slope + curvature / 2 > rise + SUFFICIENT_DECREASE * slope:
-        t = -slope / curvature  # the minimiser along d always decreases enough
+        # the minimiser along d always satisfies the decrease condition
+        t = -slope / curvature
     cost = s.costs[-1] + t * slope + t * t / 2 * curvature
     curved = curvature > 1e-15 * np.sqrt(square * float(w @ w))
     alpha = square / curvature if curved else s.alpha

@@ -1,8 +1,8 @@
-"""Backends of qpsolvers and cvxpy, listed without importing these libraries.
+"""Lists of the backends of qpsolvers and cvxpy, without importing these libraries.
 
-Importing either library imports every installed backend, which takes a second. So the
-backends are listed from the files of the library's own adapters, and the packages that
-a backend needs from the import statements in these files.
+Importing either library imports every installed backend, which takes a second. The
+backends are therefore listed from the adapter files inside the library, and the
+packages that a backend needs from the import statements in its adapter file.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 class Call:
     """Keyword arguments and scaling for one backend of a solver library."""
 
-    tolerances: tuple[str, ...] = ()  #: keywords set to max(tighter·tol, floor)
+    #: keywords to which max(tighter·tol, floor) is passed
+    tolerances: tuple[str, ...] = ()
     fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords
     size: float = OBJECTIVE_SIZE  #: ‖q‖∞ after the scaling of the objective
     tighter: float = 1.0
@@ -35,13 +36,13 @@ class Call:
 
 
 def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
-    """Return the adapter file of each backend, by the name in the file's name.
+    """Return the path of each backend's adapter file, keyed by the backend's name.
 
     Parameters
     ----------
     library : name of a package; the result is empty if it is not installed
     pattern : glob of the adapter files, relative to the package
-    suffix : end of their names after the backend's name, e.g. "_.py" in "osqp_.py"
+    suffix : part of the file name after the backend's name, e.g. "_.py" in "osqp_.py"
 
     """
     spec = find_spec(library)
@@ -59,8 +60,8 @@ def reason_unavailable(
 ) -> str | None:
     """Return the reason why a backend cannot be used, or None.
 
-    The result is also None if the library itself is not installed, because its import
-    raises in `prepare`.
+    None is also returned if the library itself is not installed; `prepare` then raises
+    ImportError.
 
     files : result of `adapter_files`
     """
@@ -76,7 +77,7 @@ def reason_unavailable(
 
 
 def _missing_packages(adapter: Path) -> list[str]:
-    """Return the packages that an adapter file imports and that are not installed."""
+    """Return the packages that an adapter file imports but that are not installed."""
     return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 

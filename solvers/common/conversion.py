@@ -1,8 +1,9 @@
 """Conversion between QPs and the forms of solver libraries: matrices and multipliers.
 
-Libraries take a QP in one of two forms, for which multipliers are converted back:
-`two_sided`, low ≤ Rx ≤ high, and `to_cone`, Rx + s = r with s in a product of cones.
-Without discs and cones, the second form is Rx = r (first rows) and Rx ≤ r.
+Libraries accept constraints in one of two forms, with rows R: `two_sided`, low ≤ Rx ≤
+high, and `to_cone`, Rx + s = r with the slack s in a product of cones. The multipliers
+of these rows are converted to those of the QP. Without discs and cones, the second form
+consists of equations Rx = r, followed by inequalities Rx ≤ r.
 """
 
 from __future__ import annotations
@@ -21,21 +22,21 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
-#: absolute tolerance for solvers that test a residual against absolute + relative·size,
-#: so small that the relative tolerance decides
+#: absolute tolerance for solvers that require residual ≤ absolute + relative·size; so
+#: small that the relative tolerance decides
 NEGLIGIBLE = 1e-14
-#: convex sets that have rows in second-order cones
+#: types of sets that have a conic form
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
-#: ‖x‖∞ of a claimed solution beyond which it counts as diverged: the terms of the
-#: residuals are then so large that every relative residual is small
+#: a claimed solution with a larger ‖x‖∞ counts as diverged: the terms of its residuals
+#: are so large that every relative residual is small
 DIVERGED = 1e12
-#: ‖q‖∞ for solvers that compare with max(1, size): with sizes of about 1e4 the 1 has no
-#: effect, and their tests are relative, like the tests of the harness
+#: ‖q‖∞ after scaling, for solvers that compare residuals with max(1, size): at sizes of
+#: about 1e4 the 1 has no effect, so their tests are relative, like those of the harness
 OBJECTIVE_SIZE = 1e4
 
 
 def needs_dense(qp: QP, copies: float) -> str | None:
-    """Return the reason to decline a `qp` whose dense matrices do not fit, or None.
+    """Return the reason to decline `qp` if its dense matrices are too large, or None.
 
     copies : number of dense matrices of the size of P that the solver stores at once
     """
@@ -43,9 +44,10 @@ def needs_dense(qp: QP, copies: float) -> str | None:
 
 
 def needs_independent_rows(qp: QP) -> str | None:
-    """Return the reason to decline a `qp` with dependent equality rows, or None."""
-    # the singular values of AAᵀ are those of A squared, so rows that are dependent to
-    # half of the digits count as dependent
+    """Return the reason to decline `qp` if its equality rows are dependent, or None."""
+    # AAᵀ has the squared singular values of A, so rows count as dependent if the
+    # smallest singular value of A, relative to the largest, is below about √(machine
+    # precision)
     gram = dense(csc(qp.A) @ csc(qp.A).T)
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
@@ -55,7 +57,7 @@ def needs_independent_rows(qp: QP) -> str | None:
 def csc(M: Matrix) -> csc_matrix:
     """Return a writable csc_matrix copy with sorted indices and no duplicates.
 
-    A csc_array would not do: OSQP warns about it, and qpsolvers takes it for dense.
+    A csc_array is unsuitable: OSQP warns about it, and qpsolvers treats it as dense.
     """
     copy = csc_matrix(M, dtype=np.float64, copy=True)
     copy.sum_duplicates()
@@ -68,19 +70,19 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`, or for "auto" the storage of P: "dense" or "sparse"."""
+    """Return `backend`; for "auto", return how P is stored, "dense" or "sparse"."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
 
 
 def has_bound(qp: QP) -> NDArray[np.bool_]:
-    """Return the mask (n,) of variables with a finite bound."""
+    """Return the mask (n,) of variables with at least one finite bound."""
     return np.isfinite(qp.lb) | np.isfinite(qp.ub)
 
 
 def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
-    """Return R, low, high of low ≤ Rx ≤ high: rows of A, of G, of bounded variables."""
+    """Return R, low, high with low ≤ Rx ≤ high: rows of A, G and bounded x_j."""
     box = has_bound(qp)
     rows = vstack([csc(qp.A), csc(qp.G), eye_array(qp.q.size, format="csr")[box]])
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf), qp.lb[box]])
@@ -88,7 +90,7 @@ def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
 
 
 def from_two_sided(qp: QP, v: Vector) -> dict[str, Any]:
-    """Return y, z and z_box for multipliers of `two_sided` rows, ≥ 0 at `high`."""
+    """Return y, z and z_box for multipliers v of `two_sided` rows (v ≥ 0 at `high`)."""
     m, p = qp.b.size, qp.h.size
     z_box = np.zeros(qp.q.size)
     z_box[has_bound(qp)] = v[m + p :]
@@ -108,18 +110,19 @@ def to_two_sided(qp: QP, s: Solution) -> Vector:
 class ConicForm:
     """Constraints of a QP as  Rx + s = r  with s in a product of cones.
 
-    The components of s are zero (rows of A, and variables that a set fixes at 0), then
-    nonnegative (rows of G, x ≤ ub, −x ≤ −lb), then blocks (t, w) with ‖w‖ ≤ t, one for
-    each disc, s = (radius, x_I), and each cone, s = (slope·x_N, x_T). The multiplier v
-    of these rows is in the dual cone, and  P x + q + Rᵀv = 0  at a solution.
+    The first components of s are zero (rows of A, and variables that a set fixes at 0).
+    The next ones are nonnegative (rows of G, x ≤ ub, −x ≤ −lb). The last ones are
+    blocks (t, w) with ‖w‖ ≤ t: (radius, x_I) for a disc of variables I, and (slope·x_N,
+    x_T) for a cone with normal and tangential components x_N and x_T. The vector v of
+    multipliers of the rows is in the dual cone, and Px + q + Rᵀv = 0 at a solution.
     """
 
     qp: QP
     rows: csc_matrix  #: R
     rhs: Vector  #: r
-    equalities: int  #: rows with s = 0
-    inequalities: int  #: rows with s ≥ 0
-    cones: NDArray[np.int64]  #: numbers of rows of the second-order cones
+    equalities: int  #: number of rows with s = 0
+    inequalities: int  #: number of rows with s ≥ 0
+    cones: NDArray[np.int64]  #: number of rows of each second-order cone
 
     @property
     def linear(self) -> int:
@@ -128,17 +131,17 @@ class ConicForm:
 
     @property
     def heads(self) -> NDArray[np.int64]:
-        """First row of each second-order cone."""
+        """Index of the first row, t, of each second-order cone."""
         heads: NDArray[np.int64] = self.linear + np.cumsum(self.cones) - self.cones
         return heads
 
     @property
     def tails(self) -> NDArray[np.int64]:
-        """Rows of second-order cones other than `heads`, block by block."""
+        """Indices of the rows of second-order cones other than `heads`, ascending."""
         return np.setdiff1d(np.arange(self.linear, self.rhs.size), self.heads)
 
     def multipliers(self, v: Vector) -> dict[str, Any]:
-        """Return y, z and z_box for multipliers of the rows."""
+        """Return y, z and z_box for the multipliers v of the rows."""
         m, p, first = self.qp.b.size, self.qp.h.size, self.equalities
         is_row_of_set = np.ones(v.size, dtype=bool)
         is_row_of_set[:m] = is_row_of_set[first : first + p] = False
@@ -152,7 +155,8 @@ class ConicForm:
     def point(self, s: Solution) -> tuple[Vector, Vector, Vector]:
         """Return x, the multipliers v of the rows, and a slack in the cones."""
         qp, first, last = self.qp, self.equalities, self.linear
-        # rows of sets hold ±x_j and slope·x_j
+        # A row of a set has a single entry, ±1 or −slope, so this is the multiplier
+        # times the square of the entry. The head row of a disc is empty.
         v = self.rows @ s.z_box
         squares = np.ravel(self.rows.multiply(self.rows).sum(axis=1))[self.heads]
         apex = np.divide(v[self.heads], squares, where=squares > 0, out=0 * squares)
@@ -166,7 +170,7 @@ class ConicForm:
         return s.x.copy(), v, slack
 
     def _lengths(self, v: Vector) -> Vector:
-        """Return ‖w‖ of each second-order cone."""
+        """Return ‖w‖ for the tail w of v in each second-order cone."""
         owner = np.repeat(np.arange(self.cones.size), self.cones - 1)
         lengths: Vector = np.sqrt(
             np.bincount(owner, v[self.tails] ** 2, self.cones.size)
@@ -175,10 +179,11 @@ class ConicForm:
 
 
 def to_cone(qp: QP) -> ConicForm:
-    """Return the constraints of a QP as rows in cones.
+    """Return the constraints of a QP in conic form.
 
-    A disc of radius 0 has equality rows, since its second-order cone has no interior,
-    and interior-point methods would fail. A cone of slope 0 has rows x_T = 0, x_N ≥ 0.
+    A disc of radius 0 becomes equality rows: a second-order cone would leave no
+    interior, and interior-point methods would fail. A cone of slope 0 becomes rows x_T
+    = 0 and x_N ≥ 0.
     """
     up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
     eye = eye_array(qp.q.size, format="csr")
@@ -200,22 +205,23 @@ def to_cone(qp: QP) -> ConicForm:
 
 
 class _ConicBlocks(NamedTuple):
-    """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]."""
+    """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]  for i < k."""
 
-    tail: NDArray[np.int64]  #: (k, d)
+    #: (k, d) indices of the variables bounded in norm, for each block
+    tail: NDArray[np.int64]
     side: Vector  #: (k,)
     head: NDArray[np.int64]  #: (k,)
-    slope: Vector  #: (k,) zero without heads
-    has_head: bool  #: False for discs
+    slope: Vector  #: (k,) zero for discs
+    has_head: bool  #: False for discs, whose `head` is unused
 
     @property
     def is_flat(self) -> NDArray[np.bool_]:
-        """Mask (k,) of blocks whose right-hand side is zero at all x."""
+        """Mask (k,) of the blocks whose right-hand side is zero for every x."""
         flat: NDArray[np.bool_] = (self.side == 0) & (self.slope == 0)
         return flat
 
     def rows(self, n: int) -> tuple[csr_array, Vector]:
-        """Return R, r with r − Rx = (side + slope·x_head, x_tail) block by block."""
+        """Return R, r with blocks r − Rx = (side + slope·x_head, x_tail), not flat."""
         tail, side, head, slope = (part[~self.is_flat] for part in self[:4])
         k, d = tail.shape
         first = np.arange(k) * (d + 1)
@@ -240,12 +246,12 @@ def _conic_blocks(one: ConvexSet) -> _ConicBlocks:
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
-    """Concatenate integers of all parts."""
+    """Flatten and concatenate integer arrays."""
     return np.concatenate([np.empty(0, np.int64), *(part.ravel() for part in parts)])
 
 
 def same_cones(one: QP, other: QP) -> bool:
-    """Return True if the sets beside bounds have the same rows in conic form."""
+    """Return True if both QPs have bounds only or conic forms with equal rows."""
     if len(one.sets) == len(other.sets) == 1:
         return True
     R, S = to_cone(one), to_cone(other)
@@ -257,15 +263,15 @@ def same_cones(one: QP, other: QP) -> bool:
 
 
 def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
-    """Return the factor of the objective that makes ‖q‖∞ = `size`; 1 if q = 0."""
+    """Return the factor that scales the objective to ‖q‖∞ = `size`; 1 if q = 0."""
     return float(size / (np.abs(qp.q).max(initial=0.0) or size))
 
 
 def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
     """Return z_box (n,) with zeros for multipliers of absent bounds.
 
-    Solvers may return rounding errors there. Larger values appear as a residual of
-    stationarity in the harness.
+    Solvers may return rounding errors as such multipliers. If a larger value is set to
+    zero, the harness measures it as a residual of stationarity.
     """
     return admissible(qp.sets, z_box)
 

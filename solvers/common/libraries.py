@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: packages that adapters call, and packages that these use: backends and factorisations
+#: packages called by adapters, and their backends and factorisation libraries
 PACKAGES = (
     "clarabel", "cvxopt", "cvxpy", "daqp", "ecos", "highspy", "highspy-extras", "osqp",
     "piqp", "proxsuite", "py-mkl-pardiso", "pyamg", "qoco", "qpalm", "qpsolvers",

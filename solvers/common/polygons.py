@@ -1,4 +1,4 @@
-"""Polygons in place of discs and friction cones, for solvers that take rows only."""
+"""Polygons in place of discs and friction cones, for solvers without such sets."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonalQP:
-    """Approximation of a QP by another one, with polygons in place of circles."""
+    """Approximation of a QP in which polygons replace discs and sections of cones."""
 
-    qp: QP  #: QP with rows of G for the sides of polygons instead of discs and cones
-    #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius
+    qp: QP  #: QP whose G has a row for each side of a polygon, without discs and cones
+    #: 1 − cos(π/k) for k sides: a polygon contains the disc of (1 − error)·radius
     error: float
-    #: maps a point of `qp` to the original QP; `z_box` is then normal to the polygons,
-    #: not to the circles, and the residuals show the error
+    #: maps a point of `qp` to a point of the original QP. Its `z_box` is normal to the
+    #: polygons, not to the circles, so its residuals on the original QP show the error
     recover: Callable[[Solution], Solution]
 
 
 def polygonal(qp: QP, sides: int) -> PolygonalQP:
     """Replace discs and friction cones by inscribed regular polygons and pyramids.
 
-    Points of the new QP are feasible in the original. With the normals n_j of the k
-    sides, a disc becomes  n_jᵀx ≤ radius·cos(π/k),  and a cone  n_jᵀx_T ≤
+    Every feasible point of the new QP is feasible in the original one. With the normals
+    n_j of the k sides, a disc becomes  n_jᵀx ≤ radius·cos(π/k),  and a cone  n_jᵀx_T ≤
     slope·cos(π/k)·x_N  with x_N ≥ 0.
 
     sides : k, the number of sides of each polygon
@@ -41,8 +41,8 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
     Raises
     ------
     InputError
-        If `sides` is not an integer from 3 to 10 000, or a disc or the
-        tangential part of a cone does not have two variables.
+        If `sides` is not an integer from 3 to 10 000, or if a disc or the tangential
+        part of a cone does not have exactly two variables.
 
     Examples
     --------
@@ -79,7 +79,7 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
 
 
 def _sides(one: ConvexSet, sides: int, n: int) -> tuple[csr_array, Vector]:
-    """Return R, r of the sides Rx ≤ r of all polygons of a set."""
+    """Return R, r such that Rx ≤ r are the sides of all polygons of a set."""
     if isinstance(one, Discs):
         tangents, radius, slope = one.index, one.radius, 0 * one.radius
     elif isinstance(one, Cones):

@@ -1,4 +1,4 @@
-"""Sequences of QPs: one solver object, updated or restarted from the last point."""
+"""Sequences of QPs: solver objects that are updated or start from the last point."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from mortarbench.solvers.common.conversion import same_cones
 
 
 class Session(NamedTuple):
-    """Solver object of a library, set up for one QP, as four operations."""
+    """Operations on a library's solver object that has been set up for one QP."""
 
     solve: Callable[[], Solution]
-    #: replace the vectors of the QP; matrices and the places of bounds are unchanged.
-    #: None: every QP needs a new session
+    #: replace the vectors of the QP, whose matrices and set of bounded variables are
+    #: unchanged; None if every QP needs a new session
     update: Callable[[QP], None] | None = None
-    #: start the next solve from this point; None: the library takes no start
+    #: start the next solve from this point; None if the library accepts no starting
+    #: point
     start: Callable[[Solution], None] | None = None
-    #: change the tolerance of all later solves; None: that needs a new session
+    #: change the tolerance of all later solves; None if this requires a new session
     tighten: Callable[[float], None] | None = None
 
 
 def chain(
     begin: Callable[[QP, float], Session], tol: float
 ) -> Callable[[QP], Callable[[], Solution]]:
-    """Return the `prepare` of a sequence whose QPs are all solved to `tol`."""
+    """Return the `prepare` function for a sequence of QPs, all solved to `tol`."""
     prepare = tightening(begin)
     return lambda qp: prepare(qp, tol)
 
@@ -35,13 +36,13 @@ def chain(
 def tightening(
     begin: Callable[[QP, float], Session],
 ) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Return the `prepare` of a sequence in which each QP has its own tolerance.
+    """Return the `prepare` function for a sequence with a tolerance for each QP.
 
-    If only vectors changed since the last QP, the session is updated, and libraries
-    that support it start from their last point. Otherwise `begin` creates a new
-    session, which starts from the last point if the library accepts a start and the
-    point has the right shape. A new tolerance also requires a new session, unless the
-    session has `tighten`.
+    If only vectors have changed since the last QP, the session is updated, and a
+    library that supports warm starts continues from its last point. Otherwise `begin`
+    creates a new session, which starts from the last point if the library accepts a
+    start and the point has the right shape. A new tolerance also requires a new
+    session, unless the session has `tighten`.
     """
     session: Session | None = None
     session_qp: QP
@@ -78,9 +79,9 @@ def tightening(
 
 
 def only_vectors_differ(one: QP, other: QP) -> bool:
-    """Return True if two QPs have equal matrices and bounds at the same places.
+    """Return True if two QPs have equal matrices and bounds on the same variables.
 
-    Sets may differ in right-hand sides of their conic rows only.
+    Discs and cones may differ only in the right-hand sides of their conic rows.
     """
     matrices = ((one.P, other.P), (one.A, other.A), (one.G, other.G))
     bounds = ((one.lb, other.lb), (one.ub, other.ub))
@@ -100,8 +101,9 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
-    """Return True if a point is finite and has the shape of `qp`, bounds included."""
-    # bounds at other places would shift the multipliers of conic rows
+    """Return True if the point `s` of the QP `earlier` can be a start for `qp`."""
+    # bounds on other variables would shift the rows of the conic form, and with them
+    # the multipliers
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))

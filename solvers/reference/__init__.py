@@ -1,1 +1,1 @@
-"""Reference solves, which share no code with the solvers under test."""
+"""Reference solves, computed without code of the solvers under test."""

@@ -1,11 +1,10 @@
 """Equilibration: scaling of variables and rows that is independent of units.
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
-largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). One factor of x
-relative to y and z remains free; it is chosen so that the largest entry of P is about
-one, for every unit of the objective. All factors are powers of two, so no entry is
-rounded, and a point of the scaled QP equals a point of the original one to the last
-digit.
+largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). This leaves the
+scale of x relative to that of y and z free; it is chosen so that the largest entry of P
+is about one, whatever the unit of the objective. All factors are powers of two, so that
+neither the data nor the points that are scaled back are rounded.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from scipy.sparse import csc_array, diags_array
 from mortarbench.harness import QP, Box, Matrix, Solution, Vector
 from mortarbench.harness.sets.blocks import Blocks
 
-#: rounds of scaling; entries whose units differ by factors of 1e±12 need fewer
+#: limit of scaling rounds; fewer suffice for entries whose units differ by 1e±12
 ROUNDS = 20
 Exponents = NDArray[np.int64]
 
@@ -34,16 +33,17 @@ class ScaledQP:
     H: Vector  #: (p,)
 
     def recover(self, s: Solution) -> Solution:
-        """Return the point of the original QP for a point of the scaled one."""
+        """Return the point of the original QP that corresponds to a scaled point."""
         return replace(
             s, x=s.x * self.D, y=s.y * self.E, z=s.z * self.H, z_box=s.z_box / self.D
         )
 
 
 def equilibrate(qp: QP) -> ScaledQP:
-    """Scale a QP with an explicit P; its matrices become dense if P is, else sparse.
+    """Scale a QP with an explicit P; all matrices become dense if P is, else sparse.
 
-    Its sets other than bounds are of blocks, which are scaled evenly.
+    Sets other than bounds must consist of blocks of variables; the variables of a block
+    receive a common scale.
     """
     store = _dense if isinstance(qp.P, np.ndarray) else _sparse
     P, A, G = (store(M) for M in (qp.P, qp.A, qp.G))
@@ -52,7 +52,7 @@ def equilibrate(qp: QP) -> ScaledQP:
     for _ in range(ROUNDS):
         P_, A_, G_ = _times(d, P, d), _times(e, A, d), _times(h, G, d)
         columns = np.maximum.reduce([_largest(M, 0) for M in (P_, A_, G_)])
-        for one in blocks:  # their variables have a common scale
+        for one in blocks:  # one scale for all variables of a block
             columns[one.index] = columns[one.index].max(axis=1, keepdims=True)
         changes = [_root(v) for v in (columns, _largest(A_, 1), _largest(G_, 1))]
         if not any(c.any() for c in changes):
@@ -113,6 +113,6 @@ def _largest(M: Matrix, axis: int) -> Vector:
 
 
 def _root(largest: Vector) -> Exponents:
-    """Return log₂(1/√largest), rounded to an integer; 0 for an empty row."""
+    """Return log₂(1/√largest), rounded to an integer; 0 for zero, inf and NaN."""
     filled = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
     return np.rint(-0.5 * np.log2(filled)).astype(np.int64)

@@ -1,20 +1,22 @@
-"""Primal-dual interior-point method, the first stage of the reference solve.
+"""Primal-dual interior-point method, which computes the start for refinement.
 
-Mehrotra's predictor and corrector for  min ½xᵀPx + qᵀx,  Ax = b,  Cx + s = d,  s ≥ 0
+Mehrotra's predictor-corrector method for  min ½xᵀPx + qᵀx,  Ax = b,  Cx + s = d,  s ≥ 0
 (Nocedal and Wright 2006, Numerical Optimization, ch. 16.6; Gertz and Wright 2003, ACM
-Trans. Math. Softw. 29), with C the rows of G and of the finite bounds. A step solves
+Trans. Math. Softw. 29), where C contains the rows of G and of the finite bounds. With
+the diagonal matrix S/Z of sᵢ/zᵢ and the centring parameter σ, a step solves
 
     [P + δ  Aᵀ   Cᵀ ] [dx]   [−(Px + q + Aᵀy + Cᵀz)  ]
     [A      −δ      ] [dy] = [−(Ax − b)              ],  ds = −(Cx + s − d) − C dx,
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
-for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). A step covers 0.995
-of the distance to the boundary, with a common length for x, y, z and s. A disc is the
-smooth constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the current x, and its
-multiplier adds z/r to the diagonal of P. δ is the parameter
-of a proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio
-2021, Comput. Optim. Appl. 78): the solutions do not depend on it, and P may be singular
-and rows may be linearly dependent.
+for r_sz = sz (predictor), then for r_sz = sz + ds dz − σμ (corrector), with
+componentwise products and μ = sᵀz/(number of rows of C). A step covers 0.995 of the
+distance to the boundary of s, z ≥ 0, with a common length for x, y, z and s. A disc
+‖x_I‖ ≤ r is the smooth constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the
+current x, and its multiplier adds z/r to the diagonal of P. δ is the parameter of a
+proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio 2021,
+Comput. Optim. Appl. 78). The solution does not depend on δ, which permits a singular P
+and linearly dependent rows.
 """
 
 from __future__ import annotations
@@ -40,17 +42,19 @@ from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
-DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
+DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
 #: KKT residual at which the iteration ends: small enough to identify the active
-#: constraints, which `polish` then takes as equations
+#: constraints, which `polish` then treats as equations
 STOP_RESIDUAL = 1e-11
 MAX_ITERATIONS = 100
-PATIENCE = 12  #: iterations without a halved residual after which it ends
-BOUNDARY_FRACTION = 0.995  #: share of the distance to the boundary that a step covers
+#: number of iterations without halving the residual after which the loop ends
+PATIENCE = 12
+#: fraction of the distance to the boundary that a step covers
+BOUNDARY_FRACTION = 0.995
 
 
 class Iterate(NamedTuple):
-    """Point with s, z > 0."""
+    """Point with multipliers y, z and slacks s, where s, z > 0."""
 
     x: Vector
     y: Vector
@@ -60,7 +64,7 @@ class Iterate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """QP with rows of A for fixed variables; C stacks discs, G, upper, lower bounds."""
+    """QP with rows of A for fixed variables; C stacks discs, G and bounds."""
 
     qp: QP
     A: Matrix
@@ -71,22 +75,23 @@ class _Problem:
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
     discs: tuple[Discs, ...]  #: discs of positive radius
-    #: factorises [P + D Bᵀ; B −W], B = [A; rows of discs; G]
+    #: maps the rows of discs and G to a function that factorises [P + D Bᵀ; B −W] with
+    #: B = [A; these rows]
     saddle: Callable[[Matrix], Factorise]
     delta: float
 
     @property
     def rows(self) -> int:
-        """Number of rows of discs and G."""
+        """Number of discs plus number of rows of G."""
         return int(self.qp.h.size) + sum(len(one.index) for one in self.discs)
 
     def C(self, x: Vector) -> Vector:
-        """Return Cx, and ‖x_I‖²/2r of discs."""
+        """Return ‖x_I‖²/2r for the discs, then Cx for the other rows."""
         of_discs = [norms(x[one.index]) ** 2 / one.radius / 2 for one in self.discs]
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs and G at x, and the diagonal that discs add to P."""
+        """Return the rows of discs (at x) and G, and what discs add to diag P."""
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:
@@ -110,7 +115,7 @@ class _Problem:
         return start
 
     def factorise(self, w: Vector, rows: Matrix, curvature: Vector) -> Solve:
-        """Factorise the system of a step with diag(w) = S/Z; return its solve.
+        """Factorise the system of a step, diag(w) = S/Z; return the solution operator.
 
         The rows of bounds are eliminated: they add 1/w to the diagonal of P.
 
@@ -133,7 +138,7 @@ class _Problem:
         return solve_all
 
     def solution(self, at: Iterate) -> Solution:
-        """Return the iterate as a point of the QP."""
+        """Return the iterate as a solution of the QP, with the multipliers z_box."""
         m, p = self.qp.b.size, self.rows
         _, curvature = self.at(at.x, at.z)
         z_box = curvature * at.x  # multipliers of discs
@@ -149,13 +154,13 @@ class _Problem:
         )
 
 
-@np.errstate(all="ignore")  # a divergent residual is not finite and ends the loop
+@np.errstate(all="ignore")  # a residual that overflows is not finite and ends the loop
 def interior_point(qp: QP, delta: float = DELTA) -> Solution:
-    """Return the iterate with the smallest KKT residual.
+    """Run the interior-point method; return the iterate with the smallest KKT residual.
 
     The slacks and multipliers of all inequalities are positive. The constants suit a
-    QP whose largest entries are about one (`equilibrate`). Nothing is raised if there
-    is no solution; the caller checks the residual.
+    QP whose largest entries are about one (`equilibrate`). No exception is raised if
+    the QP has no solution; the caller checks the residual.
     """
     problem = _problem(qp, delta)
     best, least, stalled = Solution.without_point(qp, Status.FAILED), np.inf, 0
@@ -170,7 +175,7 @@ def interior_point(qp: QP, delta: float = DELTA) -> Solution:
             if least <= STOP_RESIDUAL or stalled == PATIENCE or not np.isfinite(worst):
                 break
             at = _step(problem, at)
-    except ArithmeticError:  # the next system is singular: return the best iterate
+    except ArithmeticError:  # a system is singular: return the best iterate
         pass
     return best
 
@@ -214,14 +219,14 @@ def _problem(qp: QP, delta: float) -> _Problem:
 
 
 def _stacked(A: Matrix, rows: Matrix) -> Matrix:
-    """Stack rows below A, dense if A is."""
+    """Stack rows below A; the result is dense if A is dense."""
     if isinstance(A, np.ndarray):
         return np.vstack([A, rows.toarray() if issparse(rows) else rows])
     return vstack([A, rows])
 
 
 def _start(problem: _Problem) -> Iterate:
-    """Minimise with ½|Cx − d|² in place of Cx ≤ d, then shift s and z to be positive.
+    """Minimise with ½‖Cx − d‖² in place of Cx ≤ d; shift s and z to be positive.
 
     Source: Vandenberghe (2010), The CVXOPT linear and quadratic cone program solvers,
     section 5.3.
@@ -234,15 +239,14 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    for (
-        one
-    ) in problem.discs:  # far outside, slacks would shrink before x is near the disc
+    # from far outside a disc, its slack would shrink before x is near it
+    for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)
 
 
 def _step(problem: _Problem, at: Iterate) -> Iterate:
-    """Return the next iterate: predictor, centring and corrector."""
+    """Return the next iterate, after a predictor and a centring corrector."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
     rows, curvature = problem.at(x, z)
@@ -267,6 +271,6 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
 
 
 def _step_length(at: Iterate, step: Iterate) -> float:
-    """Return the longest step that keeps s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
+    """Return the longest step length with s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
     lengths = [-v[dv < 0] / dv[dv < 0] for v, dv in ((at.s, step.s), (at.z, step.z))]
     return float(np.concatenate(lengths).min(initial=1 / BOUNDARY_FRACTION))

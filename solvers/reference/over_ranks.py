@@ -1,27 +1,29 @@
-"""Reference solve of duals distributed over MPI ranks: active sets, CG on each face.
+"""Reference solve of duals distributed over MPI ranks: active sets with CG on faces.
 
 Minimises ½xᵀFx + qᵀx subject to Gx = e, l ≤ x ≤ u and ‖x_I‖ ≤ r on discs, with the
 components of x distributed over the ranks (`harness.distributed`). The equality rows
 must be linearly independent on the components without bounds, as they are if all bodies
 are supported.
 
-1. On a face, with the components 𝒜 fixed at a bound, x_𝓕 solves a linear system:
-   projected preconditioned conjugate gradients, 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted
-   from the true residual until only rounding remains (iterative refinement). A disc on
-   whose boundary x is, with the normal vector z_I = ηx_I, is linearised there, as in
-   Newton's method: nᵀx_I = r with its outward normal n, and x_I moves along the
-   tangents, on which η is added to F, the curvature of the boundary.
+1. On a face, some components are fixed at bounds, and the free components x_𝓕 solve a
+   linear system. It is solved by projected preconditioned conjugate gradients with the
+   projector 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted from the true residual until only
+   rounding remains (iterative refinement). If x is on the boundary of a disc, with the
+   multipliers z_I = ηx_I, the disc is linearised there, as in Newton's method: with the
+   outward normal n, nᵀx_I = r, and x_I varies along the tangents, on which the
+   curvature of the boundary adds η to F.
 2. Primal-dual active sets (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13):
-   components with a multiplier of the wrong sign are freed, components beyond a bound
-   are fixed there. The same for discs, whose n and η are those of w = x_I + γz_I (for
-   friction: Hüeber, Stadler and Wohlmuth 2008, SIAM J. Sci. Comput. 30). The sets may
-   cycle. After ten changes in a row that did not reduce the number of wrong components,
-   only the last wrong one changes, until there are fewer (block principal pivoting,
-   Júdice and Pires 1994, Comput. Oper. Res. 21, which ends after finitely many changes
-   if there are no discs).
+   components with a multiplier of the wrong sign are freed, and components beyond a
+   bound are fixed there. Discs are treated likewise, with n and η computed from
+   w = x_I + γz_I (for friction: Hüeber, Stadler and Wohlmuth 2008, SIAM J. Sci. Comput.
+   30). The active sets may cycle. After ten consecutive changes that did not reduce the
+   number of wrong components, only the last wrong component changes, until there are
+   fewer of them (block principal pivoting, Júdice and Pires 1994, Comput. Oper. Res.
+   21). Without discs, this ends after finitely many changes.
 
-The result is the solution, to about rounding, for the active set that both signs
-confirm. It is computed without any of the solvers under test.
+The result is the solution, up to about rounding, for an active set that has no
+multiplier of the wrong sign and no violated bound. None of the solvers under test is
+used.
 """
 
 from __future__ import annotations
@@ -42,18 +44,19 @@ from mortarbench.harness.sets.blocks import norms
 Mask = NDArray[np.bool_]
 
 MAX_FACES = 300
-#: changes of the active set, without fewer wrong components, before single exchanges
+#: number of consecutive changes of the active set that may fail to reduce the number of
+#: wrong components; after these, single components change
 PATIENCE = 10
-CG_REDUCTION = 1e-6  #: factor of the projected residual in each round of CG
-MAX_CG_ROUNDS = 3  #: rounds of CG on a face
-MAX_CG_STEPS = 300  #: steps of CG in a round
-#: projected residual, relative to the projected q, that is not refined further
+CG_REDUCTION = 1e-6  #: reduction of the projected residual in each round of CG
+MAX_CG_ROUNDS = 3  #: limit of CG rounds on a face
+MAX_CG_STEPS = 300  #: limit of CG steps in a round
+#: CG ends at this norm of the projected residual, relative to that of the projected q
 ROUNDING_RESIDUAL = 1e-14
 #: Multipliers of the wrong sign and violations of bounds count as rounding below this
 #: value, relative to the largest multiplier or component.
 SIGN_ROUNDING = 1e-12
-#: angle between x and the normal at which a disc was linearised, in radians: Newton's
-#: method then leaves an error of its square
+#: largest final angle in radians between x and the normal at which a disc was
+#: linearised; the remaining error of Newton's method is about its square
 MAX_TURN = 1e-7
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 
@@ -61,15 +64,16 @@ MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     """Solve a distributed dual to about rounding; collective over all ranks.
 
-    qp : this rank's share of the dual
-    start : solution of a dual that differs in its bounds only; its active set is tried
+    qp : the dual, with the local components of this rank
+    start : solution of a dual that differs only in its bounds; its active set is tried
         first
 
     Raises
     ------
     ArithmeticError
-        If no active set is confirmed within 300 faces, its point has a KKT residual
-        above 1e-9, or the equality rows are linearly dependent on a face.
+        If no active set is confirmed within 300 faces, if the point of the confirmed
+        one has a KKT residual above 1e-9, or if the equality rows are linearly
+        dependent on a face.
 
     """
     task = _Task.of(qp)
@@ -116,8 +120,8 @@ class _Point(NamedTuple):
     """Local components of a point, with the multipliers of Gx = e."""
 
     x: Vector  #: (n,)
-    y: Vector  #: (r,) multipliers of Gx = e, on every rank
-    z: Vector  #: (n,) normal to the sets: negative at a lower bound
+    y: Vector  #: (r,) multipliers of Gx = e, replicated on every rank
+    z: Vector  #: (n,) multipliers, normal to the sets: negative at a lower bound
 
     @classmethod
     def of(cls, s: Solution) -> _Point:
@@ -128,8 +132,8 @@ class _Point(NamedTuple):
 class _Face(NamedTuple):
     """Components at bounds, and discs that are linearised on their boundary."""
 
-    #: (n + k,) of components, −1 at the lower bound, 1 at the upper one, else 0; then
-    #: of discs, 1 on the boundary
+    #: (n + k,): for components, −1 at the lower bound, 1 at the upper bound, else 0;
+    #: for discs, 1 on the boundary, else 0
     state: NDArray[np.int8]
     normal: NDArray[np.float64]  #: (k, d) outward unit normals
     curvature: Vector  #: (k,) η ≥ 0
@@ -137,17 +141,17 @@ class _Face(NamedTuple):
 
 @dataclass(eq=False)
 class _Task:
-    """Local part of a QP, in plain arrays."""
+    """Local components of a QP as plain arrays."""
 
     F: Callable[[Vector], Vector]
-    M: Callable[[Vector], Vector]  #: ≈ F⁻¹
+    M: Callable[[Vector], Vector]  #: product with an approximation of F⁻¹
     G: DistributedColumns
     e: Vector
     q: Vector
     lower: Vector
     upper: Vector
-    discs: Discs  #: the local ones
-    length: Vector  #: (k,) γ of each disc, a length divided by a force
+    discs: Discs  #: discs of local components
+    length: Vector  #: (k,) γ of each disc, in units of x divided by units of z
     products: int = 0
 
     @classmethod
@@ -180,7 +184,7 @@ class _Task:
         return float(self.G.ranks.total(np.array([part]))[0])
 
     def only_last(self, which: Mask) -> Mask:
-        """Keep only the globally last True: the last one of the last rank with any."""
+        """Keep only the globally last True: the last one on the last rank with any."""
         ranks = self.G.ranks
         local = np.flatnonzero(which)
         last_rank = ranks.extreme(float(ranks.rank if local.size else -1), np.max)
@@ -198,9 +202,10 @@ class _Task:
         return self.F(x) + self.q
 
     def moving(self, face: _Face) -> tuple[csr_array, Vector]:
-        """Return the projector (n, n) onto a face, and its origin (n,).
+        """Return the projector (n, n) along a face and the origin (n,) of the face.
 
-        The origin is x where it does not move, and zero on the directions of the face.
+        The origin contains the fixed components of x; its projection onto these
+        directions is zero.
         """
         n, (index, radius) = self.q.size, (self.discs.index, self.discs.radius)
         at_bound, sliding = face.state[:n], self.on_disc(face)
@@ -241,17 +246,18 @@ class _Task:
             return np.asarray(v - spread(self.G @ v))
 
         def bent(v: Vector) -> Vector:
-            """Return the curvature of the boundary of discs times v."""
+            """Return the product of v with the curvature of the boundary of discs."""
             return np.asarray(curvature * (moving @ v))
 
-        # M ≈ F⁻¹ is too large where the curvature exceeds F, as on small discs, and it
-        # is zero along redundant rows (friction on supported nodes), which bend as well
+        # M ≈ F⁻¹ is too large if the curvature exceeds F, as on small discs. It is zero
+        # along redundant rows (friction on supported nodes), although the curvature
+        # acts there too
         length = np.zeros(x.size)
         length[self.discs.index] = (self.length * on_disc)[:, None]
         soft = 1 / np.sqrt(1 + length * curvature)
 
         def precondition(v: Vector) -> Vector:
-            """Return an approximation of (F + bent)⁻¹v in the face."""
+            """Return an approximation of (F + curvature)⁻¹v in the face."""
             return project(soft * (self.M(soft * v) + length * (soft * v)))
 
         x = origin + moving @ x
@@ -277,7 +283,7 @@ class _Task:
         precondition: Callable[[Vector], Vector],
         bent: Callable[[Vector], Vector],
     ) -> Vector:
-        """Return d in the face with 𝒫(w − Fd − bent(d)) small, by CG."""
+        """Return d in the face such that 𝒫(w − Fd − bent(d)) is small, by CG."""
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
         p = y = precondition(w)
         wy = self.total(float(w @ y))
@@ -298,10 +304,11 @@ class _Task:
         return d
 
     def first_face(self, point: _Point) -> _Face:
-        """Return the face on which a solution of a similar problem is."""
+        """Return the face that contains `point`, the solution of a similar problem."""
         x, z, index = point.x, point.z, self.discs.index
         at_bound = (z != 0) | (self.lower == self.upper)
-        # the nearer bound, not the sign of z: a multiplier near zero may have either
+        # use the nearer bound, not the sign of z: a multiplier near zero may have
+        # either sign
         below = x - self.lower <= self.upper - x
         at_bound[index] = False
         state = np.where(at_bound, np.where(below, -1, 1), 0)
@@ -315,7 +322,7 @@ class _Task:
         )
 
     def next_face(self, point: _Point, face: _Face) -> _Face:
-        """Return the face that the signs of multipliers and violations suggest."""
+        """Return the face predicted from signs of multipliers and violated bounds."""
         x, _, z = point
         n, radius = x.size, self.discs.radius
         largest = [
@@ -334,17 +341,17 @@ class _Task:
         return _Face(np.append(state, pushed).astype(np.int8), normal, curvature)
 
     def on_disc(self, face: _Face) -> Mask:
-        """Return the discs (k,) that are linearised on their boundary."""
+        """Return the mask (k,) of discs that are linearised on their boundary."""
         return np.asarray(face.state[self.q.size :] > 0)
 
     def is_normal(self, point: _Point, face: _Face) -> bool:
-        """Return True if x is normal to the boundary of discs, up to `MAX_TURN`."""
+        """Return True if x is normal to the linearised discs, up to `MAX_TURN`."""
         on, across = self.on_disc(face), np.asarray(self.moving(face)[0] @ point.x)
         turn = norms(across[self.discs.index])[on] / self.discs.radius[on]
         return self.G.ranks.extreme(float(turn.max(initial=0.0)), np.max) <= MAX_TURN
 
     def _pushes(self, point: _Point) -> tuple[NDArray[np.float64], Vector]:
-        """Return w/‖w‖ (k, d) and ‖w‖ (k,) of discs, with w = x_I + γz_I."""
+        """Return w/‖w‖ (k, d) and ‖w‖ (k,) for w = x_I + γz_I of each disc."""
         index = self.discs.index
         w = point.x[index] + self.length[:, None] * point.z[index]
         size = norms(w)

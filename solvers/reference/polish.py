@@ -1,18 +1,18 @@
 """Refinement of a solution in extended precision, with active constraints as equations.
 
-For a fixed active set the KKT conditions are linear. They are solved by Newton steps
-with residuals evaluated in `numpy.longdouble` (iterative refinement, Higham 2002,
-Accuracy and Stability of Numerical Algorithms, ch. 12) and one factor of
+For a fixed active set the KKT conditions are linear. They are solved by iterative
+refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) with
+residuals evaluated in `numpy.longdouble` and a factorisation of
 
-    [P_FF + δ  B_Fᵀ]     F: variables off their bounds,
-    [B_F       −δ  ]     B: A and the active rows of G.
+    [P_FF + δ  B_Fᵀ]     F: variables not at a bound, [B_F       −δ  ]     B: A and the
+    active rows of G.
 
 δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
-are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1),
-and if solutions or multipliers are not unique they converge to ones near the start.
-Then violated constraints enter the active set and constraints with a multiplier of the
-wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13), until it no
-longer changes.
+are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1).
+If the solution or its multipliers are not unique, the steps converge to a solution near
+the start. After convergence, violated constraints enter the active set and constraints
+with a multiplier of the wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM
+J. Optim. 13), until the active set no longer changes.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from mortarbench.harness import QP, Matrix, Solution, Status
 from mortarbench.solvers.reference.saddle import saddle
 
 Extended = NDArray[np.longdouble]
-DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
-MAX_REFINEMENTS = 40  #: steps of refinement with one active set
-MAX_STEP_RATIO = 0.9  #: refinement ends at a step longer than this times the last one
+DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
+MAX_REFINEMENTS = 40  #: limit of refinement steps per active set
+#: refinement ends if a step is longer than this times the previous step
+MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
 FULL_CHANGES = 10  #: updates of the active set before only the worst constraint changes
 #: Multipliers of the wrong sign and violations count as rounding below this value,
@@ -52,7 +53,7 @@ class _Point(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A QP, and its matrices in extended precision."""
+    """A QP with its matrices in extended precision."""
 
     qp: QP
     P: Matrix
@@ -60,14 +61,14 @@ class _Problem:
     G: Matrix
 
     def gradient(self, at: _Point) -> Extended:
-        """Return Px + q + Aᵀy + Gᵀz."""
+        """Return the gradient Px + q + Aᵀy + Gᵀz in extended precision."""
         g = self.P @ at.x + self.qp.q + self.A.T @ at.y + self.G.T @ at.z
         return np.asarray(g, dtype=np.longdouble)
 
 
-@np.errstate(all="ignore")  # callers compare residuals, which are then not finite
+@np.errstate(all="ignore")  # residuals that overflow are not finite; callers check that
 def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
-    """Yield a refined point for each active set that is tried; often there is one.
+    """Yield a refined point for each active set that is tried, often just one.
 
     qp : QP whose largest entries are about one, with P, A and G all dense or all sparse
     start : point near a solution, such as that of an interior-point method
@@ -122,8 +123,9 @@ def _update_active_set(
 ) -> _Active:
     """Add violated constraints; drop those with a multiplier of the wrong sign.
 
-    Nearly dependent active rows cannot all hold unless their multipliers are huge. So
-    when no other constraint is wrong, active rows that keep a slack are dropped.
+    Nearly dependent active rows cannot all be satisfied unless their multipliers are
+    huge. So if no other constraint is wrong, active rows with a remaining slack are
+    dropped.
 
     one : change only the constraint with the largest error, relative to the size of x
         (violations) or of the gradient (signs)

@@ -1,18 +1,19 @@
-"""Reference solve of QPs over arbitrary convex sets, by projections only.
+"""Reference solve of QPs over arbitrary convex sets, which uses only projections.
 
-With M = [A; G; I] and C = {b} × {w ≤ h} × S, a QP is  min ½xᵀPx + qᵀx,  Mx ∈ C. A
-point t of the space of Mx gives both w = Π(t) in C and multipliers λ = R(t − w) normal
-to C at w, if R > 0 is diagonal and constant within each set. The remaining KKT
-conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
+With M = [A; G; I], the product S of the sets and C = {b} × {w ≤ h} × S, a QP is  min
+½xᵀPx + qᵀx,  Mx ∈ C. With the projection Π onto C, a point t of the space of Mx defines
+both w = Π(t) in C and multipliers λ = R(t − w) normal to C at w, if R > 0 is diagonal
+and constant within each set. The remaining KKT conditions state that the normal map is
+zero (Robinson 1992, Math. Oper. Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches this
-   zero from any start. Anderson's acceleration with a safeguard (Zhang, O'Donoghue and
+1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches such a
+   zero from any start. Anderson acceleration with a safeguard (Zhang, O'Donoghue and
    Boyd 2020, SIAM J. Optim. 30) is needed for a singular P.
-2. Newton's method converges to it, with Π' by difference quotients and residuals in
-   extended precision. The error of the quotients, √ε, only limits the rate: it is the
-   factor by which each step reduces the residual.
+2. Newton's method converges to the zero, with Π' from difference quotients and
+   residuals in extended precision. The error √ε of the quotients limits only the rate
+   of convergence: each step reduces the residual by about this factor.
 """
 
 from __future__ import annotations
@@ -26,24 +27,25 @@ from scipy.linalg import lu_factor, lu_solve
 
 from mortarbench.harness import QP, Solution, Status, Vector
 
-ROUNDS = 12  #: rounds of ADMM and Newton's method, each with another penalty
-ADMM_STEPS = 400  #: ADMM steps in the first round; each further round adds as many
+ROUNDS = 12  #: rounds of ADMM and Newton's method, each with a different penalty
+ADMM_STEPS = 400  #: ADMM steps in the first round; round k takes k times as many
 NEWTON_STEPS = 30  #: largest number of Newton steps per round
 MEMORY = 10  #: number of iterates per acceleration, and between two accelerations
 #: shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
-EQUALITY_PENALTY = 1e3  #: penalty of rows of A relative to the others, as in OSQP
+#: penalty of rows of A relative to that of all others, as in OSQP
+EQUALITY_PENALTY = 1e3
 MAX_PENALTY_CHANGE = 10.0  #: largest factor between the penalties of two rounds
 DIFFERENCE_STEP = 2.0**-26  #: √ε, step of difference quotients relative to t
-#: diagonal shift, relative, of the Newton matrix: it regularises dependent rows and
+#: relative diagonal shift of the Newton matrix: it regularises dependent rows and
 #: perturbs the steps, but not the zero of (1)
 SHIFT = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A QP with  Mx ∈ C."""
+    """A QP with the constraint Mx ∈ C."""
 
     qp: QP
     P: Any
@@ -60,11 +62,11 @@ class _Problem:
 
     @property
     def largest(self) -> float:
-        """Largest entry of P, a penalty in the units of P."""
+        """Largest |entry| of P, used as a penalty in the units of P; 1 if P = 0."""
         return float(np.abs(self.P).max(initial=0)) or 1.0
 
     def penalty(self, rho: float) -> Vector:
-        """Return R (r,) for the penalty of rows of G and of variables."""
+        """Return R (r,): rho for rows of G and variables, more for rows of A."""
         m = self.qp.b.size
         R: Vector = rho * np.ones(self.M.shape[0])
         R[:m] *= EQUALITY_PENALTY
@@ -94,7 +96,7 @@ class _Problem:
 
 
 def refine(qp: QP, start: Solution) -> Solution:
-    """Return the point of Newton's method from a point near the solution."""
+    """Refine a point near the solution by Newton's method."""
     problem = _Problem.of(qp)
     R = problem.penalty(problem.largest)
     forces = np.concatenate([np.append(start.y, start.z) * problem.size, start.z_box])
@@ -105,7 +107,7 @@ def refine(qp: QP, start: Solution) -> Solution:
 
 
 def projection_iterates(qp: QP) -> Iterator[Solution]:
-    """Yield the point of each round; later ones took more steps."""
+    """Yield the point of each round; later rounds take more steps."""
     problem = _Problem.of(qp)
     P, M, project, q = problem.P, problem.M, problem.project, qp.q
     rho = problem.largest
@@ -127,7 +129,7 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
         x, w = primal_point(t), project(t)
         multipliers = R * (t - w)
         yield problem.solution(_newton(problem, R, t), R)
-        # balance the relative residuals: √(primal/dual), as OSQP updates its ρ
+        # balance the relative residuals by the factor √(primal/dual), as OSQP does
         primal = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
         forces = [P @ x, q, M.T @ multipliers]
         dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
@@ -138,8 +140,9 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
 def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vector:
     """Iterate t ← step(t), accelerated every `MEMORY` of `count` iterations.
 
-    An accelerated point is used if its residual is not larger: ‖step(t) − t‖ decreases
-    along the iterates without acceleration, since the step is averaged.
+    An accelerated point is used only if its residual ‖step(t) − t‖ is not larger;
+    without acceleration the residual never increases, since the step is an averaged
+    operator.
     """
     images, changes = list[Vector](), list[Vector]()
     for _ in range(count // MEMORY):
@@ -166,9 +169,10 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop
 def _newton(problem: _Problem, R: Vector, t: Vector) -> Any:
-    """Return the t with the least residual of (1) among the iterates from t.
+    """Return the Newton iterate, starting from t, with the least residual of (1).
 
-    x = Π(t) on the rows of I is eliminated, so that the unknowns are t alone.
+    x is eliminated, as the components of Π(t) in the rows of I, so that t is the only
+    unknown.
     """
     P, M, q, k = problem.P, problem.M, problem.qp.q, problem.size.size
     t, rows = t.astype(np.longdouble), M[:k]

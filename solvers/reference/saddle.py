@@ -1,9 +1,9 @@
-"""Saddle-point systems [P + D Bᵀ; B −W] with D, W > 0 diagonal, by LU factors.
+"""Saddle-point systems [P + D Bᵀ; B −W] with diagonal D, W > 0, solved by LU factors.
 
 If P is positive semidefinite, such a matrix is quasidefinite: it is regular and has
 triangular factors for every symmetric permutation (Vanderbei 1995, SIAM J. Optim. 5).
-So a sparse one is ordered for least fill and factorised without pivoting. If D and W
-are so small that rounding spoils these factors, it is factorised with partial pivoting.
+So a sparse matrix is ordered for least fill and factorised without pivoting. If D and W
+are so small that rounding spoils these factors, partial pivoting is used instead.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import Matrix, Vector
 
-#: arguments of `splu`: symmetric order of least fill, no pivoting
+#: arguments of `splu` for a symmetric ordering of least fill, without pivoting
 LEAST_FILL = dict(
     permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)
 )
 PIVOTED = dict(permc_spec="COLAMD", diag_pivot_thresh=1.0)
-#: relative residual of a solve below which one step of refinement reaches rounding
+#: largest relative residual of a solve at which one step of refinement still suffices
 MAX_SOLVE_RESIDUAL = 1e-6
 
 Solve = Callable[[Vector, Vector], tuple[Vector, Vector]]
@@ -32,10 +32,10 @@ Factorise = Callable[[Vector, Vector], Solve]
 def saddle(P: Matrix, B: Matrix) -> Factorise:
     """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    The function returns the solve, (r, t) ↦ (u, v), and raises ArithmeticError if an
-    entry is not finite or a pivot is zero.
+    The function returns the solution operator (r, t) ↦ (u, v). It raises
+    ArithmeticError if an entry of D or W is not finite or a pivot is zero.
 
-    P : (n, n), and B : (r, n), both dense or both sparse
+    P, B : (n, n) and (r, n) matrices, both dense or both sparse
     """
     n = P.shape[0]
     with_diagonal = (
@@ -76,7 +76,7 @@ def _dense_matrices(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
 
 
 def _sparse_matrices(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
-    """Return the same function for sparse matrices; the result is CSC."""
+    """Return the function d (n + r,) ↦ [P Bᵀ; B 0] + diag(d) in CSC format."""
     size = P.shape[0] + B.shape[0]
     base = csc_array(block_array([[P, B.T], [B, None]])) if B.shape[0] else P
     values = base.diagonal()
@@ -113,6 +113,6 @@ def _factorise(K: Matrix) -> Callable[[Vector], Vector]:
 
 
 def _is_accurate(solve: Callable[[Vector], Vector], K: Matrix) -> bool:
-    """Return True if the factors solve one test system to MAX_SOLVE_RESIDUAL."""
+    """Return True if the factors solve a test system to MAX_SOLVE_RESIDUAL."""
     v = K @ np.linspace(1, 2, K.shape[0])
     return bool(np.abs(K @ solve(v) - v).max() <= MAX_SOLVE_RESIDUAL * np.abs(v).max())

@@ -2,17 +2,18 @@
 
 With lower bounds only and a dense positive definite P = LLᵀ, min ½xᵀPx + qᵀx over
 x ≥ lb is the nonnegative least-squares problem min ½‖Lᵀy + L⁻¹(q + P lb)‖² over
-y = x − lb ≥ 0. Lawson and Hanson's active-set method ends after finitely many
-steps with the exact active set; the free components are then computed once more by a
-direct solve with one step of iterative refinement.
+y = x − lb ≥ 0. Lawson and Hanson's active-set method ends after finitely many steps
+with the exact active set; the free components are then recomputed by a direct solve
+with one step of iterative refinement.
 
-Any other QP is scaled (`equilibrate`), solved by an interior-point method until the
-active constraints can be identified (`interior`), and the equations of the active set
-are refined in extended precision (`polish`). The result is the point with the smallest
-KKT residual, as the harness measures it on the original QP.
+Any other QP is scaled (`equilibrate`) and solved by an interior-point method until the
+active constraints can be identified (`interior`). The equations of the active set are
+then solved with refinement in extended precision (`polish`). The result is the point
+with the smallest KKT residual, as the harness measures it on the original QP.
 
-With discs the interior-point method is the same, and projections on the sets refine its
-point. A QP with other sets is solved by projections alone (`projection`).
+If the sets are bounds and discs, the point of the interior-point method is refined by a
+method that uses projections (`projection`). A QP with other sets is solved by that
+method alone.
 """
 
 from __future__ import annotations
@@ -33,35 +34,36 @@ from mortarbench.solvers.reference.interior import DELTA, interior_point
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates, refine
 
-#: largest KKT residual of a start for refinement. From a start with a larger residual,
-#: refinement of a QP with many solutions ended at a solution of size 1e10, whose
-#: rounding hid errors of the optimal value; therefore other starts are tried as well
+#: largest KKT residual of a reliable start for refinement. From a start with a larger
+#: residual, refinement of a QP with many solutions ended at a solution of size 1e10,
+#: whose rounding hid errors of the optimal value; therefore other starts are tried too
 MAX_START_RESIDUAL = 1e-3
-#: rounds of projections without a smaller residual, after which they end
+#: number of rounds of `projection` without a smaller residual after which it may end
 MAX_IDLE_ROUNDS = 1
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
-#: δ of the interior-point method over discs where P is singular: with a smaller one,
-#: steps along its kernel leave discs far behind, whose linearisation then fails
+#: δ of the interior-point method for discs and a singular P: with a smaller δ, steps
+#: along the kernel of P end far outside discs, where their linearisation fails
 SINGULAR_DELTA = 1e-7
-#: data of a scaled QP larger than this times their median are first left out
+#: data of a scaled QP larger than this times their median count as outliers
 OUTLIER_FACTOR = 1e4
 
 
 def reference_solution(qp: QP) -> Solution:
-    """Solve a convex QP to about the rounding of x and its multipliers.
+    """Solve a convex QP; x and its multipliers are accurate to about rounding.
 
-    `iterations` counts those of the interior-point method, if it ran. The remaining
-    residual is the effect of rounding x to double precision: about 1e-16·|P||x|
-    relative to |Px|, a few 1e-12 for the displacements of stiff bodies. P is assumed,
-    not checked, to be positive semidefinite.
+    `iterations` counts the steps of the interior-point method, if it ran. The remaining
+    residual is due to rounding x to double precision: about 1e-16·|P||x| relative to
+    |Px|, a few times 1e-12 for the displacements of stiff bodies. P must be positive
+    semidefinite, which is not checked.
 
     Raises
     ------
     ValueError
-        If P is an operator of a QP that is not small, or a matrix contains NaN or inf.
+        If P is an operator and the QP is too large to assemble it, or if a matrix
+        contains NaN or inf.
     ArithmeticError
-        If no point with a KKT residual of at most 1e-9 is found: the constraints
-        contradict each other, or the objective is unbounded below.
+        If no point with a KKT residual of at most 1e-9 is found, usually because the
+        constraints contradict each other or the objective is unbounded below.
 
     Examples
     --------
@@ -116,7 +118,7 @@ def _residual(qp: QP, s: Solution) -> float:
 
 
 def _candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points, each usually better than the one before."""
+    """Yield points, each usually more accurate than the previous one."""
     if _is_nonnegative(qp):
         # LinAlgError: P is singular; RuntimeError: scipy's nnls reached its step limit
         with suppress(np.linalg.LinAlgError, RuntimeError):
@@ -130,7 +132,7 @@ def _candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
-    """Yield points of a QP over bounds and discs, refined by projections."""
+    """Yield an interior point of a QP over bounds and discs, then its refinement."""
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp, delta)
     yield scaled.recover(start)
@@ -138,7 +140,7 @@ def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
 
 
 def _projection_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points of a QP over arbitrary sets, until the residual is rounding."""
+    """Yield points of a QP over arbitrary sets until the residual is small."""
     residuals = list[float]()
     for point in projection_iterates(qp):
         yield point
@@ -150,7 +152,7 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
-    """Yield points from a start that ignores data far larger than all others."""
+    """Yield points refined from a start for which outliers in the data are ignored."""
     scaled = equilibrate(qp)
     near = scaled.qp.h < _outlier_size(scaled.qp)
     tame = equilibrate(_without_outliers(scaled.qp, near))
@@ -163,7 +165,7 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 
 
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points with a smaller δ, for weak curvature and nearly parallel rows."""
+    """Yield points with a smaller δ, for weak curvature or nearly parallel rows."""
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     for delta in (1e-13, 1e-16):
@@ -171,18 +173,18 @@ def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _outlier_size(qp: QP) -> float:
-    """Return the size above which a datum of a scaled QP counts as an outlier."""
+    """Return the absolute value above which data of a scaled QP count as outliers."""
     data = np.concatenate([qp.q, qp.b, qp.h, qp.lb, qp.ub])
     sizes = np.abs(data[np.isfinite(data) & (data != 0)])
     return OUTLIER_FACTOR * float(np.median(sizes)) if sizes.size else np.inf
 
 
 def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
-    """Drop or clip data of a scaled QP that far exceed all others, for a start.
+    """Drop or clip the outliers among the data of a scaled QP, to compute a start.
 
-    Bounds and rows so far away are assumed inactive, and an objective coefficient so
-    large is assumed to push its variable to a bound even after clipping. The residual
-    on the original QP checks both assumptions.
+    Bounds and rows with outliers are assumed to be inactive, and an objective
+    coefficient that is an outlier is assumed to keep its variable at a bound even after
+    clipping. The residual on the original QP checks both assumptions.
 
     near : (p,) rows to keep
     """
@@ -194,9 +196,9 @@ def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
 
 
 def _is_nonnegative(qp: QP) -> bool:
-    """Return True if P is dense and the only constraints are x ≥ lb, lb finite.
+    """Return True if P is dense and the only constraints are x ≥ lb with finite lb.
 
-    False for a QP without variables, on which scipy's nnls (1.17.1) crashes Python.
+    A QP without variables is excluded, because scipy's nnls (1.17.1) crashes on it.
     """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
     lower = qp.q.size > 0 and np.isfinite(qp.lb).all()
@@ -204,8 +206,9 @@ def _is_nonnegative(qp: QP) -> bool:
 
 
 def _nonnegative(qp: QP) -> Solution:
-    """Solve  min ½xᵀPx + qᵀx, x ≥ lb, by nonnegative least squares."""
-    from scipy.optimize import nnls  # a slow import that workers do not need
+    """Minimise ½xᵀPx + qᵀx over x ≥ lb by nonnegative least squares."""
+    # imported here because it is slow and workers do not need it
+    from scipy.optimize import nnls
 
     P, gradient_at_lb = qp.P, qp.q + qp.P @ qp.lb
     L = cholesky(P, lower=True)

@@ -1,1 +1,1 @@
-"""SMALBE: options, transformations of the QP, and the compiled loop."""
+"""SMALBE: options, transformations of the QP, and the compiled algorithm."""

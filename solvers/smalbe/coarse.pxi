@@ -1,17 +1,18 @@
-# Products and solves with sparse rows G, such as those of the rigid motions of
-# subdomains, whose GGᵀ has a factor L. On one process they run without Python.
+# Products with sparse rows G, such as those for the rigid motions of subdomains, and
+# solves with the factor L of GGᵀ. On one process they run without Python.
 
 
 cdef class Coarse:
-    """The operations on G (k, n) by calls of Python, for rows shared by several ranks.
+    """Operations, called through Python, with rows G (k, n) shared by several ranks.
 
-    Vectors (k,) hold the rows that this process touches; L⁻¹ maps them to vectors (r,).
+    Vectors (k,) have an entry for each row with entries in the columns of this process;
+    L⁻¹ maps them to vectors (r,).
 
     source : a `solvers.smalbe.rows.SparseRows`
     """
 
     cdef Py_ssize_t n, k, r
-    cdef Py_ssize_t places  # number of components with a bound
+    cdef Py_ssize_t places  # number of local components with a bound
     cdef object source
     cdef const long long *bounded  # (places,) these components
     cdef list owners
@@ -47,14 +48,14 @@ cdef class Coarse:
     cdef int weigh_difference(
         self, const double *v, const double *y, const double *weights, double *out
     ) except -1:
-        """out ← weights times (v − Gᵀy)."""
+        """out ← weights·(v − Gᵀy), componentwise."""
         difference = self.source.weighted_difference(
             view(v, self.n), view(y, self.k), view(weights, self.n)
         )
         return copy_result(difference, self.n, out, "v − Gᵀy")
 
     cdef int times_bounded(self, const double *s_b, double *t) except -1:
-        """t ← G_b s_b with the columns of G at components with a bound."""
+        """t ← G_b s_b with the columns G_b of the components with a bound."""
         part = self.source.of_bounded @ view(s_b, self.places)
         return copy_result(part, self.k, t, "G_b s_b")
 
@@ -78,21 +79,21 @@ cdef class Coarse:
         return copy_result(self.source.gram.backward(view(a, self.r)), self.k, y, "L⁻ᵀa")
 
     cdef in_face(self, double shift):
-        """Return the factor of G_F G_Fᵀ + shift·GGᵀ on the face F that `active` defines."""
+        """Return the factor of G_F G_Fᵀ + shift·GGᵀ, F: components not `active`."""
         free = np.ones(self.n, dtype=bool)
         free[self.source.bounded] = view(self.active, self.places) == 0
         return self.source.gram.in_face(free, shift)
 
     cdef int solve(self, factor, const double *t, double *y) except -1:
-        """y ← the solution for the right-hand side t, by a result of `in_face`."""
+        """y ← the solution for the right-hand side t; `factor` is a result of `in_face`."""
         return copy_result(factor(view(t, self.k)), self.k, y, "solution")
 
     cdef double error(self, const double *nu) except? -1:
-        """Return ‖Gν‖ with the rows as given."""
+        """Return ‖Gν‖ with the original, unnormalised rows."""
         return np.linalg.norm(self.source.error(view(nu, self.n)))
 
     cdef void enter(self, const double *free) noexcept:
-        """Set `active` for the face where `free` (n,) is 1."""
+        """Set `active` from the mask `free` (n,) of the face."""
         cdef Py_ssize_t i
         for i in range(self.places):
             self.active[i] = 1 - free[self.bounded[i]]
@@ -100,12 +101,12 @@ cdef class Coarse:
 
 @cython.final
 cdef class LocalCoarse(Coarse):
-    """The same for rows of one process, without Python."""
+    """`Coarse` for rows on one process only; the operations run without Python."""
 
     cdef CompressedRows rows  # G
     cdef CompressedRows by_components  # Gᵀ
     cdef CompressedRows of_bounded  # G_bᵀ
-    cdef CompressedRows given  # the transpose of the rows as given
+    cdef CompressedRows given  # transpose of the original, unnormalised rows
     cdef CompressedRows matrix  # GGᵀ
     cdef BorderedFactor factor
     cdef bint has_border
@@ -177,10 +178,10 @@ cdef class LocalCoarse(Coarse):
 
 
 cdef CompressedRows transposed_rows(G):
-    """Return the transpose of sparse rows."""
+    """Return the transpose of a sparse matrix."""
     return CompressedRows.of_transpose(G if G.format == "csc" else csc_array(G))
 
 
 cdef CompressedRows symmetric_rows(M):
-    """Return a symmetric matrix, an array or one in CSC format, by its rows."""
+    """Return a symmetric matrix, an array or in CSC format, as compressed rows."""
     return (CompressedRows.of_transpose if issparse(M) else CompressedRows.of_array)(M)

@@ -1,18 +1,18 @@
-"""SMALBE for small problems: faces by Cholesky factors instead of iterations.
+"""SMALBE for small problems: Cholesky factors of faces instead of iterations.
 
 Minimises ½xᵀPx + qᵀx subject to Gx = e and l ≤ x ≤ u by the proximal method of
 multipliers (Rockafellar, Math. Oper. Res. 1, 1976, 97-116). With orthonormal rows C
-that span those of G, the shortest x̃ with Gx̃ = e, and D the diagonal of P, for
-k = 0, 1, …:
+that span the rows of G, the shortest x̃ with Gx̃ = e, and the diagonal D of P, for k =
+0, 1, …:
 
 1. x ← argmin over the box of
    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2 ‖C(x − x̃)‖² + δ/2 ‖x − x_k‖²_D,
-   exactly, from one face to the next (`solvers.smalbe.faces`).
+   exactly, by an active-set method (`solvers.smalbe.faces`).
 2. a ← a + ρC(x − x̃), x_{k+1} = x.
 
 This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with exact
-inner runs, M = 0. If P is singular on a face, the proximal term makes P + ρCᵀC + δD
-positive definite; the term vanishes at the solution, where x = x_k.
+inner solves, M = 0. If P is singular on a face, the proximal term makes P + ρCᵀC + δD
+positive definite; this term vanishes at the solution, where x = x_k.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: Largest number of unknowns; a face costs O(n³), and `smalbe` is faster long before.
+#: largest number of unknowns; a face costs O(n³), and `smalbe` is faster for fewer
 MAX_UNKNOWNS = 2000
-INITIAL_RHO = 1e3  #: initial ρ/‖P‖, Frobenius norm
-MAX_RHO = 1e9  #: limit of ρ/‖P‖, which grows if ‖Cν‖ falls slowly
-DELTA = 1e-10  #: δ
+INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
+MAX_RHO = 1e9  #: limit of ρ/‖P‖; ρ grows if ‖C(x − x̃)‖ decreases slowly
+DELTA = 1e-10  #: weight δ of the proximal term
 
 
 @dataclass(frozen=True)
 class Direct:
-    """In-house SMALBE for small problems: face problems by updated Cholesky factors.
+    """In-house SMALBE for small problems, with updated Cholesky factors of faces.
 
-    Ends when the KKT residuals of the QP are within `tol`, or no longer decrease.
-    Success is claimed if they are within 5·tol.
+    The loop ends when the KKT residuals of the QP are within `tol` or no longer
+    decrease. The point is claimed solved if they are within 5·tol.
     """
 
-    max_solves: int = 10_000  #: limit of solves with factors of faces, in total
+    max_solves: int = 10_000  #: limit of all solves with factors of faces
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",
@@ -74,7 +74,7 @@ class Direct:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         P = qp.P if isinstance(qp.P, np.ndarray) else dense(qp.P)
-        P = P if P.flags.c_contiguous else P.T  # it is symmetric
+        P = P if P.flags.c_contiguous else P.T  # P is symmetric
         rows = orthonormal_rows(qp.A, qp.b)
         if not rows.consistent:
             message = "the equality rows contradict each other"
@@ -101,10 +101,11 @@ class _Task:
     faces: Faces
 
     def point(self, *, fitted: bool) -> _Point:
-        """Return the current x with its multipliers.
+        """Return the current x with its multipliers and a bound of its KKT residuals.
 
-        fitted : True to fit a to the gradient on the free components, by least
-            squares; the rounding of a is ρ times that of Cν, and may be too large
+        fitted : True to fit a to the gradient on the free components, by least squares;
+            the rounding error of an updated a is ρ times that of Cν, which may be too
+            large
         """
         qp, faces, a = self.qp, self.faces, self.faces.a
         x, Px, z_box = faces.at(a)
@@ -114,12 +115,12 @@ class _Task:
         y = self.rows.multipliers(a)
         s, serial = self.solution(x, y, z_box), Reduction()
         worst = residual_bound(qp, s, Px, faces.diagonal, self.rows.G, serial)
-        if worst == np.inf:  # no bound is known
+        if worst == np.inf:  # the bound could not be evaluated
             worst = kkt_residuals(qp, s).worst
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
-        """Return a point as a claim of success; the caller checks it."""
+        """Return a point as a `Solution` with status SOLVED; the caller checks it."""
         return Solution(
             status=Status.SOLVED,
             x=x,
@@ -130,7 +131,7 @@ class _Task:
         )
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
-        """Return the a with the least ‖(g + Cᵀa)_F‖ on the free components F."""
+        """Return the a that minimises ‖(g + Cᵀa)_F‖ on the free components F."""
         C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
         missing = g[free] + C.T[free] @ a
         change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)
@@ -170,7 +171,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Increase ρ a hundredfold if rounding permits; return the new limit of ρ."""
+    """Multiply ρ by 100 if the factorisation succeeds; return the new limit of ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)
@@ -183,7 +184,7 @@ def _penalised(faces: Faces, most: float) -> float:
 def _claimed(
     task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
 ) -> Solution:
-    """Claim success if the bound of the residuals, or these, are within 5·tol."""
+    """Claim success if the KKT residuals, or a bound of them, are within 5·tol."""
     faces, checked = task.faces, False
     if point is None:
         return Solution.without_point(task.qp, Status.ITERATION_LIMIT, otherwise)

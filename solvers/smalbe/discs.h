@@ -1,9 +1,10 @@
-/* Loops over discs ‖x_I + c_I‖ ≤ r of the set of MPRGP, beside those of vectors.h.
+/* Loops over the discs ‖x_I + c_I‖ ≤ r of the feasible set of MPRGP; vectors.h has those
+   over bounds.
 
-   A disc is active if x is within `slack` of its boundary. Active discs are not
-   part of the face: the free gradient φ is zero there. With the outward normal n, the
-   chopped gradient β is the gradient, without its normal component if nᵀg < 0, which
-   holds x on the boundary. On a disc of radius zero φ = β = 0.
+   A disc is active if x is within `slack` of its boundary. Active discs are not part of
+   the face: the free gradient φ is zero there. With the outward normal n, the chopped
+   gradient β is the gradient g; if nᵀg < 0, the normal component, which presses x
+   against the boundary, is subtracted. On a disc of radius zero φ = β = 0.
 
    Each loop is compiled for discs of 2, of 3 and of any number d of variables: with a
    constant d, the variables of a disc stay in registers. Square roots are taken only on
@@ -120,7 +121,7 @@ INLINE void project_each(const discs *D, int d, double *y)
     }
 }
 
-/* y = Π(y). */
+/* y = Π(y), the projection onto the discs. */
 static void project_discs(const discs *D, double *y)
 {
     WITH_DIMENSION(D, project_each, y);
@@ -254,7 +255,7 @@ static void step_on_discs(const discs *D, const double *x, const double *g,
         WITH_DIMENSION(D, step_on_each, x, g, length, 0, s, result);
 }
 
-/* free = 1 on discs off their boundary, else 0; return 1 if that changes any of them. */
+/* free = 1 on discs whose x is off the boundary, else 0; return 1 if any entry changed. */
 static int mark_discs(const discs *D, const double *x, double *free)
 {
     int changed = 0;
@@ -268,9 +269,10 @@ static int mark_discs(const discs *D, const double *x, double *free)
     return changed;
 }
 
-/* w = T(w + κv) on discs that g holds on their boundary, where T removes the part along
-   the normal n and κ = −nᵀg/‖x + c‖ is the multiplier of ½(‖x + c‖² − r²) ≤ 0, by which
-   the boundary curves the cost. Zero on discs of radius zero.
+/* w = T(w + κv) on discs against whose boundary -g presses x, where T removes the
+   component along the normal n, and κ = −nᵀg/‖x + c‖ is the multiplier of ½(‖x + c‖² −
+   r²) ≤ 0, which adds the curvature of the boundary to that of the cost. Zero on discs
+   of radius zero.
 
    v : NULL for zero */
 static void tangential_discs(const discs *D, const double *x, const double *g,

@@ -1,4 +1,4 @@
-"""One run of SMALBE on a QP: transformation, solution, recovery and check."""
+"""A run of SMALBE on a QP: transformation, solution, recovery and check."""
 
 from __future__ import annotations
 
@@ -46,36 +46,37 @@ STEPS = {
     "p": "proportioning",
     "n": "newton",
 }
-#: "solved" is claimed if the KKT residuals are within this factor of the tolerance
+#: a point is claimed solved if its KKT residuals are at most this times the tolerance
 CLAIM_FACTOR = 5.0
-#: Factors by which the tolerance is tightened if a residual exceeds it. They are
-#: smaller than the excess suggests, since the residual decreases more slowly than
-#: ‖g^P‖. The first one suffices for four of five bodies whose residual exceeds the
-#: tolerance.
+#: Additional factors by which the tolerance is tightened if a residual exceeds it,
+#: because the residual decreases more slowly than the projected gradient ‖g^P‖. The
+#: first one suffices for four out of five bodies whose residual exceeds the tolerance.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
-#: rounding of ‖x_I‖, relative to the radius and x̃; twice that of feasible_set.pxi.
-#: With 16 EPS times the radius, `test_small_discs_beside_large_shifts` fails
+#: rounding of ‖x_I‖, relative to the sum of the radius and ‖x̃_I‖; twice that of
+#: feasible_set.pxi. With 16 EPS times the radius,
+#: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-MIN_LANCZOS_STEPS = 5  #: number of Lanczos steps for problems of few unknowns
-#: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
-#: with 1e4 two or three outer iterations suffice
+MIN_LANCZOS_STEPS = 5  #: smallest limit of Lanczos steps, used for few unknowns
+#: default penalty ρ. The models contain ρQ exactly, so that a large ρ costs no
+#: products; with 1e4 two or three outer iterations suffice
 RHO = 1e4
-#: default penalty if P offers a preconditioner. Each multiplier step restarts CG on the
-#: thousands of rows of decomposed bodies, so that fewer outer iterations pay there
+#: default penalty ρ if P provides a preconditioner. With the thousands of rows of
+#: decomposed bodies each multiplier step restarts CG, so that fewer outer iterations
+#: save time
 PRECONDITIONED_RHO = 1e6
-#: default penalty with discs. Spectral steps do not use the model, and a larger ρ would
-#: worsen the conditioning of H
+#: default penalty ρ with discs. Spectral steps do not use the model, and a larger ρ
+#: would worsen the conditioning of H
 RHO_ON_DISCS = 1.0
 MAX_IDLE_TIGHTENINGS = (
-    3  #: number of tightenings in a row that may fail to halve the residuals
+    3  #: number of consecutive tightenings that may fail to halve the residuals
 )
-#: preconditioners that need no data of the eliminated variables
+#: preconditioners that require no data of the eliminated variables
 ELIMINATION_PRECONDITIONERS = ("model", "none")
 
 
 class Carry(NamedTuple):
-    """Data that one problem of a sequence passes on to the next."""
+    """Data that one problem of a sequence passes to the next."""
 
     x: Vector  #: (n,)
     side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper bound, else 0
@@ -85,7 +86,7 @@ class Carry(NamedTuple):
 
 
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
-#: observer of a step: its letter, x and g after it
+#: observer called after each step with its letter, x and g
 Note = Callable[[str, Vector, Vector], None]
 
 
@@ -105,10 +106,10 @@ class _Task(NamedTuple):
 def prepared(
     qp: QP, tol: float, options: Options, carry: Carry | None, *, in_sequence: bool
 ) -> Solve:
-    """Prepare a run: eliminate free variables, project the QP, estimate its spectrum.
+    """Prepare a run: eliminate free variables, project the QP, estimate the spectrum.
 
-    in_sequence : True if further QPs take over the results; a factor of the free block
-        and a good spectrum then pay off several times
+    in_sequence : True if later QPs reuse the results; a factor of the free block and an
+        accurate spectrum are then worth more time
     """
     has_discs = len(qp.sets) > 1
     if has_discs:
@@ -147,10 +148,10 @@ def prepared(
 
 
 def _on_discs(qp: QP, options: Options) -> Options:
-    """Replace the options that are valid for bounds only.
+    """Replace options that are not valid for QPs with discs.
 
-    Models can be minimised only over boxes. A step along −β would leave a disc, since
-    it is tangent to it.
+    Models can be minimised only over boxes. A step along −β, which is tangent to the
+    boundary of a disc, would leave the disc.
     """
     kind = resolved_preconditioner(qp, options.preconditioner)
     return replace(
@@ -165,15 +166,15 @@ def _on_discs(qp: QP, options: Options) -> Options:
 def _eliminated(
     qp: QP, options: Options, kind: Preconditioner, carry: Carry | None
 ) -> Eliminated | None:
-    """Eliminate the free variables of a sequence as long as one factor serves all.
+    """Eliminate the free variables as long as one factor serves the whole sequence.
 
-    If the block changes from one problem to the next, as in Newton's method, a new
-    factor for each problem would cost more than it saves.
+    If the free block changes between problems, as in Newton's method, a new factor for
+    each problem would cost more than it saves.
     """
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (
         kind == "incomplete" and options.preconditioner == "auto"
     )
-    # the functions of a subclass expect all variables of the original QP
+    # user-defined functions of a subclass expect all variables of the original QP
     if options.is_extended or not may_follow or len(qp.sets) > 1:
         return None
     if options.eliminate == "always" or carry is None:
@@ -187,11 +188,12 @@ def _projected(
 ) -> Projected:
     """Homogenise, project and normalise the QP; estimate the spectrum.
 
-    steps : number of steps of the Lanczos process
+    steps : largest number of steps of the Lanczos process
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and not qp.b.size and qp.q.any():
-        # no step depends on the norm, and q is nearer to the first eigenvector
+        # no step depends on the norm, and q is closer to the first eigenvector than a
+        # random vector
         find = partial(by_lanczos, steps=1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
@@ -222,9 +224,10 @@ def _estimated_spectrum(
 ) -> Spectrum:
     """Estimate the spectrum of 𝒫F𝒫, or reuse the previous problem's spectrum.
 
-    The previous spectrum is reused if the Rayleigh quotient of the start vector of the
-    Lanczos process, which is always the same, has changed by less than a factor of two.
-    Only steps by the model may do so, because they detect and correct a wrong model.
+    The previous spectrum is reused if the Rayleigh quotient of the Lanczos start
+    vector, which is the same for all problems, has changed by less than a factor of
+    two. This is permitted only with model steps, because they detect and correct a
+    wrong model.
     """
     if options.norm == "power":
         return by_power(F, C)
@@ -238,16 +241,16 @@ def _estimated_spectrum(
 
 
 def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
-    """Return the number of Lanczos steps.
+    """Return the maximum number of Lanczos steps for this problem.
 
-    Few steps suffice for few unknowns, where more steps would cost as much as CG. They
-    also suffice if P offers a preconditioner, since the spectrum of decomposed bodies
-    is flat and only its norm is used. With bounds alone fewer steps are enough: for 73
-    to 85 unknowns, where CG takes about ten products, the steps beyond seven or eight
-    save no more products than they cost. Seven steps for all sizes would save up to a
-    fifth of the products on dense duals with bounds alone, but take up to 1.9 times as
-    many on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
-    so that further steps are worthwhile: with fewer steps, the 24 problems of
+    For few unknowns, more steps would cost as much as CG. Few steps also suffice if P
+    provides a preconditioner, since the spectrum of decomposed bodies is flat and only
+    the norm is used. With bounds alone fewer steps are enough: for 73 to 85 unknowns,
+    where CG takes about ten products, the steps beyond seven or eight save no more
+    products than they cost. Seven steps for all sizes would save up to a fifth of the
+    products on dense duals with bounds alone, but would require up to 1.9 times as many
+    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum, so
+    that more steps are worthwhile: with n/10 steps, the 24 problems of
     greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
@@ -260,10 +263,10 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 
 
 def _start(task: _Task, tol: float) -> Iterate:
-    """Start from zero, or from the solution of the previous problem.
+    """Return the start: zero, or the solution of the previous problem of a sequence.
 
-    A component that was at a bound starts at that bound, even if the bound has moved:
-    rows that slip continue to slip when the bound of friction changes.
+    A component that was at a bound starts at the same bound, even if its value has
+    changed: slipping nodes usually continue to slip when the friction bound changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
     x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
@@ -277,29 +280,29 @@ def _start(task: _Task, tol: float) -> Iterate:
 
 
 def _penalty(rho: float, tol: float) -> float:
-    """Limit ρ so that the rounding of ρQν in the gradient stays below the tolerance."""
+    """Return ρ, limited so that the rounding of ρQν in the gradient is below tol."""
     return min(rho, max(1.0, tol / (10 * EPS)))
 
 
 @dataclass(eq=False)
 class OuterLoop:
-    """The outer loop on one projected problem."""
+    """The outer loop of SMALBE on a projected problem."""
 
     solver: compiled.SMALBE
     problem: Projected
     options: Options
-    #: k, right-hand side → observer of outer iteration k
+    #: k, right-hand side → observer of the steps of outer iteration k; None for none
     watch: Callable[[int, Vector], Note] | None
 
     def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
-        """Return the iterate at x, projected onto the bounds, and μ.
+        """Return the first iterate: x, projected onto the set, and the multipliers μ.
 
-        One product, none for x = 0.
+        This takes one product, or none for x = 0.
         """
         return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
 
     def solve(self, tol: float, at: Iterate) -> Iterate:
-        """Continue the outer loop from `at` to a tolerance."""
+        """Continue the outer loop from `at` to the tolerance `tol`."""
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
             self.options,
@@ -312,7 +315,7 @@ class OuterLoop:
         return Iterate(nu, g, mu, M, rho, outer, status)
 
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
-        """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product."""
+        """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product."""
         box = qp.box
         point = self.solver.point(at.nu, at.mu, box.lower, box.upper)
         return point or recovered(self.problem, qp, at)
@@ -321,8 +324,9 @@ class OuterLoop:
 def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
-    """Prepare the outer loop with the preconditioner of the options."""
-    if problem.factor is not None:  # never for a subclass that overrides the steps
+    """Prepare the outer loop with the preconditioner and step rule of the options."""
+    # not used with user-defined preconditioners or step rules
+    if problem.factor is not None:
         solver = compiled.SMALBE(problem, options, False)
     else:
         own = options.preconditioner_for(qp)
@@ -343,10 +347,11 @@ def outer_loop(
 def _solve_to_tolerance(
     task: _Task, tol: float
 ) -> tuple[Solution, Callable[[], Carry | None]]:
-    """Return a point whose KKT residuals on the original problem are within `tol`.
+    """Tighten the outer loop until the KKT residuals of the original QP are within tol.
 
     Residuals of up to CLAIM_FACTOR·tol are accepted; if they exceed tol, the tolerance
-    is tightened once or twice more, and the best of the points is returned.
+    of the outer loop is tightened once or twice more, and the best of these points is
+    returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
     if at is None or task.options.expansion != "model":
@@ -367,10 +372,10 @@ def _solve_to_tolerance(
 def _claimed(
     task: _Task, tol: float
 ) -> tuple[tuple[Solution, Callable[[], Carry | None]], float, Iterate | None, float]:
-    """Tighten the tolerance until the KKT residuals of the original QP agree.
+    """Tighten the tolerance until the KKT residuals of the QP are within 5·tol.
 
-    Returns the result, the worst residual, the iterate to continue from (None if
-    nothing can be gained), and the tolerance in units of `tol`.
+    Returns the result, the worst residual, the iterate to continue from (None if more
+    iterations are useless), and the final tolerance in units of `tol`.
     """
     options, at = task.options, _start(task, tol)
     tighter, best, waited = 1.0, np.inf, 0
@@ -394,8 +399,9 @@ def _claimed(
         best = min(best, worst)
         if not solved or waited == MAX_IDLE_TIGHTENINGS:
             break
-        # A hundredfold if the last tightening changed little: multipliers may converge
-        # so slowly that one outer iteration meets a slightly smaller tolerance.
+        # Tighten by 0.01 if the last tightening had little effect: multipliers may
+        # converge so slowly that a single outer iteration already meets a slightly
+        # smaller tolerance.
         tighter *= 0.01 if waited else min(0.5, max(0.01, CLAIM_FACTOR * tol / worst))
         at = _with_exact_gradient(task, at, _penalty(task.rho, tighter * tol))
     message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
@@ -406,14 +412,14 @@ def _claimed(
 
 
 def _with_exact_gradient(task: _Task, at: Iterate, rho: float) -> Iterate:
-    """Recompute the gradient, which the steps only update; one product."""
+    """Return the iterate with a recomputed gradient, which steps only update."""
     x = task.problem.rows.x_tilde + at.nu
     fresh = task.loop.first(x, at.mu, M=at.M, rho=min(at.rho, rho))
     return fresh._replace(outer=at.outer)
 
 
 def _nothing() -> None:
-    """Return None: a failed run passes nothing on."""
+    """Return None in place of a `Carry`, after a failed run."""
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:
@@ -421,7 +427,7 @@ def _carry(task: _Task, at: Iterate) -> Carry:
     lower, upper = problem.bounds
     side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
     fixed = lower == upper
-    side[fixed] = -np.sign(at.g[fixed])  # the bound that a descent step would approach
+    side[fixed] = -np.sign(at.g[fixed])  # the bound towards which −g points
     x = problem.rows.x_tilde + at.nu
     return Carry(
         x=x if task.scaled is None else x / task.scaled.root,
@@ -433,7 +439,7 @@ def _carry(task: _Task, at: Iterate) -> Carry:
 
 
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
-    """Recover the solution of the original QP; also returns Fx of the inner problem."""
+    """Recover the solution of the original QP, and Fx of the inner problem."""
     qp, problem = task.inner, task.problem
     x, a, z_box, Fx = task.loop.recovered(qp, at)
     letters = at.steps
@@ -460,11 +466,12 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
 def recovered(
     problem: Projected, qp: QP, at: Iterate
 ) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product.
+    """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product.
 
-    For a = ‖𝒫F𝒫‖μ − C(Fx − d) the residual Fx − d + Cᵀa equals the gradient of the
-    projected problem up to rounding and ‖Cν‖. A least-squares correction of a on the
-    free components, where the residual must vanish, removes these errors.
+    For a = ‖𝒫F𝒫‖μ − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
+    projected problem, up to rounding and terms of the order of ‖Cν‖. A least-squares
+    correction of a on the free components, where the residual must vanish, removes
+    these errors.
     """
     C = problem.rows.C
     at_lower, at_upper = at.nu <= problem.bounds[0], at.nu >= problem.bounds[1]
@@ -472,7 +479,7 @@ def recovered(
     x = np.where(
         at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
     )
-    x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
+    x = np.clip(x, qp.lb, qp.ub)  # (l − x̃) + x̃ may differ from l in the last bit
     boundaries = [
         (one, _on_boundary(one, x, problem.rows.x_tilde)) for one in problem.discs
     ]
@@ -481,7 +488,7 @@ def recovered(
         free[one.index[active]] = False
     Fx = problem.F(x)
     r = Fx + qp.q
-    if not r.any():  # a minimum of the cost without any constraint
+    if not r.any():  # x is the unconstrained minimum
         return x, np.zeros_like(at.mu), np.zeros_like(x), Fx
     a = problem.spectrum.norm * at.mu - C @ r
     a += problem.rows.fitted(free, r + C.T @ a)
@@ -496,9 +503,9 @@ def recovered(
 
 
 def _on_boundary(discs: Discs, x: Vector, shift: Vector) -> NDArray[np.bool_]:
-    """Return a mask (k,) of the discs that have x (n,) on their boundary.
+    """Return a mask (k,) of the discs whose variables in x (n,) are on the boundary.
 
-    shift : x̃ (n,), whose rounding is part of x
+    shift : x̃ (n,), whose rounding errors enter x
     """
     sizes, shifts = (np.linalg.norm(v[discs.index], axis=1) for v in (x, shift))
     rounding = DISC_ROUNDING * (discs.radius + shifts)
@@ -507,10 +514,10 @@ def _on_boundary(discs: Discs, x: Vector, shift: Vector) -> NDArray[np.bool_]:
 
 
 def _normal_part(x: Vector, v: Vector) -> Vector:
-    """Return the parts of v (k, d) that are normal to discs at x (k, d) on them."""
+    """Return the outward normal components of v (k, d) on discs at x (k, d)."""
     square = (x * x).sum(axis=1, keepdims=True)
     share = np.maximum((x * v).sum(axis=1, keepdims=True), 0)
-    # at a radius of zero every vector is normal
+    # every vector is normal to a disc of radius zero
     scaled = np.divide(share, square, out=np.zeros_like(share), where=square > 0) * x
     normal: Vector = np.where(square > 0, scaled, v)
     return normal
@@ -534,7 +541,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
-    """Add the products of the residuals to the count of products."""
+    """Return `point` with products for residuals included in the count of products."""
     products = task.problem.F.count
     if products == point.counts["P_products"]:
         return point
@@ -542,22 +549,22 @@ def _counted(task: _Task, point: Solution) -> Solution:
 
 
 COLUMNS = (
-    "step",  # c, e, f or p
-    "outer",  # number of the outer iteration
-    "products",  # with F, so far
+    "step",  # letter of the step, see `STEPS`
+    "outer",  # index k of the outer iteration
+    "products",  # number of products with F so far
     "free_gradient",  # ‖φ‖
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
-    "active",  # components on their bounds
-    "two_sided",  # of them, those between two bounds; left out where there are none
-    "cost",  # the augmented Lagrangian
-    "seconds",  # since prepare began
+    "active",  # number of components at bounds
+    "two_sided",  # how many of these have two bounds; omitted if no component has two
+    "cost",  # value of the augmented Lagrangian
+    "seconds",  # since the start of `prepare`
 )
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """History of a run, rows in the order of `COLUMNS`.
+    """History of a run: one row per step, with entries in the order of `COLUMNS`.
 
     Gradients and costs refer to the normalised problem.
     """
@@ -572,9 +579,9 @@ class History:
         outer: int,
         rhs: Vector,
     ) -> Note:
-        """Return the observer of one inner run with the right-hand side `rhs`.
+        """Return the observer of the steps of an inner run with right-hand side `rhs`.
 
-        parts : x, g → `free` (1 on the face), φ and β
+        parts : x, g → mask of the face, gradients φ and β
         """
         C, x_tilde = problem.rows.C, problem.rows.x_tilde
         size = float(np.linalg.norm(x_tilde))

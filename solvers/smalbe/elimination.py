@@ -1,19 +1,19 @@
-"""Elimination of the free variables of a QP: the transform and its inverse.
+"""Elimination of the variables without bounds from a QP, and their recovery.
 
-Let E be the variables without bounds. Stationarity in E and the equality rows that
-involve E,
+Let E be the variables without bounds and I the others. Stationarity in E and the
+equality rows that involve E,
 
     [P_EE G_Eᵀ] [x_E]   [−q_E − P_EI x_I]
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
 
-determine x_E and y as affine functions of the bounded x_I. The reduced problem is a QP
-in x_I with the bounds, the equality rows that do not involve E, and the Schur
-complement
+determine x_E and the multipliers y of these rows as affine functions of x_I. The
+reduced problem is a QP in x_I with the bounds, the equality rows that do not involve E,
+and the Schur complement
 
     P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I,
 
-whose assembly costs about as much as the factorisation of P_EE. On duals of contact
-problems E contains the supports, and P_EE = F_EE is the same in every load step.
+whose assembly costs about as much as the factorisation of P_EE. In duals of contact
+problems, E contains the support forces, and P_EE = F_EE is the same in every load step.
 """
 
 from __future__ import annotations
@@ -31,34 +31,36 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
-#: Bounds for singular values of orthonormal rows, restricted to E: values below the
-#: first count as zero, values above the second are accepted. The reciprocals of values
-#: in between would enter the reduced matrix, and its rounding exceed the tolerance.
+#: thresholds for the singular values of orthonormal rows, restricted to E: values below
+#: the first count as zero, and values above the second are accepted. The reciprocals of
+#: values in between would enter the reduced matrix, whose rounding would exceed the
+#: tolerance
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
 
 
 class FreeBlock(NamedTuple):
-    """P_EE with its Cholesky factor."""
+    """The block P_EE with its Cholesky factor."""
 
     matrix: Array  #: (k, k)
-    factor: Array  #: R of P_EE = RᵀR, in the upper triangle
+    #: upper triangular R (k, k) with P_EE = RᵀR; the lower triangle is arbitrary
+    factor: Array
 
 
 class Eliminated(NamedTuple):
-    """A QP in the bounded variables, with the recovery of the others."""
+    """A QP in the bounded variables, with the recovery of the other variables."""
 
-    qp: QP  #: P is dense
+    qp: QP  #: reduced QP, with a dense P
     recover: Callable[[Solution], Solution]
     G: Array  #: (m, n) equality rows of the original QP
     block: FreeBlock  #: factor for later QPs with the same P_EE
-    columns: int  #: columns of P_EE factorised here; 0 if a stored factor was used
+    columns: int  #: number of columns of P_EE factorised; 0 if a stored factor was used
 
 
 @dataclass(frozen=True, eq=False)
 class _Saddle:
-    """Solution operator of the saddle point system for x_E and y."""
+    """Solution operator of the saddle-point system for x_E and y."""
 
     factor: Array  #: (k, k) Cholesky factor of P_EE, in the upper triangle
     G_E: Array  #: (r, k) rows of full rank
@@ -73,7 +75,7 @@ class _Saddle:
         return w - self.PG @ y, y
 
     def complement(self, P_EI: Array, P_II: Array, G_I: Array) -> Array:
-        """Return the Schur complement (n − k, n − k) of the saddle point matrix."""
+        """Return the Schur complement (n − k, n − k) of the saddle-point matrix."""
         W = dtrtrs(self.factor, P_EI, trans=1)[0]
         S: Array = P_II - W.T @ W
         if len(G_I):
@@ -83,7 +85,7 @@ class _Saddle:
 
 
 def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
-    """Eliminate the variables without bounds; returns None if that is not possible.
+    """Eliminate the variables without bounds; return None if that is impossible.
 
     Elimination requires an explicit P with positive definite P_EE, variables with and
     without bounds, no inequality rows, and consistent equality rows whose restrictions
@@ -107,7 +109,7 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     G, N, Cx = meets.T @ rows.C, others.T @ rows.C, rows.C @ rows.x_tilde
     try:
         solve = _saddle(block, G[:, free])
-    except LinAlgError:  # rows that P_EE⁻¹ makes nearly parallel
+    except LinAlgError:  # G_E P_EE⁻¹ G_Eᵀ is singular to rounding
         return None
     G_I, P_EI = G[:, ~free], _block(qp.P, free, ~free)
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
@@ -144,7 +146,7 @@ def _factorised(P_EE: Array, previous: FreeBlock | None) -> FreeBlock | None:
 
 
 def _cholesky(M: Array) -> Array:
-    """Return R of M = RᵀR (k, k) in the upper triangle; the lower one is arbitrary."""
+    """Return R with M = RᵀR in the upper triangle; the lower triangle is arbitrary."""
     factor, info = dpotrf(M.T, clean=False)
     if info:
         raise LinAlgError("not positive definite")
@@ -159,17 +161,18 @@ def _saddle(block: FreeBlock, G_E: Array) -> _Saddle:
 
 
 def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
-    """Return a block of a symmetric P, as a view if P is dense."""
+    """Return the block P[rows, columns] of a symmetric P, as a view if possible."""
     if not isinstance(P, np.ndarray):
         return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
     at, of = _as_slice(columns), _as_slice(rows)
     if isinstance(at, slice) and isinstance(of, slice):
-        return P[at, of].astype(float, copy=False).T  # as LAPACK stores it
+        # in column-major order, for LAPACK
+        return P[at, of].astype(float, copy=False).T
     return P[np.ix_(columns, rows)].astype(float, copy=False).T
 
 
 def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Return a mask as a slice if its components are consecutive."""
+    """Return a mask as a slice if its true components are consecutive."""
     at = np.flatnonzero(chosen)
     whole = at.size and at[-1] - at[0] == at.size - 1
     return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen

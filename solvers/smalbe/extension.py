@@ -1,14 +1,14 @@
 """Protocol for user-defined preconditioners and step rules in SMALBE.
 
 A subclass of `solvers.smalbe.solver.SMALBE` overrides `preconditioner_for`,
-`step_rule_for`, or both. Each is called once per QP, while that is prepared, and
-returns a function for this QP, or None to keep the built-in choice. Fields of the
-subclass are options like those of SMALBE.
+`step_rule_for`, or both. Each method is called once while a QP is prepared, and returns
+a function for this QP, or None to keep the built-in choice. Fields of the subclass are
+options like those of SMALBE.
 
-Neither function can make SMALBE return a wrong answer: a preconditioner changes the
-directions of conjugate gradients alone, and a trial point of a step rule is projected
-onto the bounds and accepted only if the cost decreases sufficiently (`Step`). The KKT
-residuals are measured by the harness in any case.
+Neither function can cause SMALBE to claim a wrong solution: a preconditioner changes
+only the directions of conjugate gradients, and the trial point of a step rule is
+projected onto the bounds and accepted only if the cost decreases sufficiently
+(`StepRule`). The harness measures the KKT residuals in any case.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ import numpy as np
 
 from mortarbench.harness import Vector
 
-#: v (n,) → Mv (n,) with a symmetric positive definite M that approximates P⁻¹
+#: function v (n,) ↦ Mv (n,) with a symmetric positive definite M ≈ P⁻¹
 Operator: TypeAlias = Callable[[Vector], Vector]
 
 
 class Step(NamedTuple):
-    """State of MPRGP where the CG step x − αp would leave the box.
+    """State of MPRGP when the CG step x − αp would leave the box.
 
     Costs, gradients and lengths refer to the augmented Lagrangian
     ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span the
@@ -37,27 +37,28 @@ class Step(NamedTuple):
     p: Vector  #: (n,) direction of conjugate gradients, zero on active bounds; gᵀp > 0
     lb: Vector  #: (n,) lower bounds
     ub: Vector  #: (n,) upper bounds
-    alpha_cg: float  #: length that minimises the cost along x − αp; may be inf
-    alpha_f: float  #: largest length for which x − αp stays within the bounds
-    alpha_bar: float  #: length of a step of gradient projection, 1.9/‖H‖ by default
+    alpha_cg: float  #: α that minimises the cost along x − αp; may be inf
+    alpha_f: float  #: largest α for which x − αp is within the bounds
+    alpha_bar: float  #: length ᾱ of a gradient projection step, 1.9/‖H‖ by default
 
 
-#: Step → trial point (n,). It is projected onto the bounds, and accepted if the cost
-#: decreases by at least φ̃ᵀφ/(2‖H‖), on which the convergence rate of MPRGP is based
-#: (Dostál and Schöberl 2005); otherwise the standard expansion is taken.
+#: function of a `Step` that returns a trial point (n,). It is projected onto the
+#: bounds, and accepted if the cost decreases by at least φ̃ᵀφ/(2‖H‖), on which the
+#: convergence rate of MPRGP is based (Dostál and Schöberl 2005); otherwise the standard
+#: expansion is taken.
 StepRule: TypeAlias = Callable[[Step], Vector]
 
 
 def checked(M: Operator) -> Operator:
-    """Return M with a test of each product: vᵀMv must be positive.
+    """Return M with a check that vᵀMv is positive in each product.
 
     Conjugate gradients would increase the cost along a direction with vᵀMv < 0.
 
     Raises
     ------
     ValueError
-        If, in a call of the returned function, the shapes of Mv and v differ or vᵀMv is
-        not a positive number.
+        Raised by the returned function if the shapes of Mv and v differ, or if v ≠ 0
+        and vᵀMv is not a finite positive number.
 
     """
 

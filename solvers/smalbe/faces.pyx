@@ -1,11 +1,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 # cython: initializedcheck=False
-"""A proximal augmented Lagrangian, minimised over a box exactly, face after face.
+"""Exact minimisation of a proximal augmented Lagrangian over a box, by faces.
 
-`Faces` updates the Cholesky factor of the Hessian on the free components. A component
-that becomes free appends a row; one that reaches a bound removes its row, and Givens
-rotations, or a factorisation of the rows behind it, restore the factor (Golub and Van
-Loan, Matrix Computations, 4th ed., 6.5.4). `solvers.smalbe.direct` uses it.
+`Faces` updates the Cholesky factor of the Hessian on the free components. A row is
+appended for a component that becomes free. The row of a component that reaches a bound
+is removed, and the factor is restored by Givens rotations or by factorising the rows
+below again (Golub and Van Loan, Matrix Computations, 4th ed., 6.5.4).
+`solvers.smalbe.direct` uses this class.
 """
 
 from cpython.exc cimport PyErr_CheckSignals
@@ -16,10 +17,12 @@ from scipy.linalg.cython_lapack cimport dpotrf
 
 import numpy as np
 
-cdef double ROUNDING = 8 * 2.0 ** -52  # of a sum of terms, relative to their sizes
-cdef double RELEASE_SHARE = 0.9  # of the largest inward gradient that is freed with it
+cdef double ROUNDING = 8 * 2.0 ** -52  # rounding of a sum, relative to the absolute terms
+# initial `share` of `minimise`: components whose gradient is at least this fraction of the
+# largest one are released together
+cdef double RELEASE_SHARE = 0.9
 cdef double FLAT = 1e-12  # diagonal entries below this times their mean count as zero
-cdef int GIVENS_COST = 6  # removing a row by rotations, in rows of a factorisation
+cdef int GIVENS_COST = 6  # cost of removing a row by rotations, in factorised rows
 
 
 def _whole(a):
@@ -29,11 +32,12 @@ def _whole(a):
 cdef class Faces:
     """½xᵀPx + qᵀx + aᵀCν + ρ/2 ‖Cν‖² + δ/2 ‖x − x_k‖²_D over l ≤ x ≤ u, ν = x − x̃.
 
-    P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, or its mean
-    where that is nearly zero. a and x_k are initially zero. L (k, k) is the factor of
-    P + ρCᵀC + δD in the order in which components became free. It is stored by rows,
-    which LAPACK reads as the columns of Lᵀ; `among` holds the columns of C in that
-    order, as rows. A component within the rounding of qᵢ/Dᵢ of a bound is set to it.
+    P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, with its
+    mean in place of entries near zero. The multipliers a and the proximal centre x_k
+    are initially zero. L (k, k) is the factor of P + ρCᵀC + δD in the order in which
+    components became free. L is stored by rows, which LAPACK reads as the columns of
+    Lᵀ; the rows of `among` are the columns of C in the same order. A component whose
+    distance to a bound is within the rounding of qᵢ/Dᵢ is set to the bound.
     """
 
     cdef Py_ssize_t n, k
@@ -51,7 +55,7 @@ cdef class Faces:
     cdef int[::1] order, place
 
     def __init__(self, P, q, C, x_tilde, bounds, double rho, double delta):
-        """Start from the projection of zero onto the box and factorise on its face.
+        """Set x to the projection of zero onto the box and factorise on its face.
 
         rho is relative to ‖P‖ (Frobenius). Raises ArithmeticError if P is not positive
         semidefinite.
@@ -91,7 +95,7 @@ cdef class Faces:
     def at(self, const double[::1] a):
         """Return x, Px and z_box (n,) for multipliers a.
 
-        z_box = −(Px + q + Cᵀa) on bounds where that has the admissible sign, else 0.
+        z_box is −(Px + q + Cᵀa) on bounds where this has the admissible sign, else 0.
         """
         cdef Py_ssize_t i, m, n = self.n
         cdef double total
@@ -118,7 +122,7 @@ cdef class Faces:
     # the factor
 
     cdef int enter(self) except -1:
-        """Update the factor to the face where the `wanted` components are free."""
+        """Update the factor for the face with the free components `wanted`."""
         cdef Py_ssize_t i, j, first = self.k, kept, base, unchanged, a, b
         cdef int gone = 0, n = self.n, r = max(self.r, 1), s, t, info = 0
         cdef double one = 1.0, minus = -1.0
@@ -200,7 +204,7 @@ cdef class Faces:
             row[r] = size
 
     cdef void solve(self):
-        """step ← (LLᵀ)⁻¹ step, its first k components."""
+        """step ← (LLᵀ)⁻¹ step, for the first k components."""
         cdef int n = self.n, k = self.k, one = 1
         self.solves += 1
         if k:
@@ -210,7 +214,7 @@ cdef class Faces:
     # the method
 
     cdef void gradient(self, const double[::1] x, double[::1] g):
-        """g ← gradient at x, `off` ← Cν; one product."""
+        """g ← gradient at x, `off` ← Cν; takes one product."""
         cdef Py_ssize_t i, m, n = self.n
         cdef double weight
         for i in range(n):
@@ -253,19 +257,19 @@ cdef class Faces:
         self.enter()
 
     def minimise(self, long most):
-        """Minimise from x on; returns False after `most` solves with factors of faces.
+        """Minimise from x; return False after `most` solves with factors of faces.
 
         1. x ← the minimum on its face, reduced until no component leaves the box.
         2. If no component at a bound has a feasible descent direction, x is the minimum.
-        3. Free those whose gradient, relative to √Pᵢᵢ, is at least a share of the
-           largest, and repeat 1. If the cost has decreased, go to 2. The share is halved
+        3. Release those whose gradient, divided by √Pᵢᵢ, is at least `share` times the
+           largest, and repeat 1. If the cost has decreased, go to 2. `share` is halved
            if no component left the face, and reset to RELEASE_SHARE otherwise.
-        4. Otherwise free only the component with the largest gradient. Step to the
+        4. Otherwise release only the component with the largest gradient. Step to the
            minimum on that face or to the first bound, fix the component that reached it,
            and repeat; go to 2.
 
         Steps 3 and 4 decrease the cost, and each ends at the minimum on a face. So no
-        face occurs twice, and there are finitely many.
+        face occurs twice, and the method is finite.
         """
         cdef long left
         self.share = RELEASE_SHARE
@@ -315,7 +319,7 @@ cdef class Faces:
         return 0
 
     cdef int advance(self, double[::1] x, double[::1] g) except -1:
-        """Step to the minimum on the face of `wanted`, fixing components on the way."""
+        """Step to the minimum on the face of `wanted`, fixing components at bounds."""
         cdef Py_ssize_t i, j
         cdef double length = 0.0, s, bound
         while length < 1:
@@ -340,11 +344,12 @@ cdef class Faces:
         return 0
 
     cdef bint release(self, double share):
-        """Mark components at bounds to be freed; returns True if there are any.
+        """Add the components to be released to `wanted`; return True if there are any.
 
-        Marked are those with a feasible descent direction whose gradient, relative to
-        √Pᵢᵢ, is at least that share of the largest and exceeds its rounding, bounded by
-        Σ|Pᵢⱼxⱼ| ≤ √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
+        Released are components at bounds with a feasible descent direction whose
+        gradient, divided by √Pᵢᵢ, is at least `share` times the largest such value. The
+        gradient must also exceed its rounding, for which Σ|Pᵢⱼxⱼ| is bounded by √Pᵢᵢ
+        Σ√Pⱼⱼ|xⱼ|.
         """
         cdef Py_ssize_t i, m
         cdef double most = 0.0, total = 0.0, inward, terms, force

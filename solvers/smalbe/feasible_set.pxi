@@ -1,34 +1,36 @@
-# The feasible set and every operation on it that MPRGP uses. The loop itself refers neither
-# to bounds nor to discs.
+# The feasible set and all operations on it that MPRGP uses; the loop itself does not
+# depend on the kind of set.
 
 
-# Relative rounding of the norm of a disc about its centre: sixteen operations. With zero,
-# discs that a step put on their boundary would count as free.
+# Relative rounding of the distance from the centre of a disc, after sixteen operations.
+# With zero, a disc whose variables a step moved to the boundary would count as free.
 cdef double DISC_ROUNDING = 16 * 2.0 ** -52
 
 
 cdef struct Line:
-    double cg  # α that minimises the cost at x − αp; inf if pᵀHp ≤ 0
-    double feasible  # the largest feasible α; may be inf if it is not below cg
+    double cg  # α that minimises the cost along x − αp; inf if pᵀHp ≤ 0
+    double feasible  # the largest feasible α; may be set to inf if it is not below cg
     double slope  # gᵀp
     double curvature  # pᵀHp
 
 
 cdef struct Parts:
     double phi_square  # ‖φ‖², φ the free gradient: g off the boundary
-    double beta_square  # ‖β‖², β the chopped gradient: the inward part of g on it
+    # ‖β‖², β the chopped gradient: on the boundary, the part of g whose descent is
+    # feasible
+    double beta_square
     double reduced_square  # φ̃ᵀφ, φ̃ = φ reduced so that x − φ̃/τ stays feasible
     double phi_Hp  # φᵀHp after a step along p
 
 
 @cython.final
 cdef class FeasibleSet:
-    """The box l ≤ x ≤ u, and discs of variables that have no bounds.
+    """The box l ≤ x ≤ u, and discs over variables without bounds.
 
     Vectors may be distributed over processes, with each disc on one of them. Each
-    operation passes over its vectors once and accumulates all sums that the step needs:
-    separate operations would read each vector several times per CG step. A disc is free
-    or active as a whole (discs.h).
+    operation passes over the vectors once and computes all sums that a step needs:
+    separate operations would read each vector several times per CG step. All variables
+    of a disc are free, or all are active (discs.h).
     """
 
     cdef Py_ssize_t n
@@ -95,7 +97,7 @@ cdef class FeasibleSet:
     cdef void project(
         self, const double *x, double alpha, const double *p, double *y
     ) noexcept:
-        """y ← P(x − αp)."""
+        """y ← Π(x − αp), with the projection Π onto the set."""
         cdef Py_ssize_t i
         for i in range(self.n):
             y[i] = fmin(fmax(x[i] - alpha * p[i], self.lower[i]), self.upper[i])
@@ -115,7 +117,7 @@ cdef class FeasibleSet:
         return 0
 
     cdef double feasible_length(self, const double *x, const double *p) noexcept:
-        """Return the largest α for which the components of this process stay in the set."""
+        """Return the largest α for which the local part of x − αp is in the set."""
         cdef double least = INFINITY
         cdef Py_ssize_t i, o, size
         if not self.has_discs:
@@ -169,8 +171,8 @@ cdef class FeasibleSet:
                      Parts *parts) except -1:
         """x ← x − αp, g ← g − αHp, and `split`.
 
-        Components within rounding of their bound are set to it: otherwise a step of
-        the largest feasible length could stop just short of the face.
+        Components within rounding of a bound are set to the bound: otherwise a step of
+        the largest feasible length could miss the face by rounding.
 
         phi, free : NULL if they are not stored
         """
@@ -195,7 +197,7 @@ cdef class FeasibleSet:
         return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """beta ← β, the part of g on the boundary that points into the set."""
+        """beta ← β, the part of g on the boundary whose descent is feasible."""
         cdef Py_ssize_t i
         for i in range(self.n):
             beta[i] = 0.0
@@ -208,7 +210,7 @@ cdef class FeasibleSet:
             chop_discs(&self.D, x, g, beta)
 
     cdef bint marks(self, const double *x, double *free) noexcept:
-        """free ← 1 off the boundary, else 0; return True if that changes any of them."""
+        """free ← 1 off the boundary, else 0; return True if any entry changed."""
         cdef Py_ssize_t i
         cdef double inside
         cdef bint changed = False
@@ -222,10 +224,11 @@ cdef class FeasibleSet:
     cdef void follow(
         self, const double *x, const double *g, const double *v, double *w
     ) noexcept:
-        """w ← T(w + κv), T the projection on the tangents of the boundary at x.
+        """w ← T(w + κv), where T projects onto the tangents of the boundary at x.
 
-        Bounds that x attains remain active, and so do discs that g holds on their
-        boundary, whose multiplier κ is the curvature of the cost along it (discs.h).
+        Bounds that x attains stay active, and so do discs that −g presses against their
+        boundary. The multiplier κ of such a disc adds curvature to the cost along the
+        boundary (discs.h).
 
         v : NULL for zero
         """
@@ -238,7 +241,7 @@ cdef class FeasibleSet:
     cdef void project_free(
         self, const double *x, const double *g, double tau, double *y
     ) noexcept:
-        """y ← P(x − φ/τ), which is x − φ̃/τ."""
+        """y ← Π(x − φ/τ), which equals x − φ̃/τ."""
         cdef Py_ssize_t i
         projected(x, g, tau, self.lower, self.upper, y, self.n)
         if self.D.count:
@@ -249,7 +252,7 @@ cdef class FeasibleSet:
     cdef void step_on_discs(
         self, const double *x, const double *g, double tau, bint free_only, double *s
     ) noexcept:
-        """s ← P(x − g/τ) − x on discs."""
+        """s ← Π(x − g/τ) − x on discs."""
         cdef double sums[2]
         cdef Py_ssize_t i
         step_on_discs(&self.D, x, g, 1 / tau, free_only, s, sums)
@@ -258,7 +261,7 @@ cdef class FeasibleSet:
 
     cdef double step_back(self, const double *x, const double *g, double tau, double *s,
                           double *square) except? -1:
-        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs."""
+        """s ← x − Π(x − g/τ), square ← ‖s‖²; returns gᵀs."""
         cdef double sums[2]
         cdef Py_ssize_t i, j, first, last
         sums[:] = [0.0, 0.0]
@@ -278,9 +281,10 @@ cdef class FeasibleSet:
 
     cdef void minimise(self, const double *x, const double *g, double tau, double *s,
                        double *piece) noexcept:
-        """s ← argmin gᵀs + τ/2‖s‖², x + s in the set.
+        """s ← argmin of gᵀs + τ/2‖s‖² over all s with x + s in the set.
 
-        piece : −1 at the lower bound, 1 at the upper, 0 between; may be NULL
+        piece : receives −1 at the lower bound, 1 at the upper bound, else 0; may be
+            NULL
         """
         model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
         if self.D.count:
@@ -290,18 +294,19 @@ cdef class FeasibleSet:
         self, Py_ssize_t first, Py_ssize_t size, const double *x, const double *g_part,
         double tau, double *s, double *piece
     ) noexcept:
-        """Apply `minimise` to a range of components; g_part and piece are of that size."""
+        """Apply `minimise` to a range of components; g_part and piece have its size."""
         model_minimiser(x + first, g_part, tau, self.lower + first, self.upper + first, s + first,
                piece, size)
 
     cdef void leave_box(self, double alpha, double beta, bint release, double *x, double *g,
                     const double *p, const double *Hp, double *x0, double *g0,
                     double *free, FeasibleSet face, double *z, double *z_g) noexcept:
-        """Step to the boundary, x ← x − αp; save the state before in x₀, g₀ and `free`.
+        """Step to the boundary, x ← x − αp; save the old state in x₀, g₀, `free`.
 
-        face : receives the set of the next step; it fixes the components that are on
-            the boundary, unless `release`
-        z, z_g : receive x − βp from the new x, outside of the set, and its gradient
+        face : receives the set for the next step, in which components on the boundary
+            are fixed unless `release`
+        z, z_g : receive the point x − βp outside the set, with the new x, and the
+            gradient there
         """
         leave_box(alpha, beta, release, x, g, p, Hp, self.lower, self.upper, x0, g0, free,
               <double *> face.lower, <double *> face.upper, z, z_g, self.n)
@@ -310,14 +315,14 @@ cdef class FeasibleSet:
         self, const double *z, const double *z_g, double tau, const double *x,
         const double *g, double *s
     ) except? -1:
-        """s ← z + argmin of `minimise` at z, minus x; returns gᵀs."""
+        """s ← z + r − x, where r is the result of `minimise` at z; returns gᵀs."""
         return self.over.total(model_minimiser_within(
             z, z_g, tau, x, g, self.lower, self.upper, s, self.n
         ))
 
     cdef double within(self, const double *z, const double *x, const double *g,
                        bint release, double *s) except? -1:
-        """s ← z + s − x, rounded to the boundary where within rounding; returns gᵀs.
+        """s ← z + s − x; within rounding of a bound, x + s is set to it; returns gᵀs.
 
         s is zero on components that the set fixes, unless `release`.
         """
@@ -328,9 +333,9 @@ cdef class FeasibleSet:
     cdef double inward_energy(self, const double *x, const double *g,
                               const double *diagonal, double norm,
                               double noise) except? -1:
-        """Return Σ (norm gᵢ)²/Dᵢ over components whose descent direction is feasible.
+        """Return Σ (norm·gᵢ)²/Dᵢ over components whose descent direction is feasible.
 
-        noise : components with a smaller gradient are left out
+        noise : components with |norm·gᵢ| ≤ noise are omitted
         """
         cdef double energy = 0.0
         cdef Py_ssize_t i, o, size

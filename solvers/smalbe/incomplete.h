@@ -7,14 +7,14 @@
    keep = 0; survey: Benzi 2002).
 
    The order is 0, 1, ... up to `half`, then n - 1, n - 2, ... down to it (twisted
-   factorisation). Within each part, a column depends on the one before, with the latency
-   of a division or some multiplications. The parts are independent of each other, except
-   within the distance `reach` of the end of the second part, so that columns of both are
-   eliminated alternately, in the time of one part.
+   factorisation). Within each part, a column depends on the previous column, with the
+   latency of a division or several multiplications. The two parts are independent of
+   each other, except within the distance `reach` of the end of the second part. So
+   their columns are eliminated alternately, in the time of one part.
 
    Only free components are included. If P has few diagonals, L is also stored by
    diagonals. Then only the entries next to the main diagonal form a recurrence, and the
-   others are subtracted for some hundred rows at once. */
+   others are subtracted for a few hundred rows at once. */
 
 #ifndef INCOMPLETE_H
 #define INCOMPLETE_H
@@ -24,16 +24,17 @@ enum {
 };
 
 typedef struct {
-    Py_ssize_t n, half, reach, count; /* count: of diagonals on one side, 0 without */
+    /* count: number of diagonals on one side; 0 if stored by columns */
+    Py_ssize_t n, half, reach, count;
     Py_ssize_t runs, first_of_second, first_of_tail;
-    Py_ssize_t width;            /* of a diagonal: n, and the reach */
+    Py_ssize_t width;            /* stored length of a diagonal: n + reach */
     const int *start, *row;      /* (n + 1,), (nnz,) later rows of each column */
     const Py_ssize_t *pair;      /* (n,) the first pair of entries of each column */
-    const int *target;           /* of each pair: the entry it changes, -1 if dropped */
+    const int *target;           /* entry changed by each pair; -1 if it is dropped */
     const double *below, *diagonal; /* the matrix, stored as L is */
     const double *scale;         /* (n,) S of the inverse S M^-1 S */
-    const Py_ssize_t *offset;    /* (count,) of the diagonals, ascending */
-    const int *between;          /* the diagonal with the distance of two, or -1 */
+    const Py_ssize_t *offset;    /* (count,) offsets of the diagonals, ascending */
+    const int *between;          /* diagonal whose offset is the difference of two, or -1 */
     int *from, *to;              /* (runs,) intervals of free components, in the order of
                                     elimination: first part, second part, its tail */
     double *L, *bands;           /* the factor by columns, or by diagonals */
@@ -57,7 +58,7 @@ append_runs(incomplete *F, in free, Py_ssize_t a, Py_ssize_t b, int down, Py_ssi
     }
 }
 
-/* Intervals of free components, none longer than `most`. */
+/* Find the intervals of free components, none longer than `most`. */
 static void find_runs(incomplete *F, in free, Py_ssize_t most)
 {
     Py_ssize_t tail = F->half + F->reach < F->n ? F->half + F->reach : F->n;
@@ -95,8 +96,8 @@ INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, doub
     return (p > least * F->diagonal[j]) & (p < INFINITY);
 }
 
-/* Eliminate column j of a matrix stored by diagonals; `count` of them is a constant for
-   the compiler. Entries that are not in the pattern of P are zero. */
+/* Eliminate column j of a matrix stored by diagonals; their number `count` is a
+   compile-time constant. Entries that are not in the pattern of P are zero. */
 INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t count,
                               double keep, double least)
 {
@@ -114,7 +115,8 @@ INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t coun
         for (Py_ssize_t d = c + 1; d < count; d++) {
             double fill = l[c] * l[d];
             int e = F->between[c * MAX_DIAGONALS + d];
-            if (e >= 0) { /* in the column of the row that is eliminated first */
+            /* the entry is in the column of the row that is eliminated first */
+            if (e >= 0) {
                 Py_ssize_t near = j + sign * F->offset[c], far = j + sign * F->offset[d];
                 Py_ssize_t column = sign > 0 && near >= half ? far : near;
                 F->bands[e * n + column] -= fill * inverse;
@@ -230,7 +232,8 @@ INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v
     }
 }
 
-/* The backward counterpart: y = D^-1 y and L', starting at the last column. */
+/* Backward substitution on a run: y = D^-1 y, then the products with L', starting at the
+   last column. */
 INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
 {
     double *y = F->y;
@@ -259,7 +262,8 @@ INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
     }
 }
 
-/* A recurrence y_i = y_i - l y_before on a run: its start and its coefficients. */
+/* The recurrence y_i = y_i - l y_j with the previous row j on a run: start and
+   coefficients. */
 typedef struct {
     Py_ssize_t at, left, step;
     const double *l;
@@ -286,7 +290,8 @@ INLINE void go_on(recurrence *c, double *y, Py_ssize_t size)
     Py_ssize_t i = c->at, step = c->step;
     double last = c->last;
     const double *l = c->l;
-    if (size) { /* there may be none before: its entry is not read where that is zero */
+    /* a previous row may not exist: its entry is not read if the coefficient is zero */
+    if (size) {
         last = y[i] - (last != 0 ? l[i] * last : 0);
         y[i] = last;
         i += step;
@@ -300,14 +305,14 @@ INLINE void go_on(recurrence *c, double *y, Py_ssize_t size)
     c->left -= size;
 }
 
-/* Two independent recurrences, evaluated alternately. */
+/* Evaluate two independent recurrences alternately. */
 INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
 {
     Py_ssize_t size = c->left < d->left ? c->left : d->left;
     Py_ssize_t i = c->at, j = d->at, up = c->step, down = d->step;
     double first = c->last, second = d->last;
     const double *l = c->l, *m = d->l;
-    if (size) { /* the ones before may be none */
+    if (size) { /* there may be no previous rows */
         go_on(c, y, 1);
         go_on(d, y, 1);
         i = c->at, j = d->at, first = c->last, second = d->last;
@@ -395,7 +400,8 @@ INLINE void backward_column(const incomplete *F, Py_ssize_t j)
     y[j] = rest;
 }
 
-/* z = S M^-1 S v for v that is zero off the free set; returns the sum of z along. */
+/* z = S M^-1 S v for v that is zero off the free set; returns the dot product of z and
+   `along`. */
 TWICE static double solve_incompletely(const incomplete *F, in v, in along, out z)
 {
     double *y = F->y, sum = 0;
@@ -442,8 +448,9 @@ projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
     return slope;
 }
 
-/* Compute the entries of S P S for P by rows and diagonal S, its largest row sum of
-   absolute values, and the smallest row sums of P and of S P S relative to the diagonal. */
+/* Compute the entries of S P S for P stored by rows and a diagonal S, the largest row sum
+   of their absolute values, and the smallest row sums of P and of S P S, each relative
+   to the diagonal entry. */
 TWICE static void
 scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
               Py_ssize_t n, out told)

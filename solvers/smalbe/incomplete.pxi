@@ -1,28 +1,29 @@
-# Incomplete Cholesky factors of the free part of a sparse P, and proportioning by them.
+# Incomplete Cholesky factors of the free block of a sparse P.
 
 
-# Share of what a factor drops that goes to its diagonal. With all of it (1), a few pivots
-# are small and CG slow where faces are irregular: torsion with n = 50 takes 45 products
-# for 32. With none, bearings take twice as many.
+# Fraction of each dropped entry that is added to the diagonal. With 1, a few pivots are
+# small and CG is slow on irregular faces: torsion with n = 50 takes 45 products instead
+# of 32. With 0, journal bearings take twice as many.
 cdef double KEEP = 0.95
 
-# Least pivot, relative to the diagonal entry. Rounding of an entry is 2⁻⁵² of it, so that
-# pivots above have six digits.
+# Smallest pivot, relative to the diagonal entry. The relative rounding of entries is
+# 2⁻⁵², so that larger pivots have six correct digits.
 cdef double LEAST_PIVOT = 1e-10
 
-# First shift of the diagonal where a pivot is too small with nothing added to it, and its
-# growth until none is (Manteuffel 1980). A diagonally dominant matrix has good pivots.
+# First relative shift of the diagonal if a pivot is too small although no dropped
+# entries are added to the diagonal, and growth of the shift until no pivot is too small
+# (Manteuffel 1980). The pivots of a diagonally dominant matrix are large enough.
 cdef double FIRST_SHIFT = 1e-3
 cdef double SHIFT_GROWTH = 4.0
 
 cdef enum:
-    # Least distance of a diagonal from the main one for which taking it off a run at once
-    # is faster than going by columns.
+    # Smallest distance of a diagonal from the main diagonal for which eliminating a run
+    # of columns at once is faster than eliminating column by column.
     LEAST_OFFSET = 8
 
 
 cdef inline bint is_later(Py_ssize_t i, Py_ssize_t j, Py_ssize_t half) noexcept nogil:
-    """Return True if i is eliminated after j: up to `half`, then down from the last."""
+    """Return True if i follows j in the order 0, …, half − 1, n − 1, …, half."""
     return i > j if j < half else half <= i < j
 
 
@@ -59,8 +60,9 @@ def sparsity(matrix):
 def scaled_by_diagonal(matrix, scale):
     """Return the entries of SPS, and bounds from its row sums.
 
-    The bounds are the largest row sum of absolute values, and the smallest row sums of
-    P and of SPS relative to the diagonal, where S² is the inverse diagonal of P.
+    The bounds are the largest row sum of absolute values of SPS, and the smallest row
+    sums of P and of SPS relative to their diagonals, where S² is the inverse diagonal
+    of P.
 
     matrix : P in SciPy's csr format; scale : S (n,)
     """
@@ -77,21 +79,23 @@ def scaled_by_diagonal(matrix, scale):
 cdef class IncompleteFactor:
     """M ≈ P_FF on the free set F, by an incomplete Cholesky factorisation.
 
-    The pattern of L is that of P. Dropped entries are added to the diagonal times `keep`,
-    KEEP or 0 (modified incomplete Cholesky, Gustafsson, BIT 18, 1978, 142-156); both are
-    in Benzi's survey (J. Comput. Phys. 182, 2002, 418-477). On a tridiagonal matrix
-    nothing is dropped, and M = P_FF. If a pivot is below LEAST_PIVOT times the diagonal
-    entry, `keep` is set to 0, and if that does not suffice, the diagonal is multiplied
-    by 1 + σ with increasing σ (Manteuffel, Math. Comp. 34, 1980, 473-497). Hence M is
-    finite and positive definite for every symmetric P with a positive diagonal. Both
-    choices are kept for all later faces.
+    The sparsity pattern of L is that of P. Dropped entries, multiplied by `keep`, which
+    is KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson,
+    BIT 18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002,
+    418-477). On a tridiagonal matrix nothing is dropped, and M = P_FF. If a pivot is
+    below LEAST_PIVOT times the diagonal entry, `keep` is set to 0, and if that does not
+    suffice, the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math.
+    Comp. 34, 1980, 473-497). Hence M is finite and positive definite for every
+    symmetric P with a positive diagonal. Both `keep` and σ are retained for all later
+    faces.
 
-    The factor is that of WPW with positive weights W, whose row sums are preserved.
-    Therefore W·1 should be a vector that P maps to zero in the interior of a domain.
+    The matrix that is factorised is WPW with a positive diagonal W; with `keep` = 1 its
+    row sums would be preserved. Therefore the vector of weights should be one that P
+    maps to zero in the interior of a domain.
 
     matrix : P in SciPy's csr or csc format, with sorted indices
-    weights : W (n,)
-    scale : S (n,); `inverse` is S M⁻¹ S
+    weights : (n,) diagonal of W
+    scale : (n,) diagonal of S; `inverse` applies S M⁻¹ S
     keep : True to add dropped entries, times KEEP, to the diagonal
     """
 
@@ -105,9 +109,9 @@ cdef class IncompleteFactor:
     cdef int *integers
     cdef Py_ssize_t *first_pairs
     cdef double *face  # (n,) 1 where a component is free in the present factor
-    cdef double *wanted  # (n,) a face that is being tried
+    cdef double *wanted  # (n,) mask of a trial face
     cdef int *queue  # (n,)
-    cdef int *besides  # (idle,) components of the present factor that are not free
+    cdef int *besides  # (idle,) components in the present factor that are not free
     cdef Py_ssize_t idle
     cdef bint is_ready
     cdef readonly double keep, shift
@@ -140,7 +144,8 @@ cdef class IncompleteFactor:
                         offset[count] = far
                         count += 1
         half = n // 2 if n >= 4 * reach and n > 1 else n
-        # 2. How many later rows, and pairs of them, there are in all columns.
+        # 2. The numbers of entries in later rows, and of pairs of them, over all
+        #    columns.
         for i in range(n):
             used = 0
             for k in range(indptr[i], indptr[i + 1]):
@@ -160,7 +165,7 @@ cdef class IncompleteFactor:
         else:
             stored = entries
         cdef Py_ssize_t[::1] at_offset = np.array(offsets if by_bands else [0], dtype=np.intp)
-        # 3. Room.
+        # 3. Memory.
         self.integers = <int *> calloc(
             5 * n + 3 + (0 if by_bands else entries) + pairs
             + MAX_DIAGONALS * MAX_DIAGONALS, sizeof(int)
@@ -195,8 +200,8 @@ cdef class IncompleteFactor:
                         entries += 1
                     below[m] = data[k] * w[i] * w[indices[k]]
             start[i + 1] = <int> entries
-        # 5. The entry between two later rows of a column, if there is one: it is in the
-        #    column of the one that is eliminated first.
+        # 5. The entry that couples two later rows of a column, if it exists: it is
+        #    stored in the column of the row that is eliminated first.
         for m in range(count):
             for k in range(count):
                 between[m * MAX_DIAGONALS + k] = -1
@@ -235,11 +240,11 @@ cdef class IncompleteFactor:
         release_memory(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
-        """Factorise on the face of the components where `free` (n,) is 1.
+        """Factorise on the face whose free components have `free` (n,) = 1.
 
-        The present factor M̃ is kept if it is that of this face or, with `may_exceed`,
-        of a larger free set. M⁻¹ is then the block of M̃⁻¹ on the face, which is positive
-        definite.
+        The present factor M̃ is reused if it belongs to this face or, with
+        `may_exceed`, to a larger free set. M⁻¹ is then the block of M̃⁻¹ on the face,
+        which is positive definite.
         """
         cdef Py_ssize_t i
         cdef bint inside = self.is_ready
@@ -270,7 +275,7 @@ cdef class IncompleteFactor:
     cdef double inverse(
         self, const double *v, const double *along, double *z
     ) noexcept:
-        """z ← S M⁻¹ S v for v that vanishes off the face; returns zᵀ along."""
+        """z ← S M⁻¹ S v for a v that is zero off the face; returns zᵀ`along`."""
         cdef Py_ssize_t i
         cdef double sum_ = solve_incompletely(&self.F, v, along, z)
         self.solves += 1
@@ -281,7 +286,7 @@ cdef class IncompleteFactor:
 
     cdef Py_ssize_t widen(self, double *free, Py_ssize_t count, long layers) noexcept:
         """Add to `free` all components within `layers` edges of `queue` (count,) in the
-        graph of P; return the new length of the queue, which contains them too."""
+        graph of P, and append them to the queue; return its new length."""
         cdef Py_ssize_t first = 0, last = count, i, k
         cdef long layer
         for layer in range(layers):
@@ -297,7 +302,7 @@ cdef class IncompleteFactor:
         return count
 
     def solve(self, free, v):
-        """Return S M⁻¹ S v (n,) of the face where `free` (n,) is true, zero elsewhere."""
+        """Return S M⁻¹ S v (n,) on the face of the true `free` (n,), zero elsewhere."""
         result, face = np.empty(self.n), np.asarray(free, dtype=float)
         masked_v = _whole(np.where(free, v, 0.0))
         self.enter(address(face))
@@ -306,5 +311,5 @@ cdef class IncompleteFactor:
 
 
 cdef _integers(a):
-    """Return an array as C ints; an empty one gets one entry, to have an address."""
+    """Return an array of C ints; [0] for an empty array, to have an address."""
     return np.ascontiguousarray(a if len(a) else [0], dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Proof that no point within the bounds meets the equality rows."""
+"""Proof that no point within the bounds satisfies the equality rows."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ import numpy as np
 from mortarbench.harness import Vector
 from mortarbench.solvers.smalbe.rows import Rows
 
-#: Radius that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof holds for
-#: points within it.
+#: value that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof applies only
+#: to points within these bounds
 SEARCH_RADIUS = 1e6
-PRODUCT_ROUNDING = 1e-12  #: rounding of a sum of products, relative to its terms
+#: rounding of a sum of products, relative to the size of the terms
+PRODUCT_ROUNDING = 1e-12
 
 
 def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
     """Return True if ν proves that no point of the box satisfies Cν' = 0.
 
-    By Farkas' lemma: with r = CᵀCν, each such ν' has rᵀν' = 0, so that none exists if
-    the minimum of rᵀν' over the box is positive. Infinite bounds are replaced by
-    SEARCH_RADIUS.
+    With r = CᵀCν, every ν' with Cν' = 0 satisfies rᵀν' = 0. So no such ν' exists in the
+    box if the minimum of rᵀν' over the box is positive (Farkas' lemma). Infinite bounds
+    are replaced by finite ones (`SEARCH_RADIUS`).
     """
     lower, upper = bounds
     Cnu = rows.C @ nu

@@ -1,20 +1,20 @@
-# KKT residuals of a QP with bounds only, from the gradient of the scaled and normalised
-# form that MPRGP solves; no product is required.
+# KKT residuals of a QP with bounds only, computed without a product from the gradient
+# of the scaled and normalised problem that MPRGP solves.
 
 
 @cython.final
 cdef class Judge:
-    """Bound the worst KKT residual of a QP at a point of its normalised form.
+    """Upper bound of the worst KKT residual of a QP at a point of its normalised form.
 
-    With the scale d of the variables, x = y/d (exactly on a bound where y is), and the
-    gradient g of the normalised form satisfies Px + q = ‖H‖ d g. The bound is then that
-    of `residual_bound`.
+    With the scale d of the variables, x = y/d componentwise (exactly at a bound if y
+    is), and the gradient g of the normalised form satisfies Px + q = ‖H‖ d g. From
+    these, the bound is computed as in `residual_bound`.
 
     qp : the original QP
     scaled : the QP in y = d x
-    root : d (n,), None for ones
+    root : d (n,); None if all are 1
     diagonal : (n,) diagonal of the original P
-    norm : ‖H‖, by which the scaled one is divided
+    norm : ‖H‖, by which the scaled QP is divided
     """
 
     cdef Py_ssize_t n
@@ -50,7 +50,7 @@ cdef class Judge:
         self.size, self.z = self.x + 3 * n, self.x + 4 * n
 
     cdef double residual(self, const double *y, const double *g) noexcept:
-        """Return the bound at y (n,) with its gradient g (n,); inf without an energy."""
+        """Return the bound at y (n,) with the gradient g (n,), or inf if unavailable."""
         cdef Py_ssize_t i, n = self.n
         cdef double sums[3]
         cdef double most[2]

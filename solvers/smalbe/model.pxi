@@ -1,10 +1,11 @@
-# A quadratic model of H, minimised over the set without products with H.
+# Quadratic model of H, which is minimised over the set without products with H.
 
 
 cdef enum:
-    # Limits of Newton's method and of its line search. The search stays 5 % off the ends
-    # of its interval, so that 60 steps shrink it to 5 % at least. If Newton's method does
-    # not end, the step is made with the largest eigenvalue for τ. Without the search
+    # Limits of Newton's method and of its line search. The search keeps 5 % away from
+    # the ends of its interval, so that 60 steps shrink it to 5 % at most. If Newton's
+    # method does not end, the step is taken with the model norm·I of the largest
+    # eigenvalue. Without the search
     # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
@@ -12,14 +13,15 @@ cdef enum:
 
 @cython.final
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis.
+    """B = τI + Uᵀ diag(w) U, where U (k, n) are the first rows of an orthonormal basis.
 
-    U holds the directions in which H is large, with eigenvalues w + τ, and τ stands for
-    H on their complement. If B ≥ H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimum of
-    the right side over the set is a gradient projection step in the metric of B. Without
-    U it is the ordinary one, x ← P(x − g/τ), whose length ‖H‖ dictates; with the largest
-    eigenvalues removed, the rest of the spectrum does. The product that each step needs
-    anyway tests whether B ≥ H; if not, τ is raised.
+    The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
+    bounds H on their complement. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the
+    minimiser of the right side over the set is a gradient projection step in the metric
+    of B. Without U this is the ordinary step x ← Π(x − g/τ), whose length is determined
+    by ‖H‖; with U, the length is determined by the rest of the spectrum. The product
+    that each step takes anyway tests whether B ≥ H along the step; if not, τ is
+    increased.
     """
 
     cdef double tau
@@ -37,18 +39,18 @@ cdef class Model:
         return B
 
     cdef Model with_tail(self, double tau):
-        """Return a model with another τ and the same w + τ, where that exceeds τ."""
+        """Return a model with a new τ and the same w + τ, where these exceed it."""
         if self.basis is None:
             return Model.of_norm(tau, self.n)
         return self.basis.model(self.k, self.w, self.tau - tau, tau)
 
     cdef int step(self, const double *x, const double *g, FeasibleSet box, double *s) except -1:
-        """s ← argmin gᵀs + ½sᵀBs, x + s in the set.
+        """s ← argmin of gᵀs + ½sᵀBs over all s with x + s in the set.
 
         With the multiplier y = WUs, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
         and y maximises the dual function, which is concave, piecewise quadratic and has
-        the gradient Us(y) − W⁻¹y in k variables. Newton's method with a line search ends
-        on the piece of the maximum.
+        the gradient Us(y) − W⁻¹y in k variables. Newton's method with a line search
+        ends on the quadratic piece that contains the maximum.
         """
         cdef Basis U = self.basis
         cdef Py_ssize_t i, newton, search, k = self.k
@@ -68,7 +70,7 @@ cdef class Model:
             begun = U.over_dual.total(dot(U.slope, dy, k))
             U.minimise_lagrangian(self, x, g, box, s)
             if not U.over.any(not same(U.piece, U.piece_there, U.places)):
-                U.finish(self, x, g, box, s)  # the Newton step is exact on one piece
+                U.finish(self, x, g, box, s)  # the Newton step is exact within a piece
                 return 0
             U.find_slope(self, s)
             now = U.over_dual.total(dot(U.slope_there, dy, k))
@@ -76,7 +78,8 @@ cdef class Model:
             for search in range(SEARCH_STEPS):
                 if fabs(now) <= 0.1 * begun or (now > 0 and t == 1) or at_low <= at_high:
                     break
-                share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+                # regula falsi, kept away from the ends
+                share = at_low / (at_low - at_high)
                 t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
                 for i in range(k):
                     there[i] = y[i] + t * dy[i]
@@ -93,7 +96,7 @@ cdef class Model:
         return Model.of_norm(self.tau + U.largest(self), self.n).step(x, g, box, s)
 
     cdef Model raised(self, const double *s, double square, double sHs):
-        """Return the model with τ raised, at most tenfold, so that sᵀBs = sᵀHs.
+        """Return the model with τ increased, at most tenfold, until sᵀBs ≥ sᵀHs.
 
         w + τ is unchanged.
 
@@ -108,7 +111,7 @@ cdef class Model:
         return self.with_tail(fmin(tau, 10 * self.tau))
 
     cdef int enter(self, const double *free) except -1:
-        """Prepare `inverse` for the face where `free` is 1."""
+        """Prepare `inverse` for the face whose free components have `free` = 1."""
         if self.basis is not None:
             self.basis.enter(self, free)
         return 0
@@ -125,8 +128,8 @@ cdef class Model:
 cdef class Basis:
     """Orthonormal rows U (k, n) of models, and the workspace for their multipliers.
 
-    `slope`, `piece` and `y` belong to the iterate of Newton's method, those with `_there`
-    to its trial point.
+    `slope`, `piece` and `y` belong to the iterate of Newton's method, the variables
+    with the suffix `_there` to the trial point.
     """
 
     cdef Py_ssize_t n, k
@@ -143,7 +146,7 @@ cdef class Basis:
     cdef double *piece_there
 
     cdef int make_room(self, Py_ssize_t stride) except -1:
-        """Allocate multipliers of `stride` numbers each."""
+        """Allocate the vectors of multipliers, of `stride` numbers each."""
         self.dual = Room(5 * stride + 2 * self.places)
         self.y, self.dy = self.dual.at, self.dual.at + stride
         self.y_there, self.slope = self.dy + stride, self.dy + 2 * stride
@@ -153,12 +156,12 @@ cdef class Basis:
         return 0
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        """Return a model of the first k rows with weights w + shift, where positive."""
+        """Return a model of those of the first k rows with a weight w + shift > 0."""
         raise NotImplementedError
 
     cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
                    double *s) except -1:
-        """Compute s, piece and slope for y = 0."""
+        """Compute s, `piece` and `slope` for y = 0."""
         raise NotImplementedError
 
     cdef int newton(self, Model B) except -1:
@@ -167,16 +170,16 @@ cdef class Basis:
 
     cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
                   double *s) except -1:
-        """Compute s(y) and its piece at `y_there`, for the components with bounds."""
+        """Compute s(y) and its piece at y = `y_there` for components with bounds."""
         raise NotImplementedError
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        """Compute Us(y) − W⁻¹y at `y_there`, after `minimise_lagrangian`."""
+        """Compute Us(y) − W⁻¹y at y = `y_there`, after `minimise_lagrangian`."""
         raise NotImplementedError
 
     cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
                     double *s) except -1:
-        """Complete s(y) at `y_there` for the components without bounds."""
+        """Compute s(y) at y = `y_there` for the components without bounds."""
         raise NotImplementedError
 
     cdef double largest(self, Model B) except? -1:
@@ -198,7 +201,7 @@ cdef class Basis:
 
 @cython.final
 cdef class DenseBasis(Basis):
-    """An array U (k, n), with U_F U_Fᵀ of the latest face F.
+    """Rows U (k, n) as an array, with U_F U_Fᵀ for the components F of the last face.
 
     Bounds occur only in the range of `size` components from `first` on; all others are
     free in every face.
@@ -245,7 +248,7 @@ cdef class DenseBasis(Basis):
         return new
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        # rows left out are usually the last ones; then the basis itself serves
+        # omitted rows are usually the last ones; then the basis itself is used
         cdef Model B = Model.__new__(Model)
         cdef Py_ssize_t i, kept = 0, last = -1, n = self.n
         cdef DenseBasis chosen = self
@@ -271,7 +274,7 @@ cdef class DenseBasis(Basis):
         return B
 
     cdef void split(self) noexcept:
-        """Separate the components that may have bounds from the others, once."""
+        """Copy the columns of components that may have bounds; only once."""
         cdef Py_ssize_t i, j, stride = self.stride
         if self.is_split:
             return
@@ -292,7 +295,7 @@ cdef class DenseBasis(Basis):
                 self.others[i * stride + j] = self.others[j * stride + i]
 
     cdef void change(self, Py_ssize_t count, double *gram) noexcept:
-        """Subtract components in `where` that are active now from gram; add the others."""
+        """Subtract from gram the now active components in `where`; add the others."""
         cdef Py_ssize_t c, q
         cdef double sign[4]
         for c in range(0, count, 4):
@@ -305,11 +308,11 @@ cdef class DenseBasis(Basis):
             add_gram(sign, self.columns, self.where + c, gram, self.stride)
 
     cdef void face(self, const double *piece) noexcept:
-        """Update `gram` to the face where `piece` (size,) is zero.
+        """Update `gram` for the face on which `piece` (size,) is zero.
 
-        The rows are orthonormal, so that gram = I − the sum over active components. To
-        limit rounding it is summed again after as many changes as components, over the
-        active or the free components, whichever are fewer.
+        Since the rows are orthonormal, gram is I minus the sum over active components.
+        To limit rounding errors, gram is summed anew after as many changes as there are
+        components, over the active or the free components, whichever are fewer.
         """
         cdef Py_ssize_t i, count, stride = self.stride
         cdef bint sums_active
@@ -331,7 +334,7 @@ cdef class DenseBasis(Basis):
         self.change(count, self.gram)
 
     cdef int factor(self, Model B, const double *piece) except -1:
-        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ² for the face F where `piece` (size,) is zero.
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², F: components with `piece` zero.
 
         This form is bounded below by τI, however large W is.
         """
@@ -374,7 +377,8 @@ cdef class DenseBasis(Basis):
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` = −Ug/τ of these
+        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` is their part of
+        # −Ug/τ
         cdef Py_ssize_t i
         rows_times(self.bounded, s + self.first, self.slope_there, B.k, self.size)
         for i in range(B.k):
@@ -431,11 +435,11 @@ cdef class DenseBasis(Basis):
 
 @cython.final
 cdef class FactoredBasis(Basis):
-    """The rows C = L⁻¹G of sparse G, with one weight w, that of the penalty.
+    """Rows C = L⁻¹G with a sparse G, with a common weight w, that of the penalty.
 
     B = τI + w Gᵀ(GGᵀ)⁻¹G with multipliers y = w(GGᵀ)⁻¹Gs; the gradient of the dual
     function is Gs(y) − GGᵀy/w. Components without bounds have s = −(g + Gᵀy)/τ, so that
-    only those with bounds, b, are evaluated for each y:
+    for each y only the components b with bounds are evaluated:
 
         Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
     """

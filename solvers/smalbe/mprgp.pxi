@@ -1,4 +1,4 @@
-# MPRGP, written in the operations of this folder, without bounds and processes.
+# MPRGP, independent of the kind of feasible set and of the distribution over processes.
 
 
 # Rounding of a cost, relative to the sum of its absolute terms: the error of a sum of k
@@ -6,30 +6,36 @@
 # `test_a_solve_that_rounding_stops_ends` takes 4000 products instead of 1000.
 cdef double NOISE = 1e-13
 
-# Smallest ratio of gᵀp to φᵀz for a CG direction p, the part of z conjugate to the earlier
-# directions. In exact arithmetic both are equal, because g is orthogonal to all earlier
-# directions. A smaller ratio shows that rounding has brought back gradient along these.
-# Without it `test_rounding_along_directions_that_were_taken_is_taken_out` fails.
+# Smallest accepted ratio of gᵀp to φᵀz, where the CG direction p is the part of the
+# preconditioned gradient z that is conjugate to the earlier directions. In exact
+# arithmetic both products are equal, because g is orthogonal to all earlier directions.
+# A smaller ratio shows that rounding has reintroduced components of g along these
+# directions. Without it `test_rounding_along_directions_that_were_taken_is_taken_out`
+# fails.
 cdef double MIN_SLOPE_RATIO = 0.5
 
 cdef enum:
-    # Directions of CG stored for a face: two passes over them read 400 vectors, as much as
-    # a product with the triangle of a dense F of 800 unknowns. With 3 directions
+    # Limit of CG directions stored for a face: two passes over them read 400 vectors,
+    # as much as a product with the triangle of a dense F of 800 unknowns. With 3
+    # directions
     # `test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns` fails.
     MAX_DIRECTIONS = 200
-    # Proportionings by the model in a row that may fail to halve ‖β‖² before one along −β.
-    # Without a limit `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
+    # Number of consecutive proportionings by the model that may fail to halve ‖β‖²
+    # before a step along −β is taken. Without a limit
+    # `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
     MAX_IDLE = 2
     # Steps before the first check for stagnation, ten times what a preconditioned dual
     # takes. Without it `test_a_solve_that_rounding_stops_ends` fails.
     FIRST_CHECK = 500
-    # CG steps on a face before a factor is brought to it that has components besides. A
-    # factor costs as much as two or three steps; with 2, as with a factor for every face,
-    # bearings and torsion with n = 100 to 300 take up to a quarter more time.
+    # Number of CG steps on a face before a factor of a larger free set is replaced by a
+    # factor of this face. A factor costs as much as two or three steps; with 2, as with
+    # a new factor for every face, journal bearings and torsion with n = 100 to 300 take
+    # up to a quarter more time.
     SETTLED = 5
-    # Least number of CG steps that may be taken beyond the boundary with a factor, which
-    # needs few to say where a face ends: with 1, torsion with n = 300 takes 293 products
-    # for 186, and a bearing with n = 600 318 for 274.
+    # Smallest limit of CG steps beyond the boundary if CG uses a factor, with which few
+    # steps suffice to predict the next face: with 1, torsion with n = 300 takes 293
+    # products instead of 186, and a journal bearing with n = 600 takes 318 instead of
+    # 274.
     BEYOND = 8
     STD = 0
     PROJCG = 1
@@ -37,31 +43,34 @@ cdef enum:
     MODEL = 3
     OWN = 4
     SPECTRAL = 5
-    # Costs with which the nonmonotone line search compares. In a prototype, Mindlin's
-    # problem with 88 to 1468 discs takes as many products with 10 or 40, 2 % more with 5
-    # and 35 % more with 1, which is monotone; with 10 428 discs, 12 % more with 10.
+    # Number of previous costs with which the nonmonotone line search compares. In a
+    # prototype, Mindlin's problem with 88 to 1468 discs takes equally many products
+    # with 10 or 40, 2 % more with 5 and 35 % more with 1 (a monotone search); with 10
+    # 428 discs, 12 % more with 10.
     MEMORY = 20
-    # Steps on an unchanged face before a Newton step. On contact patches with κ = 1e4 to
-    # 6e5 products change by up to a half between 1 and 6.
+    # Number of steps on an unchanged face before a Newton step. On contact patches with
+    # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
+    # by up to a half.
     SETTLED_FACE = 3
-    # Steps before the first Newton step, as many as the products it takes on these
-    # patches. After 10, Mindlin's problem with 1468 discs takes up to 40 % more products.
+    # Number of steps before the first Newton step, about the number of products that a
+    # Newton step takes on these patches. With 10, Mindlin's problem with 1468 discs
+    # takes up to 40 % more products.
     FIRST_NEWTON = 100
 
 
-# Share of the linear decrease that a spectral step must achieve (Armijo).
+# Fraction of the linear decrease that a spectral step must achieve (Armijo condition).
 cdef double SUFFICIENT_DECREASE = 1e-4
-# Share of the CG step from which on the step to the boundary is the whole expansion.
-# With 1, where a spectral step follows always, Mindlin's problem with 88 discs takes up
-# to 11 % more products.
+# If the step to the boundary is longer than this fraction of the CG step, it is the
+# whole expansion. With 1, which means that a spectral step always follows, Mindlin's
+# problem with 88 discs takes up to 11 % more products.
 cdef double LONG_STEP = 0.5
 
 
-# Share of the tangential gradient that conjugate gradients leave in a Newton step. With
-# 0.1, the patches take up to 1.7 times as many products.
+# Relative accuracy of conjugate gradients in a Newton step. With 0.1, the contact
+# patches take up to 1.7 times as many products.
 cdef double NEWTON_ACCURACY = 0.01
 
-# Factor of Γ² for spectral steps, which decrease φ as well as β. Over Mindlin's problem
+# Factor of Γ² for spectral steps, which decrease both φ and β. Over Mindlin's problem
 # with 60 to 1468 discs 0.01 and 1 take 5 % more products on average.
 cdef double SPECTRAL_GAMMA = 0.1
 
@@ -76,7 +85,7 @@ cdef double change_along(const Line *line, double alpha) noexcept:
 
 
 cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
-    """Reallocate an array to `size` numbers; its contents are preserved."""
+    """Reallocate an array to `size` numbers, preserving its contents."""
     held = <double *> realloc(held, max(size, 1) * sizeof(double))
     if not held:
         raise MemoryError
@@ -88,10 +97,10 @@ cdef class Directions:
     """The latest conjugate directions of CG on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
 
     In exact arithmetic, conjugacy to the last direction implies conjugacy to all k.
-    Rounding destroys this after some dozens of steps, and a new right-hand side on the
-    same face (a multiplier step) does at once. Explicit conjugation to all of them
-    costs two passes over k vectors per step (Farhat, Crivelli and Roux, Comput. Methods
-    Appl. Mech. Engrg. 117, 1994, 195-209).
+    This property is lost by rounding after a few dozen steps, and immediately if the
+    right-hand side changes on the same face (in a multiplier step). Explicit
+    conjugation to all directions costs two passes over k vectors per step (Farhat,
+    Crivelli and Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, 195-209).
 
     free : the face, 1 where a component is off the boundary (n,)
     """
@@ -116,7 +125,7 @@ cdef class Directions:
         release_memory(self.share)
 
     cdef void begin(self, const double *free) noexcept:
-        """Discard all directions; those to come belong to the face `free`."""
+        """Discard all directions; later ones belong to the face `free`."""
         self.count = self.oldest = 0
         if self.n and self.most:
             memcpy(self.free, free, self.n * sizeof(double))
@@ -126,7 +135,7 @@ cdef class Directions:
         return not self.over.any(not same(self.free, free, self.n))
 
     cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
-        """Add p with its pᵀHp; replaces the oldest direction if there is no room."""
+        """Add p with curvature = pᵀHp; replaces the oldest direction if all are in use."""
         cdef Py_ssize_t at = self.count
         if not self.most:
             return 0
@@ -142,7 +151,7 @@ cdef class Directions:
         return 0
 
     cdef double conjugate(self, const double *phi, double *p) except? -1:
-        """Make p conjugate to all directions; returns φᵀp of the old p, 0 without any."""
+        """Make p conjugate to all directions; return φᵀp of the old p, 0 without any."""
         if not self.count:
             return 0.0
         rows_times(self.Hp, p, self.share, self.count, self.n)
@@ -166,41 +175,42 @@ cdef class MPRGP:
     """Modified proportioning with reduced gradient projections.
 
     Minimises ½xᵀHx − bᵀx over a set (Dostál 2009, the paper's reference [3], Chapter 5;
-    Dostál and Schöberl 2005), H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. With the gradient g = Hx − b, the
-    free gradient φ (g where x is off the boundary), the chopped gradient β (the part of
-    g on the boundary whose descent direction is feasible) and the projected gradient
-    g^P = φ + β, each step is one of
+    Dostál and Schöberl 2005), with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. With the gradient g = Hx − b,
+    the free gradient φ (g where x is off the boundary), the chopped gradient β (the
+    part of g on the boundary whose descent direction is feasible) and the projected
+    gradient g^P = φ + β, each step is one of the following:
 
-    * c, conjugate gradient: minimise along p on the face, if that stays feasible; p is
-      made conjugate to all `Directions` taken on the face, not to the last alone
+    * c, conjugate gradient: minimise along p on the face, if the step is feasible; p is
+      made conjugate to all `Directions` taken on the face, not only to the last one
     * b, beyond: conjugate gradients on the face without its bounds, to prepare an
       expansion
     * e, expansion of the active set, by one of the expansions of
       `solvers.smalbe.options`
-    * f, fallback: the safe expansion, after one that gained too little
-    * p, proportioning: free components, by the model, along −β or by a spectral step
+    * f, fallback: the safe expansion, after an expansion with too small a decrease
+    * p, proportioning: release components, by the model, along −β or by a spectral step
     * n, Newton: minimise on the tangents of discs, see below
 
-    Proportioning if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃, for which
-    x − φ̃/τ stays in the set.
+    A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient
+    φ̃, defined by x − φ̃/τ = Π(x − φ/τ) with the projection Π onto the set.
 
-    A *spectral step* is x ← x + t(P(x − αg) − x) with the length α = sᵀs/sᵀHs of Barzilai
-    and Borwein, s the last step, and the nonmonotone line search of Birgin, Martínez and
-    Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2). On discs, whose boundary is curved,
-    steps of a fixed length take products in proportion to the condition of H. Where
-    directions of slip vary, CG cannot follow them: it begins on a face only if a step of
-    length α along φ stays in the set.
+    A *spectral step* is x ← x + t(Π(x − αg) − x) with the length α = sᵀs/sᵀHs of
+    Barzilai and Borwein for the last step s, and with the nonmonotone line search of
+    Birgin, Martínez and Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2). On discs,
+    whose boundary is curved, the number of steps of a fixed length would be
+    proportional to the condition number of H. CG is not suited to varying directions of
+    slip: it begins on a face only if a step of length α along −φ stays in the set.
 
-    Spectral steps take products in proportion to the condition of H. On a settled face
-    *Newton steps* (n) replace them: x ← P(x − d), where CG solves T(H + κ)Td = Tg on
-    the tangents of the boundary, κ being its curvature times the multiplier. They are
-    taken only if the cost decreases.
+    The number of spectral steps also grows in proportion to the condition number. On a
+    face that no longer changes, *Newton steps* (n) replace them: x ← Π(x − d), where CG
+    solves T(H + κ)Td = Tg with the projector T onto the tangents of the boundary and
+    the product κ of its curvature and the multiplier. Newton steps are taken only if
+    the cost decreases.
 
-    Every step except those of projcg and spectral steps decreases the cost, and with the model τI by as much
-    as the rate of the book requires. Except for the first expansion by a model with
-    directions, an expansion does not free components that the half step left on the
-    boundary: from one proportioning to the next the active set only grows.
-    docs/smalbe-theory.md draws the conclusions.
+    Every step except spectral steps and those of projcg decreases the cost, with the
+    model τI by at least the amount on which the rate of convergence in the book is
+    based. Except for the first expansion by a model with directions, an expansion does
+    not release components that its half step put on the boundary: between proportioning
+    steps the active set only grows. docs/smalbe-theory.md draws conclusions from this.
     """
 
     cdef Product F
@@ -241,14 +251,14 @@ cdef class MPRGP:
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef Model B  # of H; ᾱ = 1/τ is the length of gradient projection steps
-    cdef Model preconditioner  # inverted in the face; None for none
-    cdef object M  # v → Mv of a structural preconditioner; None for none
+    cdef Model preconditioner  # inverted on the face; None without preconditioning
+    cdef object M  # product v → Mv with a structural preconditioner, or None
     cdef LinearMap M_map  # the same, if it is compiled; else None
     cdef double M_scale  # ‖𝒫F𝒫‖: M approximates F⁻¹, not H⁻¹
     cdef object counts  # counts of applications of M
-    cdef object step_rule  # of a subclass (`solvers.smalbe.extension`); None for none
-    cdef IncompleteFactor factor  # of the free part of a sparse P; None for none
-    cdef long layers  # of neighbours that a proportioning lets go as well
+    cdef object step_rule  # of a subclass (`solvers.smalbe.extension`), or None
+    cdef IncompleteFactor factor  # of the free block of a sparse P, or None
+    cdef long layers  # number of layers of neighbours released by `step_by_factor`
     cdef Directions directions
     cdef Directions tangents  # of CG for a Newton step
     cdef double *marked  # 1 off the boundary, else 0, at the last spectral step
@@ -282,10 +292,10 @@ cdef class MPRGP:
     cdef bint minimise(self, long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; return True if it ended by `stops`.
 
-        Otherwise it took `most` steps, found no step, or *stagnated*: at the checks,
-        whose distance doubles from `FIRST_CHECK` on, the smallest ‖g^P‖ had not been
-        halved since the last one, and the cost had decreased by no more than the rounding
-        of its terms.
+        Otherwise `most` steps were taken, no step was possible, or the run *stagnated*:
+        since the previous check, the smallest ‖g^P‖ was not halved and the cost
+        decreased by no more than the rounding of its terms. The first check is after
+        `FIRST_CHECK` steps, each further one after twice as many.
 
         trace : receives the letters of the steps
         note : called with letter, x and g after each step; or None
@@ -333,7 +343,8 @@ cdef class MPRGP:
                 continue
             weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
             if self.parts.beta_square > self.Gamma_square * weight:
-                # 3. Proportioning: the boundary promises more decrease than the face.
+                # 3. Proportioning: releasing components promises more decrease than the
+                #    face.
                 idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
                 chopped = self.parts.beta_square
                 letter = self.proportion(
@@ -369,7 +380,7 @@ cdef class MPRGP:
             if not letter:
                 return 0
             # 7. Restart CG on the new face with the preconditioned free gradient; after
-            #    a spectral step only where CG begins there.
+            #    a spectral step, only if CG begins on this face.
             inside, began, gamma = 0, self.parts.phi_square, 0.0
             self.phi_square_at_drift = INFINITY
             begun = self.expansion != SPECTRAL
@@ -379,7 +390,7 @@ cdef class MPRGP:
             self.record_step(letter, trace, note)
 
     cdef int settle(self) except -1:
-        """Restart CG on this face if the factor also covers other components."""
+        """Restart CG with a factor of this face if the present one has more components."""
         if self.factor.idle:
             self.factor.enter(self.free)
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
@@ -426,7 +437,8 @@ cdef class MPRGP:
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
         if self.in_two:
-            memset(self.p, 0, self.n * sizeof(double))  # φ is added with the product
+            # φ is added later, together with the product
+            memset(self.p, 0, self.n * sizeof(double))
             return 0
         if self.factor is not None:
             self.factor.enter(self.free, True)
@@ -436,7 +448,7 @@ cdef class MPRGP:
         return 0
 
     cdef const double *preconditioned_gradient(self) except NULL:
-        """Return z, φ preconditioned in the face; stores the local part of zᵀHp.
+        """Return z, φ preconditioned on the face; stores the local part of zᵀHp.
 
         With P = B_FF⁻¹ of the model alone, z = Pφ; with an M that approximates F⁻¹
         without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
@@ -465,7 +477,7 @@ cdef class MPRGP:
     # 3. Proportioning
 
     cdef int proportion(self, bint by_model) except -1:
-        """Take a step that frees components; returns its letter, 0 if there is none.
+        """Take a step that releases components; return its letter, or 0 without a step.
 
         The step ends at the opposite boundary at the latest.
         """
@@ -489,11 +501,11 @@ cdef class MPRGP:
         """Minimise the model over the set, then the cost along that step.
 
         Returns 0 if the step is zero or the cost is unbounded along it. If B ≥ H the
-        minimising length is at least 1. If the product shows that B is not above H, B is
-        raised; the line search decreases the cost in either case.
+        minimising length is at least 1. If the product shows that B ≥ H is violated, τ
+        is increased; the line search decreases the cost in either case.
         """
         cdef double length
-        if self.set.has_discs:  # where a longer or shorter step leaves curved boundaries
+        if self.set.has_discs:  # any other length would leave curved boundaries
             length = self.searched_projection(self.B.tau, 0.0)
         else:
             self.B.step(self.x, self.g, self.set, self.s)
@@ -506,7 +518,7 @@ cdef class MPRGP:
         return 1
 
     cdef double searched(self, double *s, double *Hs) except? -1:
-        """Return the length of least cost along x + αs, at most max(1, α_f).
+        """Return the α that minimises the cost along x + αs, at most max(1, α_f).
 
         0 for s = 0, inf if the cost is unbounded. Replaces s by −s, so that the step is
         x − αs, and stores its `lengths` in `line`; one product.
@@ -517,7 +529,7 @@ cdef class MPRGP:
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
 
     cdef int raise_model(self, const double *s, const double *Hs) except -1:
-        """Raise the model to the curvature that a product shows."""
+        """Raise the model until sᵀBs ≥ sᵀHs, given the product Hs."""
         cdef double sums[2]
         sums[0], sums[1] = dot(s, s, self.n), dot(s, Hs, self.n)
         self.over.add(sums, 2)
@@ -533,7 +545,7 @@ cdef class MPRGP:
         return 0
 
     cdef bint spectral_step_leaves(self, bint begun) except -1:
-        """Return True if x − αφ is not in the set; False without an α.
+        """Return True if x − αp is not in the set for the length α of spectral steps.
 
         begun : false if CG has no first direction yet on this face
         """
@@ -549,8 +561,8 @@ cdef class MPRGP:
     cdef int step_spectrally(self) except -1:
         """Take a spectral step; one product. Returns 0 if the step is zero.
 
-        The cost is quadratic along the step: its product serves the line search as well
-        as the next α.
+        Since the cost is quadratic along the step, one product suffices for the line
+        search and for the next α.
         """
         cdef Py_ssize_t i
         cdef double length, most = self.cost_now
@@ -565,7 +577,7 @@ cdef class MPRGP:
         return 1
 
     cdef bint is_settled(self) except -1:
-        """Return True if the face is settled and the next Newton step has been earned."""
+        """Return True if the face has not changed lately and a Newton step is due."""
         if self.over.any(self.set.marks(self.x, self.marked)):
             self.settled = 0
         else:
@@ -574,11 +586,12 @@ cdef class MPRGP:
         return self.settled >= SETTLED_FACE and self.patience <= 0
 
     cdef bint step_by_newton(self, long most, bytearray trace) except -1:
-        """Step to the minimum on the tangents of the boundary, projected on the set.
+        """Step to the minimum on the tangents of the boundary, projected onto the set.
 
-        Returns False if that does not decrease the cost. If it does not halve the
-        projected gradient, as many other steps follow as it took products, so that
-        useless Newton steps take no more than about half of the products.
+        Returns False, with x unchanged, if this does not decrease the cost. If it does
+        not halve the projected gradient, the next Newton step is taken only after as
+        many other steps as this one took products, so that useless Newton steps take no
+        more than about half of all products.
 
         most : limit of the letters of `trace`, which receives one per step of CG
         """
@@ -636,10 +649,11 @@ cdef class MPRGP:
         return True
 
     cdef double searched_projection(self, double tau, double rise) except? -1:
-        """Return the length of the step −s = P(x − g/τ) − x; 0 for s = 0. One product.
+        """Return the length of the step along −s = Π(x − g/τ) − x, or 0 if s = 0.
 
-        It is 1 if the cost then falls enough below `rise` above its value, else that of
-        least cost. Stores s, Hs, slope and curvature, and 1/τ of the next spectral step.
+        The length is 1 if the cost there is sufficiently below its present value plus
+        `rise`, else the minimising length. Takes one product. Stores s, Hs, slope and
+        curvature, and the length α of the next spectral step.
         """
         cdef double square
         cdef Line *line = &self.line
@@ -648,8 +662,8 @@ cdef class MPRGP:
             return 0
         self.H(self.s, self.Hs)
         line.curvature = self.over.total(dot(self.s, self.Hs, self.n))
-        # gᵀs ≥ τ‖s‖² for projections. At the end of a run rounding of the large normal
-        # components of g hides it, and the step would be refused.
+        # gᵀs ≥ τ‖s‖² for projections. At the end of a run this may be violated by the
+        # rounding of large normal components of g, and the step would be rejected.
         line.slope = fmax(line.slope, tau * square)
         if line.curvature > NOISE * line.slope:
             self.spectral_length = square / line.curvature
@@ -706,9 +720,10 @@ cdef class MPRGP:
     cdef double minimise_along_p(self) except? -1:
         """Take the CG step along `line` and compute the next direction.
 
-        If rounding has brought back gradient along earlier directions, minimise along
-        all of them again, without a product. This is done only after ‖φ‖ has been halved
-        since the last time: at the level of rounding it would be repeated for ever.
+        If rounding has reintroduced components of the gradient along earlier
+        directions, the cost is minimised along all of them again, without a product.
+        This is done only if ‖φ‖ has been halved since the last time: at the level of
+        rounding it would be repeated for ever.
 
         Returns γ of a deferred update p ← φ − γp, 0 if p is up to date.
         """
@@ -733,7 +748,8 @@ cdef class MPRGP:
             self.first_direction()
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
-        add(-length, self.Cv, self.Cx, self.rows.r)  # Cp, of the product Hp
+        # `Cv` is Cp, stored by the product Hp
+        add(-length, self.Cv, self.Cx, self.rows.r)
         self.knows_Cx = knows_Cx
         z_Hp = self.parts.phi_Hp
         if self.in_two:
@@ -767,7 +783,7 @@ cdef class MPRGP:
     cdef int expand(
         self, bint is_first, long most, double enough, bytearray trace
     ) except -1:
-        """Expand the active set; returns the letter of the step, 0 if there is none.
+        """Expand the active set; return the letter of the step, or 0 without a step.
 
         is_first : true for the first expansion of the run
         most, enough : see `minimise_beyond`
@@ -805,7 +821,7 @@ cdef class MPRGP:
         return b"f" if self.expansion in (MIXED, OWN) else b"e"
 
     cdef int expand_spectrally(self) except -1:
-        """Step to the boundary, then spectrally unless that was most of the CG step."""
+        """Step to the boundary; add a spectral step unless it was most of the CG step."""
         cdef double feasible = self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
             self.spectral_length = (
@@ -816,10 +832,10 @@ cdef class MPRGP:
         return feasible > LONG_STEP * cg or self.step_spectrally()
 
     cdef int trial_of_rule(self, double *y) except -1:
-        """y ← P(x_trial − x̃), where the step rule of a subclass leads.
+        """y ← Π(x_trial − x̃) with the trial point of a subclass's step rule.
 
-        The rule is shown x = x̃ + ν, and gradient and lengths without the factor
-        1/‖𝒫F𝒫‖ of H: those of the augmented Lagrangian of the QP as given.
+        The rule receives x = x̃ + ν, and the gradient and lengths without the factor
+        1/‖𝒫F𝒫‖ of H, which are those of the augmented Lagrangian of the original QP.
         """
         cdef Py_ssize_t i, n = self.n
         cdef const double *shift = self.rows.x_tilde
@@ -847,7 +863,7 @@ cdef class MPRGP:
     cdef int expand_by_model(
         self, bint is_first, long most, double enough, bytearray trace
     ) except -1:
-        """Project the infeasible CG point z onto the set, in the metric of the model.
+        """Project the infeasible CG point z onto the set in the metric of the model.
 
         z is x − α_cg p; in a flat spectrum, where a step changes the active set little,
         CG continues from there on the face without its bounds. The cost is known at z
@@ -857,12 +873,12 @@ cdef class MPRGP:
 
         z + r minimises the right side over the set, with the tail of B divided by the
         relaxation ᾱ‖H‖, by which steps of gradient projection exceed 1/‖H‖. Components
-        that the half step put on the boundary stay there, except in the first expansion
-        of a model with directions: before it the active set is only a guess. From the
-        half step the method goes all the way to z + r if the cost there is below that at
-        x, else to the minimum along the line. If B = τI and the decrease is less than
-        φ̃ᵀφ/2τ, which gradient projection from x attains for τ ≥ ‖H‖, the latter is done
-        instead.
+        that the half step, the step to the boundary, put on the boundary stay there,
+        except in the first expansion with a model that has directions: before it the
+        active set is only a guess. From the half step the method moves to z + r if the
+        cost there is below that at x, else to the minimum along the line. If B = τI and
+        the decrease is less than φ̃ᵀφ/2τ, which gradient projection from x attains for
+        τ ≥ ‖H‖, a gradient projection step from x is taken instead.
         """
         cdef Py_ssize_t n = self.n
         cdef double *s = self.s
@@ -911,7 +927,7 @@ cdef class MPRGP:
     cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
         """Continue CG from z on the face without its bounds.
 
-        enough : ‖φ‖² at which to stop, its value when the face was entered
+        enough : ‖φ‖² at which to stop: its value when the face was entered
         most : largest number of steps, that of the CG steps on this face, but at least 1,
             and BEYOND if CG is preconditioned by a factor
         """
@@ -980,7 +996,7 @@ cdef class MPRGP:
         return self.over.total(sum_)
 
     cdef int terms_of_cost(self) except -1:
-        """`sums` ← twice the cost at x, and the sum of its absolute terms."""
+        """`sums` ← twice the cost at x, and the sum of its terms' absolute values."""
         cdef double term, sum_ = 0.0, size = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):

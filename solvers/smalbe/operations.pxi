@@ -1,13 +1,15 @@
-# Operations of which SMALBE consists: sums over processes, products with F, orthonormal
-# rows. On one process each runs without Python; sums over ranks of MPI go through Python.
+# The basic operations of SMALBE: sums over processes, products with F, and products
+# with orthonormal rows. On one process they run without Python; sums over MPI ranks
+# call Python.
 
 
 # --- numbers ------------------------------------------------------------------------
 #
-# Creating a memoryview takes as long as a pass over a thousand numbers, and a buffer or an
-# array from Python as one over a hundred: small problems would spend more time on these
-# than on products. Arrays are therefore created and accessed by NumPy's C interface, with
-# lengths known to the caller, who also keeps a reference to each array.
+# Creating a memoryview takes as long as a pass over a thousand numbers, and creating a
+# buffer or an array through Python as long as a pass over a hundred: small problems would
+# spend more time on this than on products. Arrays are therefore created and accessed
+# through NumPy's C interface. The caller passes the lengths and keeps a reference to each
+# array.
 
 
 @cython.final
@@ -28,7 +30,7 @@ cdef class Room:
 cdef double *address(a) except NULL:
     """Return the address of the first component of a C-contiguous array of doubles.
 
-    Raises ValueError for other types and for arrays that are not contiguous.
+    Raises ValueError if `a` is not an array, has another type, or is not contiguous.
     """
     if cnp.PyArray_Check(a):
         if (
@@ -69,7 +71,7 @@ cdef const double *read(a, list owners) except NULL:
     cdef const double *at
     try:
         at = address(a)
-    except ValueError:  # other numbers, or with gaps
+    except ValueError:  # another type, or not contiguous
         a = _whole(a)
         at = address(a)
     owners.append(a)
@@ -84,7 +86,7 @@ cdef copied(const double *v, Py_ssize_t n):
 
 
 cdef view(const double *v, Py_ssize_t n):
-    """Return an array (n,) that shares the memory of v; valid during the call only."""
+    """Return an array (n,) that shares the memory of v and is valid as long as v is."""
     cdef cnp.npy_intp size = n
     return cnp.PyArray_SimpleNewFromData(1, &size, cnp.NPY_DOUBLE, <void *> v)
 
@@ -92,7 +94,7 @@ cdef view(const double *v, Py_ssize_t n):
 cdef int copy_result(
     result, Py_ssize_t n, double *y, str what, double s=1.0
 ) except -1:
-    """y ← s times an array returned by Python; raises ValueError unless its size is n."""
+    """y ← s·result for an array from Python; raises ValueError unless its size is n."""
     array = _whole(result)
     if array.size != n:
         raise ValueError(f"{what} has {array.size} components; expected {n}")
@@ -111,7 +113,8 @@ cdef class Reduction:
     """Sums over the processes that share a vector; the identity on one process.
 
     ranks : a `harness.distributed.vectors.Ranks`, None for one process
-    as_slice : array (n,), ranks → distributed vector with that local slice
+    as_slice : function of an array (n,) and ranks that returns the distributed vector
+        with this local slice
     """
 
     cdef object ranks, as_slice
@@ -120,7 +123,7 @@ cdef class Reduction:
         self.ranks, self.as_slice = ranks, as_slice
 
     cdef vector(self, array):
-        """Return an array as the (distributed) vector that operators take."""
+        """Return an array as the vector that operators take, distributed over ranks."""
         return array if self.ranks is None else self.as_slice(array, self.ranks)
 
     cdef inline int add(
@@ -167,8 +170,9 @@ cdef class Reduction:
 
 
 cdef enum:
-    # From this many unknowns on a dense P is multiplied by BLAS: its triangle of 1.4 MB
-    # no longer fits into the caches of one core, and memory limits both kernels alike.
+    # From this many unknowns on, products with a dense P use BLAS: the triangle of 1.4
+    # MB no longer fits into the caches of one core, and memory bandwidth limits both
+    # kernels alike.
     BLAS_SIZE = 600
 
 
@@ -176,7 +180,7 @@ cdef enum:
 cdef class Product:
     """The operator v ↦ Pv with a counter of its products.
 
-    over : processes that share its vectors; by default one
+    over : processes that share the vectors; by default a single process
     """
 
     cdef readonly Py_ssize_t n
@@ -186,7 +190,7 @@ cdef class Product:
     cdef object matrix
     cdef const double *dense
     cdef sparse rows  # data is NULL unless P is sparse
-    cdef LinearMap map  # of an operator that is compiled; else None
+    cdef LinearMap map  # P as a compiled linear map; else None
     cdef object owners, argument
 
     def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
@@ -247,8 +251,10 @@ cdef class Product:
             self.map.apply(v, y, 1)
             if s != 1:
                 scale(s, y, self.n)
-        else:  # of a copy: an operator may change its argument or keep a reference
-            # kept, unless an operator still holds it: new memory costs page faults
+        # pass a copy of v: an operator may change its argument or keep a reference
+        else:
+            # reuse the copy, unless the operator keeps a reference: new memory causes
+            # page faults
             if self.argument is None or getrefcount(self.argument) > 2:
                 self.argument = np.empty(self.n)
             memcpy(address(self.argument), v, self.n * sizeof(double))
@@ -367,10 +373,10 @@ cdef class Rows:
         return self.are_met(address(nu), Cnu.at, tol, least)
 
     cdef int fit(self, const double *free, double *r, double *a) except -1:
-        """a ← the least-squares multipliers of `fitted` for sparse rows.
+        """a ← the least-squares multipliers defined in `fitted`, for sparse rows.
 
         free : 1 on the free components, else 0 (n,)
-        r : becomes zero off the free components
+        r : (n,) vector of `fitted`; set to zero off the free components
         """
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -391,9 +397,9 @@ cdef class Rows:
         return multipliers
 
 
-# An x̃ below this size relative to ν is rounding of e = 0: some hundred times 2⁻⁵³.
+# If ‖x̃‖/‖ν‖ is below this, x̃ counts as rounding of e = 0: several hundred times 2⁻⁵³.
 # Without it `test_a_right_hand_side_of_rounding_is_none` fails.
 cdef double SHIFT_ROUNDING = 1e-13
-# Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face F: motions of which
-# the free components have less count as zero.
+# Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face with free
+# components F: smaller eigenvalues of G_F G_Fᵀ relative to GGᵀ count as zero.
 cdef double FREE_RANK = 1e-10

@@ -1,4 +1,4 @@
-"""The options of SMALBE."""
+"""Options of SMALBE."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
-#: Rule of the expansion step, with its products.
+#: Rule of the expansion step; the number of products with F is in brackets.
 #: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: projcg: x ← P(x − α_cg p), even if the cost rises (PERMON; 2)
-#: mixed: projcg; std if the cost would rise (ESPRESO; 2 or 3)
-#: model: the CG point, projected in the metric of the model (ours; 2, or 1 if the step
-#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
-#: decrease is below that of gradient projection)
+#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2) mixed: projcg; std if
+#: the cost would rise (ESPRESO; 2 or 3) model: the CG point, projected in the metric of
+#: the model (new; 2, or 1 if the step to the boundary is the whole step; plus 1 per CG
+#: step beyond the box, plus 1 if the decrease is below that of gradient projection)
 #: spectral: a step to the boundary and, unless it is most of the CG step, a projected
 #: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
-#: replace every proportioning, and CG where it would leave the set at once (1). With
+#: replace every proportioning, and CG if its first step would leave the set (1). With
 #: discs, the value model selects spectral, since model steps require bounds
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
 #: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
 #: feasible, model
-#: model: minimise the model over the box; for B = I/ᾱ a projected gradient step. After
-#: two such steps that did not halve ‖β‖², one of cg
+#: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
+#: gradient step. After two such steps that did not halve ‖β‖², a step of the rule cg
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 Norm = Literal["lanczos", "power"]
@@ -42,26 +41,26 @@ class Options:
     expansion: Expansion = "model"  #: see `solvers.smalbe.options`
     proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
-    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, 1e6 where P offers a preconditioner, and 1
-    #: with discs
+    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
+    #: preconditioner, else 1e4
     rho: float = 0.0
-    rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grew too little
-    M: float = 1.0  #: initial precision of the inner runs, relative to ‖𝒫F𝒫‖
-    beta: float = 0.5  #: factor of M if the Lagrangian grew too little
-    eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
+    rho_growth: float = 1.0  #: factor of ρ when the Lagrangian grows too little
+    M: float = 1.0  #: initial M, in units of ‖𝒫F𝒫‖: inner runs end at ‖g^P‖ ≤ M‖Cν‖
+    beta: float = 0.5  #: factor of M when the Lagrangian grows too little
+    eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # for a sparse P, conjugation to all directions would cost more than a product
-    recycle: bool = True  #: CG conjugate to all its directions on a face; P not sparse
+    recycle: bool = True  #: conjugate to all CG directions on a face if P is not sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
-    alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
+    alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
-    # n/10 where there are bounds alone
+    # n/10 applies to bounds alone
     lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
-    # only with the preconditioners model and none: the others need all of P
-    eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
-    energy: float = 50.0  #: limit of the estimated energy error, times tol; 0: no limit
-    history: bool = False  #: whether to record each step
-    max_steps: int = 200_000  #: limit of MPRGP steps and outer iterations, in total
+    # only with the preconditioners model and none: the others require the original P
+    eliminate: Eliminate = "sequences"  #: when to eliminate free variables
+    energy: float = 50.0  #: limit of the energy error estimate, times tol; 0: none
+    history: bool = False  #: True to record each step
+    max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
     def __post_init__(self) -> None:
         check_positive(
@@ -106,22 +105,22 @@ class Options:
     def preconditioner_for(self, qp: QP) -> Operator | None:
         """Return v ↦ Mv for this QP, or None for the option `preconditioner`.
 
-        For subclasses (`solvers.smalbe.extension`). M approximates P⁻¹ and must be
-        symmetric positive definite; the loop restricts it to the face.
+        Subclasses may override this method (`solvers.smalbe.extension`). M approximates
+        P⁻¹ and must be symmetric positive definite; SMALBE restricts it to the face.
         """
         return None
 
     def step_rule_for(self, qp: QP) -> StepRule | None:
         """Return a rule for this QP, or None for the option `expansion`.
 
-        For subclasses (`solvers.smalbe.extension`). The rule is called for a trial
-        point whenever a CG step would leave the box.
+        Subclasses may override this method (`solvers.smalbe.extension`). The rule is
+        called for a trial point whenever a CG step would leave the box.
         """
         return None
 
     @property
     def is_extended(self) -> bool:
-        """True for a subclass with a preconditioner or a step rule of its own."""
+        """True for a subclass that defines its own preconditioner or step rule."""
         own = type(self)
         return (
             own.preconditioner_for is not Options.preconditioner_for

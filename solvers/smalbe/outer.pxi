@@ -1,21 +1,22 @@
 # The outer loop, and the recovery of x and its multipliers.
 
 
-# Largest penalty. There the rounding of ρQν, 2⁻⁵³ρ‖ν‖, reaches 1e-6 of ‖ν‖; beyond, it
-# would dominate the gradient. Without a limit models become indefinite
+# Largest penalty. At this value the rounding of ρQν, 2⁻⁵³ρ‖ν‖, reaches 1e-6·‖ν‖; with
+# larger values it would dominate the gradient. Without a limit models become indefinite
 # (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`); with 1e3
 # `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
 cdef double MAX_RHO = 1e10
-# Products allowed in total, relative to those spent when the gradient was small enough:
-# the energy error may cost a quarter more
+# Limit of the total number of products, relative to their number when the gradient is
+# small enough: the reduction of the energy error may cost a quarter more
 # (`test_an_energy_error_that_is_too_large_costs_some_more_products`).
 cdef double ENERGY_BUDGET = 1.25
-# Smallest τ of a model relative to the norm: steps are at most 1e4 times as long as those
-# of plain gradient projection. With zero, an F of low rank leaves τ = 0 and thus no step
-# (`test_what_once_failed`).
+# Smallest τ of a model relative to the norm: steps are at most 1e4 times as long as
+# those of ordinary gradient projection. With zero, an F of low rank leads to τ = 0 and
+# thus to no step (`test_what_once_failed`).
 cdef double MIN_TAIL = 1e-4
-# ‖g^P‖ in units of tol‖b‖ at which the KKT residual is evaluated first, and below which it
-# is no longer evaluated. At a residual of 1e-6 strings have 1e-4, and bearings 1e-5.
+# ‖g^P‖ in units of tol‖b‖: the KKT residual is first evaluated below FIRST_JUDGED;
+# below MOST_JUDGED it is no longer decisive. At a KKT residual of 1e-6, strings have
+# ‖g^P‖/‖b‖ = 1e-4, and journal bearings 1e-5.
 cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
 
@@ -24,20 +25,21 @@ cdef double MOST_JUDGED = 1e-2
 cdef class SMALBE(MPRGP):
     """Semimonotonic augmented Lagrangians: the outer loop over MPRGP.
 
-    Minimises ½νᵀHν − bᵀν subject to Cν = 0 and a set, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
-    Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
+    Minimises ½νᵀHν − bᵀν over a set, subject to Cν = 0, with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ, Q =
+    CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
     Algorithm 6.1).
 
     problem : a `solvers.smalbe.projected.Projected`
     options : a `solvers.smalbe.options.Options`
-    M : None, or v → Mv of a structural preconditioner
-    preconditioned : true if the model, or M, preconditions in the face
-    step_rule : None, or a `solvers.smalbe.extension.StepRule` in place of the expansion
+    M : product v → Mv with a structural preconditioner, or None
+    preconditioned : true if CG is preconditioned on the face, by M or by the model
+    step_rule : a `solvers.smalbe.extension.StepRule` that replaces the expansion, or
+        None
     """
 
     cdef double norm, tail, b_size
     cdef bint plain, preconditioned
-    cdef Py_ssize_t n_directions  # of the model: rows of C, then Ritz vectors
+    cdef Py_ssize_t n_directions  # number of rows of C and Ritz vectors in the model
     cdef list owners  # references to the arrays that are read
     cdef Basis basis  # these directions; None without any
     cdef Room above  # (n_directions,) their eigenvalues above the tail
@@ -47,8 +49,8 @@ cdef class SMALBE(MPRGP):
     cdef Model cached_model
     cdef double cached_rho
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
-    cdef Judge judge  # of KKT residuals; None where ‖g^P‖ says when to stop
-    cdef double next_judged  # ‖g^P‖ from which on it is asked
+    cdef Judge judge  # stopping test by KKT residuals; None if ‖g^P‖ is tested
+    cdef double next_judged  # ‖g^P‖ at or below which `judge` is evaluated next
     cdef long most_products  # limit up to which the energy error is reduced
 
     def __init__(self, problem, options, bint preconditioned, M=None, step_rule=None):
@@ -85,7 +87,7 @@ cdef class SMALBE(MPRGP):
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
-        if problem.discs:  # CG takes few steps on a face
+        if problem.discs:  # with discs, CG takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
         self.patience = FIRST_NEWTON
@@ -98,15 +100,17 @@ cdef class SMALBE(MPRGP):
     # the model
 
     cdef int choose_directions(self, ritz) except -1:
-        """Choose the directions of the models, and the tail.
+        """Choose the directions of the models and the tail, the value of τ.
 
-        The tail bounds 𝒫F𝒫 on the complement of the directions that are kept: it is the
-        last Ritz value but one plus its residual (the last, if the process ended by
-        itself; the first whose residual exceeds its value). If that is too small, MPRGP
-        raises τ by the curvature that its products show. ρQ enters as it is. In a flat
-        spectrum a short process does not even find the first eigenvector, and Ritz
-        vectors that are not eigenvectors would slow CG down: then only the norm is
-        used. Sparse rows come from many subdomains, whose spectrum is flat as well.
+        The tail estimates the norm of 𝒫F𝒫 on the complement of the selected directions:
+        it is the second to last Ritz value plus its residual. If the process ended
+        because β = 0, the last value is taken; if an earlier residual exceeds its
+        value, the first such value. If the tail is too small, MPRGP raises τ to the
+        curvature shown by its products. ρQ enters the models exactly. In a flat
+        spectrum a short process does not converge even to the first eigenvector, and
+        Ritz vectors that are not eigenvectors would slow CG down: then only the norm is
+        used. With sparse rows also only the norm is used, since they come from many
+        subdomains, whose spectrum is flat.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef Py_ssize_t first = 0, last = n
@@ -147,12 +151,13 @@ cdef class SMALBE(MPRGP):
         memcpy(basis.U, self.rows.C, r * n * sizeof(double))
         if kept:
             memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
-        self.basis, self.rows.C = basis, basis.U  # one copy stays in the cache
+        # share one copy, which stays in the cache
+        self.basis, self.rows.C = basis, basis.U
         self.rows.owners.append(basis)
         return 0
 
     cdef Model model(self, double rho):
-        """Return the model of H by the Ritz pairs and the penalty ρ."""
+        """Return the model of H with the Ritz pairs and the penalty ρ."""
         cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
         cdef Room w
         if self.basis is None:
@@ -177,7 +182,7 @@ cdef class SMALBE(MPRGP):
 
     cdef int choose_models(self) except -1:
         """Choose B and the preconditioner for this ρ."""
-        if self.plain:  # by ‖H‖ alone
+        if self.plain:  # no model, only ‖H‖
             self.B = Model.of_norm(
                 fmax(1.0, self.rho if self.rows.exist else 0.0) / self.alpha, self.n
             )
@@ -191,7 +196,7 @@ cdef class SMALBE(MPRGP):
         return 0
 
     def precondition(self, free, v, double rho):
-        """Return v (n,) preconditioned in the face of the free components (n,)."""
+        """Return v (n,) preconditioned on the face with the mask `free` (n,)."""
         cdef Py_ssize_t n = self.n
         cdef list owners = []
         is_free = np.asarray(free, dtype=float)
@@ -203,7 +208,7 @@ cdef class SMALBE(MPRGP):
         return self.over.vector(copied(self.p, n))
 
     def face_and_gradients(self, x, g):
-        """Return `free` (1 on the face, else 0), φ and β, (n,) each."""
+        """Return `free` (1 for free components, else 0), φ and β, each (n,)."""
         cdef list owners = []
         cdef Parts parts
         free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
@@ -217,8 +222,8 @@ cdef class SMALBE(MPRGP):
     def begin(self, x, mu, double rho):
         """Return ν (n,), the projection of x onto the set minus x̃, and its gradient.
 
-        The gradient contains the multipliers μ. Costs one product, none for x = 0:
-        there 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.
+        The gradient includes Cᵀμ. This takes one product, or none for x = 0, where 𝒫ν =
+        −𝒫x̃ = 0 and Hν = ρQν.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
@@ -255,16 +260,17 @@ cdef class SMALBE(MPRGP):
            that the directions of CG stay conjugate on an unchanged face.
 
         until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, for the original rows, ‖Gν‖ ≤ tol‖e‖.
-        (If b = 0, the initial gradient takes its place; if e = 0, ν that of x̃.) The
-        error in the energy norm is estimated as well (`energy_error`): ‖b‖ may consist
-        of the gaps of supports, beside which contact forces are small. It may cost a
-        quarter more products and not more: where stiffnesses differ much, rounding can
-        keep it above its limit for ever.
+        (If b = 0, the initial gradient replaces b; if e = 0, ν replaces x̃.) In
+        addition, the error in the energy norm is estimated (`energy_error`), because
+        ‖b‖ may be dominated by the displacements of supports, compared with which
+        contact forces contribute little. Its reduction may take at most a quarter more
+        products: if stiffnesses differ widely, rounding can keep the estimate above its
+        limit for ever.
 
-        4. Safeguards. If two outer iterations in a row did not halve ‖Cν‖: ρ ← 10ρ up to
-           MAX_RHO, or, if ‖Cν‖ is small enough and only the gradient is not, M ← M/10,
-           so that an inner run finally meets the tolerance, or stagnates. CᵀCν is tested
-           as a certificate of infeasibility.
+        4. Safeguards. If two consecutive outer iterations did not halve ‖Cν‖: ρ ← 10ρ,
+           at most MAX_RHO, or, if ‖Cν‖ is small enough and only the gradient is not,
+           M ← M/10, so that an inner run finally meets the tolerance, or stagnates.
+           CᵀCν is tested as a certificate of infeasibility.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
         `OuterIteration`, and the status: `Status.FAILED` if the iterates diverged.
@@ -367,9 +373,10 @@ cdef class SMALBE(MPRGP):
     cdef bint is_judged_solved(self, double size) except -1:
         """Return True if the KKT residual of the original problem is within tol.
 
-        The evaluation costs as much as some steps. It is therefore repeated only when
-        `size`, ‖g^P‖, has decreased enough, assuming that the residual is proportional
-        to it. A residual without a scale (at x = 0) leaves the decision to ‖g^P‖.
+        The evaluation costs as much as several steps. It is therefore repeated only
+        when `size`, which is ‖g^P‖, has decreased enough, on the assumption that the
+        residual is proportional to it. If the residual has no scale (at x = 0), ‖g^P‖
+        is tested instead.
         """
         cdef double residual
         if size > self.next_judged:
@@ -383,8 +390,9 @@ cdef class SMALBE(MPRGP):
         return False
 
     cdef bint is_accurate(self) except -1:
-        """Return True if the rows are met, and the energy error is small or has used its
-        share of products.
+        """Return True if the rows are satisfied and the energy error is acceptable.
+
+        It is accepted if it is small or its budget of products is used up.
         """
         self.rows.times(self.x, self.Cv)
         if not self.rows.are_met(self.x, self.Cv, self.tol, self.b_size):
@@ -398,10 +406,10 @@ cdef class SMALBE(MPRGP):
     cdef double energy_error(self) except? -1:
         """Estimate the relative energy error from the remaining gradient.
 
-        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, and each rᵢ²/F_ii is
-        a lower bound of it. On contact problems the root of their sum was 0.8 to 8.4
-        times smaller than the certified error. Gradients within the rounding of q are
-        left out. Zero for an operator F without a diagonal.
+        With the gradient r on the free components f, ‖x − x*‖_F² = rᵀF_ff⁻¹r, and each
+        rᵢ²/F_ii is a lower bound of it. On contact problems the certified error was 0.8
+        to 8.4 times the root of their sum. Gradients within the rounding of q are
+        omitted. The estimate is zero for an operator F without a known diagonal.
         """
         cdef double energy = 0.0, most = 0.0, error
         cdef Py_ssize_t i
@@ -439,9 +447,10 @@ cdef class SMALBE(MPRGP):
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        The computation of `solvers.smalbe.driver.recovered`, with normal equations for
-        the correction of a. None with discs, or if a dense C is so nearly dependent on the free
-        components that normal equations would lose the correction.
+        The computation is that of `solvers.smalbe.driver.recovered`, with normal
+        equations for the correction of a. Returns None with discs, or if the rows of a
+        dense C are so nearly dependent on the free components that normal equations
+        would be inaccurate.
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef int order = r, one = 1, info = 0
@@ -498,7 +507,7 @@ cdef class SMALBE(MPRGP):
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, C, da, rest, r, n)
-        if any_left:  # else a minimum of the cost without any constraint
+        if any_left:  # else x is the unconstrained minimum
             bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
         x_array, z_array, Fx_array = map(
             self.over.vector, (restored_x, boxes, product)

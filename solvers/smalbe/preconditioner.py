@@ -1,28 +1,29 @@
-"""Preconditioners of the CG steps in a face F of the box.
+"""Preconditioners of the CG steps on a face of the box.
 
-All except `model`, which is inverted in the face (model.pxi), and `incomplete`, which
-is factorised there (incomplete.pxi; `solvers.smalbe.scaled`), are masked:
-z_F = (M φ_F)_F with one M for all faces. The structural ones, for a dual with
-F = BK⁺Bᵀ, are
+`model` is inverted on each face (model.pxi), and `incomplete` is factorised there
+(incomplete.pxi; `solvers.smalbe.scaled`). All other preconditioners use the same matrix
+M for all faces, restricted to the free components of the face: z = Mφ with the free
+gradient φ. For a dual with F = BK⁺Bᵀ, the structural preconditioners are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
 
-where b are the components that B touches, i the others, and B_D = (BWBᵀ)⁻¹BW with the
-compliances W = diag(K_bb)⁻¹ as weights, so that the softer of two bodies takes the
-larger part of a jump (Rixen and Farhat 1999). An operator P may offer its own
-(`harness.operators.Preconditioned`).
+where b are the displacements that occur in B, i the others, and B_D = (BWBᵀ)⁻¹BW with
+the compliances W = diag(K_bb)⁻¹ as weights, so that the softer of two bodies takes the
+larger part of a jump (Rixen and Farhat 1999). An operator P may provide its own
+preconditioners (`harness.operators.Preconditioned`).
 
-Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated in a face by the model of the penalty
-B = I + (ρ − 1)Q, whose inverse there, P = B_FF⁻¹, is nearly the projector on C_Fν = 0;
-M replaces the identity on the range of that projector:
+Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated by the model of the penalty, B = I +
+(ρ − 1)Q. On the free components, here denoted by the index F, its inverse P = B_FF⁻¹ is
+nearly the projector onto C_Fν = 0. M replaces the identity on the range of that
+projector:
 
     P (‖𝒫F𝒫‖ M_FF − I) P + P
 
-This is positive definite (0 < P ≤ I), and accurate even where C_F C_Fᵀ has small
-eigenvalues, such as those of motions that contact rows resist but gluing rows hardly
-resist. The projector 𝒫 of all components, in place of P, would mix free components with
-active ones and undo the effect of a large ρ.
+This matrix is positive definite (0 < P ≤ I), and accurate even if C_F C_Fᵀ has small
+eigenvalues, such as those of motions that contact constraints resist but gluing
+constraints hardly resist. The projector 𝒫 of all components, in place of P, would mix
+free components with active ones and cancel the effect of a large ρ.
 """
 
 from __future__ import annotations
@@ -44,62 +45,66 @@ Preconditioner = Literal[
     "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
 PRECONDITIONERS = get_args(Preconditioner)
-#: Preconditioners with an explicit matrix M.
+#: preconditioners with a matrix or operator M
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
-#: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
-#: takes them one by one. Meshes of more than 24³ trilinear elements have more than two,
-#: and their factors cost twice the time that they save; with a limit of 1.5, two of
-#: 1800 runs on random AᵀA give up at 1e-12 that are solved with 2.
+#: Largest number of pairs of entries in the columns of an incomplete factor, per entry
+#: of P; the pairs determine the cost of elimination. Meshes of more than 24³ trilinear
+#: elements have more than two pairs per entry, and their factors cost twice the time
+#: that they save. With a limit of 1.5, two of 1800 runs on random AᵀA fail at tol 1e-12
+#: that are solved with 2.
 MAX_PAIRS = 2.0
-#: Least levels·spread^¼ for which a factor is used. On thirty strings, obstacles,
-#: bearings and torsions of 20 to 20 000 unknowns: below this value, a factor takes up
-#: to 2.8 times as long as `model` and saves at most 0.2 ms; above it, a factor takes at
-#: most a quarter longer (a flat obstacle, n = 110) and saves up to 97 %.
+#: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. On thirty
+#: string, obstacle, journal bearing and torsion problems of 20 to 20 000 unknowns:
+#: below this value, a factor takes up to 2.8 times as long as `model` and saves at most
+#: 0.2 ms; above it, a factor takes at most a quarter longer (a flat obstacle, n = 110)
+#: and saves up to 97 %.
 MIN_DIFFICULTY = 50.0
-#: Least spread for which a factor is used in any order of the unknowns: bearings with
-#: an eccentricity of 0.9 have 2000 to 7000
+#: smallest spread for which a factor is used whatever the number of levels: journal
+#: bearings with an eccentricity of 0.9 have spreads of 2000 to 7000
 MIN_SPREAD = 1000.0
-#: Largest spread for which variables are not scaled before a factorisation: scaling
-#: takes as long as some products
+#: largest spread for which variables are not scaled before a factorisation: scaling
+#: takes as long as several products
 MAX_UNSCALED = 2.0
-#: Least spread·n for which variables are scaled if no factor is used: below it, as in
-#: bearings of 100 to 400 unknowns, scaling takes longer than the products that it saves
+#: smallest spread·n for which variables are scaled if no factor is used: below it, as
+#: in journal bearings of 100 to 400 unknowns, scaling takes longer than the products
+#: that it saves
 MIN_SCALED = 1e5
 DEPENDENT = 1e-10  #: relative addition to diag(BWBᵀ), since B may contain repeated rows
 
 
 def preconditioned_operator(qp: QP) -> Preconditioned | None:
-    """Return the operator by which P offers preconditioners, or None."""
+    """Return P as an operator that provides preconditioners, or None."""
     if isinstance(qp.P, np.ndarray) or issparse(qp.P):
         return None
     return preconditioned(qp.P)
 
 
 class Sparsity(NamedTuple):
-    """Size and difficulty of a sparse P, for the choice of a preconditioner."""
+    """Properties of a sparse P that determine the choice of a preconditioner."""
 
-    #: pairs of entries below the diagonal in its columns: steps of an incomplete
-    #: factorisation. inf if a diagonal entry is not a positive number
+    #: number of pairs of entries below the diagonal in the same column: the steps of an
+    #: incomplete factorisation. inf if a diagonal entry is not a finite positive number
     pairs: float
-    #: n divided by twice the mean distance of the entries from the diagonal: the number
-    #: of levels into which a graph with neighbours at this distance is divided. n/2 for
-    #: a string, about √n for a grid in its natural order, less than 2 in a random one;
+    #: n divided by twice the mean distance of the off-diagonal entries from the
+    #: diagonal; an estimate of the number of levels of the graph of P. n/2 for a
+    #: string, about √n for a grid in its natural order, less than 2 for a random order;
     #: 0 for a diagonal P
     levels: float
-    spread: float  #: largest over least diagonal entry
+    spread: float  #: ratio of the largest to the smallest diagonal entry
 
 
 def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Resolve ``auto``: dirichlet if offered, a factor that pays, else model."""
+    """Resolve ``auto``: dirichlet if available, incomplete if faster, else model."""
     return resolved(qp, kind)[0]
 
 
 def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
-    """Return the preconditioner for `kind`, and True if variables are to be scaled.
+    """Return the preconditioner for `kind`, and whether variables are to be scaled.
 
-    A step with an incomplete factor costs four to seven times as much as one without:
-    it saves time if CG without it takes more than about 150 steps. The number of these
-    steps grows with the `Sparsity.levels` and with the fourth root of the `spread`.
+    A CG step with an incomplete factor costs four to seven times as much as a step
+    without one: the factor saves time if CG without it takes more than about 150 steps.
+    The number of these steps grows with `Sparsity.levels` and with the fourth root of
+    `spread`.
     """
     if kind not in ("auto", "incomplete"):
         return kind, False
@@ -118,11 +123,11 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 
 
 def has_sparse_factor(qp: QP) -> bool:
-    """Return True if an incomplete factor of the free part of P is cheap.
+    """Return True if an incomplete factor of the free block of P is cheap.
 
     A factor requires a sparse P with a positive diagonal, stored by this process, and
     bounds only, since a factor of P would not include the penalty of rows. The columns
-    of P must have so few entries that a factor costs no more than some products.
+    of P must have so few entries that a factor costs no more than several products.
     """
     return _is_sparse(qp) and _sparsity(qp).pairs <= MAX_PAIRS * qp.P.nnz
 
@@ -140,7 +145,7 @@ def _sparsity(qp: QP) -> Sparsity:
 
 
 def missing_data(qp: QP, kind: Preconditioner) -> str | None:
-    """Return the reason why `qp` has no such preconditioner, or None."""
+    """Return the reason why `kind` is unavailable for `qp`, or None."""
     if kind == "incomplete" and not has_sparse_factor(qp):
         return (
             "preconditioner 'incomplete' needs a sparse P with a positive diagonal and "
@@ -158,7 +163,7 @@ def missing_data(qp: QP, kind: Preconditioner) -> str | None:
 
 
 def structural_preconditioner(qp: QP, kind: Preconditioner) -> Operator | None:
-    """Return M as a function; None for the kinds ``model`` and ``none``."""
+    """Return M as a function; None unless `kind` is in `STRUCTURAL`."""
     if kind not in STRUCTURAL:
         return None
     diagonal = qp.diagonal()
@@ -175,10 +180,10 @@ def structural_preconditioner(qp: QP, kind: Preconditioner) -> Operator | None:
 def _of_stiffness(
     structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
 ) -> Operator:
-    """Return v ↦ B_D S B_Dᵀ v with the stiffness S of the interface."""
+    """Return v ↦ B_D S B_Dᵀ v, where S is K_bb or S_bb from `of_interface`."""
     from sksparse.cholmod import (
         cholesky,
-    )  # the other preconditioners do not need CHOLMOD
+    )  # imported here because other preconditioners do not need CHOLMOD
 
     acting = np.ones(structure.K.shape[0], dtype=bool)
     acting[structure.fixed] = False
@@ -200,7 +205,7 @@ def _lumped(K: csc_matrix, touched: Mask) -> Operator:
 
 
 def _schur(K: csc_matrix, touched: Mask) -> Operator:
-    """Return the product with the Schur complement S_bb, one solve with K_ii each."""
+    """Return the product with the Schur complement S_bb; takes one solve with K_ii."""
     from sksparse.cholmod import cholesky
 
     K_bb, K_ib = K[touched][:, touched], csc_matrix(K[~touched][:, touched])

@@ -2,10 +2,11 @@
 
 
 def orthonormal(G, e):
-    """Orthonormalise the rows of Gx = e, G (m, n), by a pivoted QR factorisation.
+    """Orthonormalise the rows of G (m, n) in Gx = e by a pivoted QR factorisation.
 
-    Returns the fields of `DenseRows` except `multipliers`, and the factorisation for
-    these: R (r, r), the independent rows (r,), the norms of all rows (m,).
+    Returns two tuples: the fields of `DenseRows` except `multipliers`, and the data
+    that the function `multipliers` needs: R (r, r), the indices of the independent rows
+    (r,), and the norms of all rows (m,).
     """
     cdef Py_ssize_t i, j, m = G.shape[0], n = G.shape[1], w = min(m, n)
     cdef int rows = m, columns = n, info = 0, most = 64 * (m + n), r = 0
@@ -63,16 +64,17 @@ def orthonormal(G, e):
     )
 
 
-# Pivots of normalised rows below this are rounding: some hundred times 2⁻⁵³. With zero
-# `test_a_repeated_row_must_ask_for_the_same` fails, with 1e-9
+# Pivots of normalised rows below this are rounding: several hundred times 2⁻⁵³. With
+# zero `test_a_repeated_row_must_ask_for_the_same` fails, with 1e-9
 # `test_nearly_parallel_rows_are_independent` does.
 cdef double RANK = 1e-13
 
 
 def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
-    """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
+    """Return y (m,) with Gᵀy = Cᵀa, from the QR factorisation of the normalised rows.
 
-    triangle, rows_kept, sizes, shares : R (r, r), the rows kept (r,), their sizes (m,), a
+    triangle, rows_kept, sizes, shares : R (r, r), the indices of independent rows (r,),
+        the norms of all rows (m,), and a (r,)
     """
     cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
@@ -90,24 +92,27 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     return result
 
 
-# Ratio of Ritz values of one size, view after FLAT_STEPS steps: with κ = 10, CG halves its error
-# in every step, and five more products would cost more than they save.
+# A spectrum counts as flat if the ratio of its Ritz values after FLAT_STEPS steps is at
+# most this: with condition number 10, CG halves its error in every step, and more
+# products for the Lanczos process would cost more than they save.
 cdef double FLAT_RATIO = 10.0
 
 cdef enum:
     FLAT_STEPS = 5
-    QR_STEPS = 30  # limit for one eigenvalue; convergence is cubic, two are usual
+    # limit of QR steps per eigenvalue; convergence is cubic, and two steps usually
+    # suffice
+    QR_STEPS = 30
 
 
 cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept nogil:
     """Compute the eigenpairs of a symmetric tridiagonal matrix (k, k), ascending.
 
     QR steps with Wilkinson's shift (Golub and Van Loan, Matrix Computations, 4th ed.,
-    Algorithm 8.3.3). For six of them LAPACK's `dstev` takes twice as long, 1.3 µs, which
-    are four products with 73 unknowns.
+    Algorithm 8.3.3). For k = 6, LAPACK's `dstev` takes twice as long, 1.3 µs, the time
+    of four products with 73 unknowns.
 
     diagonal : (k,) receives the eigenvalues
-    off : (k − 1,) entries beside the diagonal, destroyed
+    off : (k − 1,) off-diagonal entries, overwritten
     S : (k, k) receives the eigenvectors by rows
     """
     cdef int first, last, i, j, step
@@ -119,7 +124,7 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
         most = fmax(most, fabs(off[i]) if i + 1 < k else 0.0)
     if not 0 < most < INFINITY:
         return
-    for i in range(k):  # whose squares neither overflow nor vanish
+    for i in range(k):  # scaled so that squares neither overflow nor underflow
         diagonal[i] /= most
     for i in range(k - 1):
         off[i] /= most
@@ -136,7 +141,7 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
             r = sqrt(half * half + z * z)
             x = diagonal[first] - diagonal[last] + z * z / (half + (r if half > 0 else -r))
             z = off[first]
-            for i in range(first, last):  # chase the entry outside of the three diagonals
+            for i in range(first, last):  # chase the bulge outside the three diagonals
                 r = sqrt(x * x + z * z)
                 c, s = (x / r, z / r) if r > 0 else (1.0, 0.0)
                 if i > first:
@@ -166,10 +171,10 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
 
 
 cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
-    """Return True if the Ritz values of the first FLAT_STEPS steps are within FLAT_RATIO.
+    """Return True if the ratio of the Ritz values of FLAT_STEPS steps is ≤ FLAT_RATIO.
 
-    The diagonal holds Rayleigh quotients, which lie between the smallest Ritz value and
-    the largest: their ratio is a cheap first test.
+    The diagonal entries are Rayleigh quotients, which lie between the smallest and the
+    largest Ritz value, so that their ratio is a cheap first test.
     """
     cdef double theta[FLAT_STEPS]
     cdef double between[FLAT_STEPS]
@@ -188,7 +193,7 @@ cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
 
 
 def eigenpairs(diagonal, off):
-    """Return the eigenvalues (k,), ascending, and eigenvectors (k, k) by rows of a matrix.
+    """Return ascending eigenvalues (k,) and eigenvectors (k, k), as rows, of a matrix.
 
     diagonal, off : (k,) and (k − 1,) entries of a symmetric tridiagonal matrix
     """
@@ -200,15 +205,15 @@ def eigenpairs(diagonal, off):
 
 
 def lanczos(Product F, Rows C, start, int steps):
-    """Compute upper Ritz pairs of 𝒫F𝒫 from start (n,); returns the fields of `Ritz`.
+    """Compute upper Ritz pairs of 𝒫F𝒫 from `start` (n,); return the fields of `Ritz`.
 
-    Lanczos process with full reorthogonalisation; one product per step, and at most as
-    many steps as 𝒫 has rank. The three-term recurrence leaves a vector of the size of
-    the next β, so that one pass of orthogonalisation suffices. The residual of the pair
-    (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
-    FLAT_STEPS steps if all Ritz values are within FLAT_RATIO: CG then needs few steps and
-    no model. No vectors are returned if the first pair has not converged, since no model
-    uses them.
+    The Lanczos process with full reorthogonalisation takes one product per step, and at
+    most rank(𝒫) steps. After the three-term recurrence, the vector is about as long as
+    the next β, so that one pass of reorthogonalisation suffices. The residual of the
+    pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
+    FLAT_STEPS steps if the spectrum `is_flat`: CG then needs few steps and no model. No
+    vectors are returned if the first pair has not converged, since no model would use
+    them.
 
     C : rows that span the kernel of 𝒫
     """
@@ -263,7 +268,7 @@ def lanczos(Product F, Rows C, start, int steps):
     diagonalise(diagonal, off, S, kept)
     values, residuals = empty(kept), empty(kept)
     value, residual = address(values), address(residuals)
-    for i in range(kept):  # in descending order
+    for i in range(kept):  # descending values
         k = kept - 1 - i
         value[i] = diagonal[k]
         residual[i] = beta * fabs(S[k * kept + kept - 1])
@@ -275,22 +280,24 @@ def lanczos(Product F, Rows C, start, int steps):
     return values, residuals, vectors, at_start
 
 
-# Largest residual of the first Ritz pair, relative to its value, in a spectrum that
-# decays: after twelve steps it is at most 1e-12 on duals of contact, and 1e-2 on a
-# Laplacian. With 1 or 1e-14 `test_compiled_and_written_steps_are_the_same` fails.
+# The first Ritz pair counts as converged if its residual, relative to its value, is at
+# most this. After twelve steps the residual is at most 1e-12 on duals of contact
+# problems, and 1e-2 on a Laplacian. With 1 or 1e-14
+# `test_compiled_and_written_steps_are_the_same` fails.
 cdef double RITZ_RESIDUAL = 1e-3
 
 
-# 𝒫F𝒫 counts as zero if its norm is below this times the mean eigenvalue of F: some
+# 𝒫F𝒫 counts as zero if its norm is below this times the mean eigenvalue of F: several
 # hundred times 2⁻⁵³.
 cdef double NORM_ROUNDING = 1e-13
 
 
 def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
-    """Return b (n,), the bounds of ν = x − x̃, and the norm; one product, unless x̃ = 0.
+    """Return b (n,), the bounds of ν = x − x̃, and the norm; one product if x̃ ≠ 0.
 
-    diagonal : of F (n,), empty if unknown
-    norm : of 𝒫F𝒫; if it is zero up to rounding, the mean eigenvalue of F replaces it
+    diagonal : diagonal of F (n,), empty if unknown
+    norm : estimate of ‖𝒫F𝒫‖; if it is zero up to rounding, the mean eigenvalue of F is
+        used and returned instead
     """
     cdef Py_ssize_t i, n = F.n, known = len(diagonal)
     cdef list owners = []
@@ -305,7 +312,8 @@ def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
     cdef double *b = address(result)
     cdef double *l = address(lower)
     cdef double *u = address(upper)
-    cdef double sums[4]  # ‖d − Fx̃‖², ‖𝒫(d − Fx̃)‖², the trace, its components
+    # ‖d − Fx̃‖², ‖𝒫(d − Fx̃)‖², trace of F, number of terms in the trace
+    cdef double sums[4]
     cdef double mean
     cdef bint moved = False
     sums[0] = sums[2] = 0.0
@@ -323,7 +331,7 @@ def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
     sums[1], sums[3] = dot(b, b, n), known
     over.add(sums, 4)
     if sums[1] <= 1e-28 * sums[0]:
-        memset(b, 0, n * sizeof(double))  # d was in the span of Cᵀ up to rounding
+        memset(b, 0, n * sizeof(double))  # d − Fx̃ is in the range of Cᵀ up to rounding
     mean = sums[2] / fmax(sums[3], 1.0)
     if not norm > NORM_ROUNDING * mean:
         norm = mean or 1.0

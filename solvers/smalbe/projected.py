@@ -1,4 +1,4 @@
-"""The homogenised, projected and normalised form of a bound and equality QP."""
+"""Homogenised, projected and normalised form of a QP with bounds and equalities."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from mortarbench.solvers.smalbe.spectrum import Ritz, power_method, random_start
 
 
 class Spectrum(NamedTuple):
-    """The norm and the upper end of the spectrum of 𝒫F𝒫."""
+    """Norm and upper end of the spectrum of 𝒫F𝒫."""
 
     norm: float  #: ‖𝒫F𝒫‖, positive
-    ritz: Ritz | None  #: None after the power method
+    ritz: Ritz | None  #: upper Ritz pairs; None if they were not computed
 
     def orthogonal_to(self, rows: Rows) -> Spectrum:
         """Return the spectrum with Ritz vectors projected onto the kernel of `rows`."""
@@ -43,29 +43,29 @@ class Spectrum(NamedTuple):
 
 @dataclass(eq=False)
 class Projected:
-    """Steps 1 to 3 of SMALBE: H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and b."""
+    """Result of steps 1 to 3 of SMALBE: the data of H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ, and b."""
 
     F: Product
     rows: Rows
-    C: compiled.Rows  #: `rows` as the compiled loop takes them
+    C: compiled.Rows  #: `rows` in the form for the compiled algorithm
     spectrum: Spectrum
     b: Vector
     bounds: tuple[Vector, Vector]  #: bounds of ν = x − x̃
     q: Vector  #: q of the original QP
-    diagonal: Vector  #: diagonal of F; empty if an operator F does not have it
-    #: counts other than products with F
+    diagonal: Vector  #: diagonal of F; empty for an operator F without a known diagonal
+    #: counts of operations other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: preconditioner on the face; None to use the option `preconditioner`
     preconditioner: Preconditioner | None = None
     #: incomplete factor of the free part of a sparse F in scaled variables, if any
     factor: compiled.IncompleteFactor | None = None
-    #: test of KKT residuals of the given QP; None where ‖g^P‖ decides when to stop
+    #: stopping test by KKT residuals of the original QP; None if the test is on ‖g^P‖
     judge: compiled.Judge | None = None
-    discs: tuple[Discs, ...] = ()  #: discs of x
+    discs: tuple[Discs, ...] = ()  #: discs of x, not of ν
 
     @property
     def hull(self) -> tuple[Vector, Vector]:
-        """The smallest box that contains ν."""
+        """Bounds (n,) of the smallest box that contains all feasible ν."""
         if not self.discs:
             return self.bounds
         lower, upper = (bound.copy() for bound in self.bounds)
@@ -78,7 +78,7 @@ class Projected:
 class OuterIteration(NamedTuple):
     """Result of one outer iteration."""
 
-    trace: str  #: the steps of its inner run
+    trace: str  #: letters of the steps of its inner run
     M: float  #: precision M of its inner run
     rho: float  #: penalty ρ of its inner run
     infeasibility: float  #: ‖Cν‖
@@ -105,9 +105,9 @@ class Iterate(NamedTuple):
 def projected_problem(
     qp: QP, find: Callable[[Product, compiled.Rows], Spectrum]
 ) -> Projected:
-    """Homogenise, project and normalise; one product with F and those of `find`.
+    """Homogenise, project and normalise; takes one product and those of `find`.
 
-    find : estimates the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or a stored result
+    find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
     """
     over, whole = Reduction(), True
     if isinstance(qp.q, DistributedVector):
@@ -131,7 +131,7 @@ def projected_problem(
 
 
 def _diagonal(qp: QP) -> Vector:
-    """Return a copy of the diagonal of P; empty if an operator P does not have it."""
+    """Return a copy of the diagonal of P; empty if the diagonal is unknown."""
     if isinstance(qp.P, np.ndarray):
         return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()
@@ -141,7 +141,7 @@ def _diagonal(qp: QP) -> Vector:
 def by_lanczos(
     F: Product, C: compiled.Rows, *, steps: int, start: Vector | None = None
 ) -> Spectrum:
-    """Estimate the norm and the upper Ritz pairs by `steps` products.
+    """Estimate the norm and the upper Ritz pairs with at most `steps` products.
 
     start : (n,) start vector; default: random
     """
@@ -151,7 +151,7 @@ def by_lanczos(
 
 
 def by_power(F: Product, C: compiled.Rows) -> Spectrum:
-    """Estimate the norm by PERMON's power method; up to 50 products."""
+    """Estimate the norm by PERMON's power method, with at most 50 products."""
     rows = C.source
     norm = power_method(partial(times_projected, F, rows), rows.x_tilde.size)
     return Spectrum(norm or 1.0, None)

@@ -1,30 +1,33 @@
-# Proportioning by an incomplete factor of the free part of P.
+# Proportioning with an incomplete factor of the free block of P.
 
 
 cdef double gain_of_projection(MPRGP at) except? -1:
-    """Return a lower bound of the decrease of the cost by the step to P(x − g/τ).
+    """Return a lower bound of the decrease of the cost in the step to Π(x − g/τ).
 
-    With s = P(x − g/τ) − x and τ ≥ ‖H‖, the bound is −gᵀs/2, because gᵀs ≤ −τ‖s‖².
+    With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
+    −gᵀs/2, because gᵀs ≤ −τ‖s‖².
     """
     at.set.minimise(at.x, at.g, at.B.tau, at.s, NULL)
     return -0.5 * at.over.total(dot(at.g, at.s, at.n))
 
 
 cdef bint step_by_factor(MPRGP at) except -1:
-    """Free components, and take a step by the factor of the enlarged free set.
+    """Release components at bounds and step with the factor of the enlarged free set.
 
-    With F the free components and those at a bound from which the gradient leads inside,
+    Let F be the free components and those at a bound from which −g points into the set.
+    With the projection Π onto the set,
 
-        s = P(x − M⁻¹g_F) − x,    x ← x + αs
+        s = Π(x − M⁻¹g_F) − x,    x ← x + αs
 
-    where α minimises the cost along s within the set; this is Newton's step if M is
-    exact. The boundary of a contact zone moves by only one component in such a step,
-    because only adjacent components are released. Therefore `layers` of neighbours in
-    the graph of P are released as well; those that M⁻¹g pushes outside stay at their
-    bounds. If most of these neighbours leave their bounds, the number of layers is
-    doubled, otherwise halved; it is reset to zero after an expansion. The step is
-    accepted only if the cost decreases by at least `gain_of_projection`; otherwise a
-    gradient projection step is taken, at the cost of one more product.
+    where M ≈ P_FF is the incomplete factorisation and α minimises the cost along s
+    within the set. This is a projected Newton step if M is exact. The boundary of a
+    contact zone moves by only one component in such a step, because only adjacent
+    components are released. Therefore `layers` of neighbours in the graph of P are
+    released too; those that the step would move out of the set stay at their bounds. If
+    most of these neighbours leave their bounds, the number of layers is doubled,
+    otherwise halved; it is reset to zero after an expansion. The step is accepted only
+    if the cost decreases by at least `gain_of_projection`; otherwise a gradient
+    projection step is taken, at the cost of one more product.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor

@@ -1,12 +1,13 @@
-# An upper bound of the KKT residuals of the original QP, without a product. Scales and
-# errors are those of `harness.verify.kkt`, from `harness/verify/scales.h`.
+# Upper bound of the KKT residuals of the original QP, without a product with P. Scales
+# and errors are defined as in `harness.verify.kkt`, with `harness/verify/scales.h`.
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
-    """Bound the worst of `harness.kkt_residuals` from above, without products.
+    """Return an upper bound of the worst of `harness.kkt_residuals`, without products.
 
-    Uses the smallest scale of energy that `kkt_residuals` may use and attributes nothing
-    to rounding, so that a small bound implies small residuals. inf if no bound is known.
+    The bound uses the smallest energy scale that `kkt_residuals` may use and attributes
+    nothing to rounding, so that a small bound implies small residuals. It is inf if it
+    cannot be evaluated.
 
     s : a `Solution` without multipliers of inequality rows
     diagonal : diagonal of P (n,), empty for an operator without one
@@ -93,7 +94,7 @@ cdef void terms_of_sparse_rows(
     CompressedRows G, const double *e, const double *x, const double *own_size,
     const double *size, double *missed, double *own, double *known
 ) noexcept:
-    """`terms_of_rows` of sparse rows, from their transpose (n, m); outputs begin at 0."""
+    """Compute `terms_of_rows` for sparse rows from Gᵀ (n, m); `own`, `known` start at 0."""
     cdef Py_ssize_t i
     cdef int j
     for i in range(G.k):

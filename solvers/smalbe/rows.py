@@ -1,21 +1,22 @@
-"""Equality rows Gx = e as orthonormal rows C: dense, or by a sparse Cholesky factor.
+"""Equality rows Gx = e as orthonormal rows C, dense or with a sparse Cholesky factor.
 
 A few rows are orthonormalised by a pivoted QR factorisation, which also reveals their
-rank (`DenseRows`). Thousands of sparse rows, such as those of the rigid modes of
-subdomains, are only divided by their norms, and
+rank (`DenseRows`). Thousands of sparse rows, such as those for the rigid modes of
+subdomains, are only divided by their norms, and the operators
 
     GGᵀ = LLᵀ,   C = L⁻¹G,   𝒫 = I − CᵀC = I − Gᵀ(GGᵀ)⁻¹G
 
-are applied by products with G and solves with L (`SparseRows`); the rows must be
-independent. A model of the penalty ρCᵀC (model.pxi) needs solves with G_F G_Fᵀ + κGGᵀ
-on a face F. These matrices differ from (1 + κ)GGᵀ only in rows with entries in bounded
-components. In contact problems only few subdomains have such rows c; if they are
-ordered last, each face needs only a factorisation of the Schur complement on c
-(`harness.distributed.sparse.BorderedFactor`).
+are applied by products with G and solves with L (`SparseRows`). Such rows must be
+independent. The model of the penalty ρCᵀC (model.pxi) requires solves with G_F G_Fᵀ +
+κGGᵀ, where F are the free components of a face. This matrix differs from (1 + κ)GGᵀ
+only in rows with entries in bounded components. In contact problems, only a few
+subdomains have such rows. If these rows are ordered last, each face requires only a
+factorisation of their Schur complement (`harness.distributed.sparse.BorderedFactor`).
 
-On several ranks this is the *coarse problem*, with a row for each rigid mode of every
-subdomain. Each rank eliminates its local rows (`_OverRanks`). If it shares many of them
-with other ranks, all ranks factorise the whole matrix instead.
+On several ranks, GGᵀ is the matrix of the *coarse problem*, with a row for each rigid
+mode of every subdomain. Each rank eliminates the rows that only its components enter
+(`_OverRanks`). If many rows are shared between ranks, every rank factorises the whole
+matrix instead.
 """
 
 from __future__ import annotations
@@ -52,21 +53,22 @@ from mortarbench.solvers.smalbe import compiled
 Mask: TypeAlias = NDArray[np.bool_]
 SparseColumns: TypeAlias = Any  #: a sparse array, `LocalRows` or `DistributedColumns`
 
-CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to x̃ and e
-RANK = 1e-13  #: smaller pivots of normalised rows count as rounding
+CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to ‖x̃‖∞ + ‖e‖∞
+RANK = 1e-13  #: smaller squared pivots of normalised rows count as rounding
 FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
-MAX_BORDER = 2000  #: limit of rows with bounded components: their block is dense
-MAX_DENSE_ENTRIES = 2000  #: limit of entries of C; larger sparse rows stay sparse
+#: limit of rows with entries in bounded components, whose block is dense
+MAX_BORDER = 2000
+MAX_DENSE_ENTRIES = 2000  #: sparse G with more than this many entries m·n stay sparse
 
 
 class Transposed(Protocol):
-    """Cᵀ (n, r)."""
+    """The transpose Cᵀ (n, r) as an operator."""
 
     def __matmul__(self, a: Vector, /) -> Vector: ...
 
 
 class Orthonormal(Protocol):
-    """C (r, n) with CCᵀ = I."""
+    """Rows C (r, n) with CCᵀ = I, as an array or an operator."""
 
     @property
     def T(self) -> Transposed: ...
@@ -76,32 +78,33 @@ class Orthonormal(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Rows(ABC):
-    """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
+    """Equality rows Gx = e in the form Cx = Cx̃ with orthonormal C."""
 
     G: Matrix  #: (m, n) original rows
     C: Orthonormal  #: (r, n)
     e_size: float  #: ‖e‖
-    least_pivot: float  #: smallest pivot of the normalised rows, 1 for orthogonal ones
+    #: smallest pivot of the normalised rows; 1 if they are orthogonal
+    least_pivot: float
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
-    consistent: bool  #: true if Gx = e has a solution
-    multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
+    consistent: bool  #: True if Gx = e has a solution
+    multipliers: Callable[[Vector], Vector]  #: function a (r,) ↦ y (m,) with Gᵀy = Cᵀa
 
     def project(self, v: Vector) -> Vector:
-        """Apply 𝒫 = I − CᵀC."""
+        """Return 𝒫v with 𝒫 = I − CᵀC."""
         return self.combined(1.0, v, -1.0, self.C @ v)
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
-        """Return sv + tCᵀa."""
+        """Return s·v + t·Cᵀa."""
         return s * v + t * (self.C.T @ a)
 
     @property
     def no_multipliers(self) -> Vector:
-        """Zero multipliers (r,) of Cx = Cx̃."""
+        """Multipliers (r,) of Cx = Cx̃ that are all zero."""
         return np.zeros(len(self.C))
 
     @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        """Return the a (r,) with the least ‖(r + Cᵀa)_F‖ on the free components F."""
+        """Return the a (r,) that minimises ‖(r + Cᵀa)_F‖ on the free components F."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,26 +126,26 @@ class SparseRows(Rows):
     unit: SparseColumns  #: (r, n) rows of G divided by their norms
     gram: GramFactor  #: Cholesky factor of the Gram matrix of `unit`
     bounded: NDArray[np.int64]  #: (b,) components with a bound
-    of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
+    of_bounded: SparseColumns  #: (r, b) columns of `unit` for these components
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         return self.combined_rows(s, v, t, self.gram.backward(a))
 
     def combined_rows(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
-        """Return sv + tGᵀy, with the normalised rows G."""
+        """Return s·v + t·Gᵀy for the normalised rows G."""
         if isinstance(self.unit, LocalRows):
             return self.unit.T.combined(s, v, t, y)
         return np.asarray(s * v + t * np.asarray(self.unit.T @ y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
-        """Return weights times (v − Gᵀy), with the normalised rows G."""
+        """Return weights·(v − Gᵀy), componentwise, for the normalised rows G."""
         if isinstance(self.unit, LocalRows):
             return self.unit.T.weighted_difference(v, y, weights)
         return np.asarray((v - np.asarray(self.unit.T @ y)) * weights)
 
     @property
     def on_one_process(self) -> bool:
-        """True if this process has all rows and columns."""
+        """True if this process stores all rows and columns."""
         return isinstance(self.unit, LocalRows) and self.unit.ranks is None
 
     @property
@@ -152,7 +155,7 @@ class SparseRows(Rows):
         return self.C @ np.zeros_like(self.x_tilde)
 
     def error(self, nu: Vector) -> Vector:
-        """Return Gν (m,)."""
+        """Return Gν (m,) for the original rows G."""
         return np.asarray(self.G @ nu)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
@@ -172,23 +175,25 @@ class GramFactor(Protocol):
         """Return L⁻ᵀa."""
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ."""
+        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ, F: free components."""
 
 
 @dataclass(frozen=True, eq=False)
 class WholeGram:
-    """Factor of all rows, replicated on every rank.
+    """Cholesky factor of GGᵀ for all rows, replicated on every rank.
 
-    Active bounds of a face change the block of GGᵀ of the rows with entries in bounded
-    components, the border of the factor: only its Schur complement is factorised again.
+    Active bounds of a face change only the block of GGᵀ for the rows with entries in
+    bounded components. These rows are the border of the factor, of which only the Schur
+    complement is factorised again.
     """
 
-    unit: LocalRows | DistributedColumns  #: G
+    unit: LocalRows | DistributedColumns  #: normalised rows G (r, n)
     matrix: Matrix  #: GGᵀ
     factor: BorderedFactor
-    has_border: bool  #: False if most rows have bounded components
+    has_border: bool  #: False if more than `MAX_BORDER` rows have bounded components
     bounded: NDArray[np.int64]  #: (b,) components with a bound
-    of_bounded: LocalRows | DistributedColumns  #: (r, b) columns of G at these
+    #: (r, b) columns of G for these components
+    of_bounded: LocalRows | DistributedColumns
 
     def product(self, y: Vector) -> Vector:
         return np.asarray(self.matrix @ y)
@@ -218,22 +223,23 @@ class WholeGram:
             except DependentRowsError:
                 shift = min(
                     100 * shift, 1.0
-                )  # ends at 1 at the latest, since GGᵀ has a factor
+                )  # the loop ends at shift = 1 at the latest, since GGᵀ has a factor
 
 
 @dataclass(frozen=True, eq=False)
 class _OverRanks:
-    """Factor over ranks; each rank has the rows with entries in its columns.
+    """Factor of GGᵀ over ranks; each rank stores the rows with entries in its columns.
 
-    See `harness.distributed.factor`. The *changing* rows are those with entries in
-    bounded components; active bounds of a face change their block of GGᵀ.
+    The factor is described in `harness.distributed.factor`. Rows with entries in
+    bounded components are called *changing*, because active bounds of a face change
+    their block of GGᵀ.
     """
 
-    matrix: csc_array  #: G_p G_pᵀ of the columns of rank p
+    matrix: csc_array  #: G_p G_pᵀ with the columns G_p of rank p
     local: LocalFactor
     factor: SummedFactor
     bounded: NDArray[np.int64]  #: (b,) components of rank p with a bound
-    of_bounded: LocalRows  #: (k, b) columns of G_p at these
+    of_bounded: LocalRows  #: (k, b) columns of G_p for these components
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
@@ -262,10 +268,11 @@ class _OverRanks:
 
 @dataclass(frozen=True, eq=False)
 class LocalRows:
-    """Rows with entries in the columns of this process; products add up over ranks.
+    """Rows with entries in the columns of this process; products are sums over ranks.
 
-    Only Gᵀ is stored, by components. Both products then pass over the components in
-    order and access the rows, which are few, at random: these stay in the cache.
+    Only Gᵀ is stored, row by row. Products with G and Gᵀ both pass over its rows in
+    order and access vectors (k,) at random. These vectors are short and stay in the
+    cache.
     """
 
     transposed: CompressedRows  #: (n_p, k)
@@ -284,7 +291,7 @@ class LocalRows:
         return self.vector(self.transposed.transposed_times(v))
 
     def vector(self, part: Vector) -> Vector:
-        """Return an array as a vector over the ranks."""
+        """Return an array as a distributed vector; unchanged on one process."""
         return part if self.ranks is None else distributed(part, self.ranks)
 
 
@@ -296,18 +303,18 @@ class _LocalRowsTransposed:
         return self.rows.vector(self.rows.transposed @ y)
 
     def combined(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
-        """Return sv + tGᵀy, in one pass."""
+        """Return s·v + t·Gᵀy in one pass over memory."""
         return self.rows.vector(self.rows.transposed.combined(s, v, t, y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
-        """Return weights times (v − Gᵀy), in one pass."""
+        """Return weights·(v − Gᵀy), componentwise, in one pass over memory."""
         difference = self.rows.transposed.weighted_difference(v, y, weights)
         return self.rows.vector(difference)
 
 
 @dataclass(frozen=True, eq=False)
 class _Factored:
-    """Operator C = L⁻¹G for normalised rows G (r, n), L the Cholesky factor of GGᵀ."""
+    """Operator C = L⁻¹G for normalised rows G (r, n) with GGᵀ = LLᵀ."""
 
     unit: SparseColumns
     gram: GramFactor
@@ -341,11 +348,11 @@ def is_sparse(G: Matrix) -> bool:
 
 
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
-    """Orthonormalise the rows of G (m, n), by a sparse factor if they are many.
+    """Orthonormalise the rows of G (m, n); with a sparse factor if G `is_sparse`.
 
-    Linearly dependent rows are treated as dense. If a dense array would exceed the
-    memory limit, or the rows are distributed over ranks, a maximal independent subset
-    replaces them.
+    If sparse rows are linearly dependent, they are converted to a dense array. If this
+    array would exceed the memory limit, or the rows are distributed over ranks, a
+    maximal independent subset replaces them.
 
     bounded : (n,) mask of components with a bound
     """
@@ -363,18 +370,18 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
 
 
 def _factored(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
-    """Factorise GGᵀ; returns None for linearly dependent rows."""
+    """Factorise GGᵀ; return None if the rows are linearly dependent."""
     over_ranks = isinstance(G, DistributedColumns)
     return (rows_over_ranks if over_ranks else sparse_rows)(G, e, bounded)
 
 
 def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
-    """Replace G (m, n) by independent rows; the multipliers of the others are zero.
+    """Replace G (m, n) by independent rows; multipliers of dropped rows are zero.
 
     Raises
     ------
     ValueError
-        If rounding hides which of the rows are independent.
+        If the selected rows turn out to be linearly dependent up to rounding.
 
     """
     gram = _gram(G)
@@ -401,13 +408,13 @@ def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
 
 
 def _consistent(missed: Vector, x_tilde: Vector, e: Vector) -> bool:
-    """Return True if unit rows with the least-squares error `missed` are consistent."""
+    """Return True if normalised rows with the error `missed` (m,) are consistent."""
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e).max(initial=0.0)
     return bool((np.abs(missed) <= CONSISTENCY_TOL * scale).all())
 
 
 def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
-    """Factorise GGᵀ of sparse G (m, n); returns None for linearly dependent rows."""
+    """Factorise GGᵀ of a sparse G (m, n); return None for linearly dependent rows."""
     b = np.flatnonzero(np.asarray(bounded))
     unit: LocalRows | DistributedColumns
     of_bounded: LocalRows | DistributedColumns
@@ -450,7 +457,7 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
 def rows_over_ranks(
     G: DistributedColumns, e: Vector, bounded: Mask
 ) -> SparseRows | None:
-    """Factorise GGᵀ of G (m, n) over ranks; returns None for linearly dependent rows.
+    """Factorise GGᵀ of G (m, n) over ranks; return None for linearly dependent rows.
 
     e : (m,) replicated on all ranks
     """
@@ -500,7 +507,7 @@ def rows_over_ranks(
 
 
 def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:
-    """Return G_F G_Fᵀ for the columns F (n,), by default all; small ones as arrays."""
+    """Return G_F G_Fᵀ for a mask F (n,) of columns; a small result as an array."""
     if isinstance(G, DistributedColumns):
         return G.gram(columns)
     if isinstance(G, LocalRows):

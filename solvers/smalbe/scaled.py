@@ -1,9 +1,9 @@
-"""Variables of a sparse QP scaled by the roots of its diagonal, and the way back.
+"""Scaling of the variables of a sparse QP by √diag P, and the inverse transformation.
 
 With D = diag(P) and y = D¹ᐟ²x the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ², whose diagonal is
 one (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all diagonal
-scalings it has nearly the least condition number). Bounds stay bounds. KKT residuals
-are those of the original QP (`compiled.Judge`).
+scalings it has nearly the least condition number). Bounds of x become bounds of y. The
+stopping test uses KKT residuals of the original QP (`compiled.Judge`).
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diag
 from mortarbench.solvers.smalbe.preconditioner import MAX_UNSCALED
 from mortarbench.solvers.smalbe.projected import Spectrum
 
-#: Sums Σⱼ Pᵢⱼwⱼ below zero by no more than this, relative to Pᵢᵢwᵢ, are rounding.
+#: a negative sum Σⱼ Pᵢⱼwⱼ counts as zero down to this times −Pᵢᵢwᵢ
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A QP in scaled variables, factors of its matrix, and the way back."""
+    """A QP in scaled variables, with data for its factor and the recovery of x."""
 
     given: QP
-    P: Matrix  #: P of `given`, sorted, by rows or columns
+    P: Matrix  #: P of `given`, in CSR or CSC format with sorted indices
     diagonal: Vector  #: (n,) diagonal of this P
     qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
-    norm: float  #: upper bound of the norm of its matrix: the largest row sum Σⱼ|Hᵢⱼ|
-    weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
+    #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
+    norm: float
+    weights: Vector  #: (n,) w > 0; Pw ≥ 0 up to rounding if `has_weights`
     has_weights: bool
-    with_factor: bool  #: True to precondition by an incomplete factor
+    with_factor: bool  #: True to use an incomplete factor as preconditioner
 
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
@@ -66,16 +67,16 @@ class Scaled:
         )
 
     def spectrum(self) -> Spectrum:
-        """Bound the norm of the matrix by Gershgorin's theorem, without a product."""
+        """Return the bound of the norm by Gershgorin's theorem, without Ritz pairs."""
         return Spectrum(self.norm, None)
 
     def factor(self) -> IncompleteFactor:
-        """Set up the incomplete factor of H/norm."""
+        """Return the incomplete factor of H/norm, where H is the matrix of `qp`."""
         scale = np.sqrt(self.norm) * self.root * self.weights
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
 
     def recovered(self, s: Solution) -> Solution:
-        """Return the point of the original QP; where y is at a bound, so is x."""
+        """Return the point of the original QP; x is at a bound exactly where y is."""
         if self.qp is self.given:
             return s
         x = np.clip(s.x / self.root, self.given.lb, self.given.ub)

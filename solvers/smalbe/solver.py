@@ -6,17 +6,17 @@ discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's referenc
 Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps
 (mprgp.pxi).
 
-1. Compute orthonormal rows C with the same span as those of G; transform e likewise.
+1. Compute orthonormal rows C with the same span as the rows of G; transform e likewise.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
-4. Run the outer loop (outer.pxi) over MPRGP (mprgp.pxi); without equality rows this is
-   one run of MPRGP.
+4. Run the outer loop (outer.pxi) over MPRGP (mprgp.pxi); without equality rows it
+   consists of one run of MPRGP.
 
 New in this implementation: the Lanczos process that estimates the norm also yields the
-upper Ritz pairs. These and C define a model of H (model.pxi) with three uses: steps
-that change the face, a preconditioner in the face, and a large ρ without loss of
-conditioning. The presets reproduce the methods of other codes.
+upper Ritz pairs. These pairs and C define a model of H (model.pxi) with three uses: for
+steps that change the face, as a preconditioner on the face, and to permit a large ρ
+without loss of conditioning. The presets reproduce the methods of other codes.
 """
 
 from __future__ import annotations
@@ -33,12 +33,13 @@ from mortarbench.solvers.smalbe.preconditioner import missing_data
 
 @dataclass(frozen=True)
 class SMALBE(Options):
-    """In-house SMALBE with MPRGP for bounds and equalities; needs only products with P.
+    """In-house SMALBE with MPRGP for bounds and equalities; uses only products with P.
 
-    Discs, which bound friction in space, are accepted as well.
+    Discs, such as bounds of friction forces in 3D, are accepted too.
 
-    `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. The solver claims
-    success only if the KKT residuals of the original QP are within 5·tol as well.
+    `tol` bounds ‖g^P‖/‖b‖, with the projected gradient g^P of the projected problem,
+    and ‖Gx − e‖/‖e‖. A point is claimed solved only if the KKT residuals of the
+    original QP are also within 5·tol.
     """
 
     about: ClassVar[About] = About(
@@ -73,10 +74,10 @@ class SMALBE(Options):
         return lambda qp: prepare(qp, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        """Start a sequence in which each QP passes its results on to the next.
+        """Start a sequence in which each QP passes its results to the next.
 
-        These are the point, the multipliers, the Ritz pairs and the factor of the free
-        block.
+        The results are the point, the multipliers, the Ritz pairs and the factor of the
+        free block.
         """
         carry: Carry | None = None
 

@@ -1,4 +1,4 @@
-"""The upper end of the spectrum of a symmetric positive semidefinite operator."""
+"""Upper end of the spectrum of a symmetric positive semidefinite operator."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ class Ritz(NamedTuple):
     """Ritz pairs, in descending order of their values."""
 
     values: Vector  #: (k,)
-    residuals: Vector  #: (k,) ‖Hv − θv‖, the largest distance of θ from an eigenvalue
+    #: (k,) ‖Hv − θv‖, a bound of the distance of θ from an eigenvalue
+    residuals: Vector
     #: (k, n) orthonormal rows; (0, n) if the first pair has not converged
     vectors: NDArray[np.float64]
     at_start: float  #: Rayleigh quotient of the start vector
 
     @property
     def norm(self) -> float:
-        """θ₁ plus its residual, an upper bound of the eigenvalue near θ₁."""
+        """Largest Ritz value plus its residual: an upper bound of an eigenvalue."""
         return float(self.values.item(0) + self.residuals.item(0))
 
 

@@ -1,4 +1,5 @@
-/* Loops over vectors of MPRGP (`tests/support/textbook/kernels.py` has them in NumPy).
+/* Loops over vectors for MPRGP, also written in NumPy in
+   `tests/support/textbook/kernels.py`.
 
    Each function is compiled twice, for processors with AVX2 and FMA and for all others;
    the loader chooses. Selections are written as expressions, so that the compiler can
@@ -22,8 +23,8 @@
 typedef const double *restrict in;
 typedef double *restrict out;
 
-/* Four components at once. Written out, because the vectoriser of the compiler produces
-   slower code for loops that accumulate several sums in one pass. */
+/* Process four components at once. This is written out, because the vectoriser of the
+   compiler produces slower code for loops that accumulate several sums in one pass. */
 typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 #define FOUR(a) (*(const four *) (a))
 #define EACH(s) ((four){(s), (s), (s), (s)})
@@ -35,8 +36,9 @@ INLINE double total(four t)
 
 #define BLOCK 256 /* components that stay in the cache from one loop to the next */
 
-/* A sparse symmetric matrix F (n, n): by its rows, or, where `count` is not zero, by its
-   diagonals 0, o₁, o₂, … above: `diagonals` (count, n) has F[i, i + o] at i. */
+/* A sparse symmetric matrix F (n, n), stored by rows, or, if `count` is not zero, by its
+   upper diagonals with offsets 0, o₁, o₂, …: column i of `diagonals` (count, n)
+   contains F[i, i + o]. */
 typedef struct {
     Py_ssize_t n, count;
     const int *indptr, *indices;
@@ -74,7 +76,8 @@ sum_of_terms(const double *const *f, const double *const *w, Py_ssize_t terms, d
     }
 }
 
-/* y = s F v of the rows from first to last by diagonals; y begins at row first. */
+/* y = s F v for the rows from `first` to `last` of an F stored by diagonals; y begins at
+   row `first`. */
 INLINE void
 rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v,
                   out y)
@@ -109,7 +112,7 @@ rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, 
     }
 }
 
-/* y = s F v of the rows from first to last; y begins at row first. */
+/* y = s F v for the rows from `first` to `last`; y begins at row `first`. */
 INLINE void
 some_rows(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v, out y)
 {
@@ -202,7 +205,7 @@ static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *o
     return count;
 }
 
-/* Fill diagonals (count, n), initially zero, by the slots that `find_diagonals` wrote. */
+/* Fill diagonals (count, n), initially zero, with slots written by `find_diagonals`. */
 static void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
 {
     for (Py_ssize_t i = 0; i < F->n; i++)
@@ -342,8 +345,7 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     }
 }
 
-/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows U by rows, in one pass over v, which may be
-   y. */
+/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows u of U, in one pass over v, which may be y. */
 INLINE void
 add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_ssize_t n)
 {
@@ -362,8 +364,8 @@ add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_
     }
 }
 
-/* y = v + s Uᵀc for U (k, n) by rows, up to eight of which share a pass over v, which may
-   be y. The last rows come first, because `rows_times` leaves them in the L1 cache. */
+/* y = v + s Uᵀc for U (k, n) stored by rows, with one pass over v for up to eight rows; v
+   may be y. The last rows come first, because `rows_times` leaves them in the L1 cache. */
 TWICE static void combination(double s, in U, in c, const double *v, double *y,
                               Py_ssize_t k, Py_ssize_t n)
 {
@@ -470,9 +472,9 @@ update_direction_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssiz
     }
 }
 
-/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Each block of Hp = s F p is computed
-   in the same pass over memory; if `is_update`, p = φ − γp is computed ahead of it, as far
-   as the product reads p. */
+/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Hp = s F p is computed block by block
+   in the same pass over memory. If `is_update`, p = φ − γp is computed just before, as
+   far as the product with the block reads p. */
 INLINE void find_lengths(const sparse *F, double s, int is_update, double gamma, in x,
                          in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
                          out result)
@@ -600,10 +602,10 @@ split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ss
     result[2] += reduced;
 }
 
-/* x = x - αp and g = g - αHp; components within rounding of a bound are set to it. x₀,
-   g₀ and `free` (1 on the face, else 0) receive the state before. box_lower, box_upper:
-   the box of the next step, which fixes components on a bound unless `release`. z = x - βp
-   and its gradient z_g. */
+/* x = x - αp and g = g - αHp; components within rounding of a bound are set to it. x₀, g₀
+   and `free` (1 on the face, else 0) receive the previous state. box_lower, box_upper:
+   receive the box for the next step, in which components at bounds are fixed unless
+   `release`. z, z_g: receive x - βp and the gradient there. */
 TWICE static void leave_box(double alpha, double beta, int release, out x, out g, in p, in Hp,
                         in lower, in upper, out x0, out g0, out free, out box_lower,
                         out box_upper, out z, out z_g, Py_ssize_t n)
@@ -824,7 +826,7 @@ TWICE static Py_ssize_t changed(in piece, out is_active, Py_ssize_t n, int *rest
     return count;
 }
 
-/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in squares of `stride` numbers a side, a
+/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in arrays (stride, stride) with `stride` a
    multiple of four; `root` and G have zeros from column k on. */
 TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
                          Py_ssize_t stride)
@@ -837,9 +839,10 @@ TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
     }
 }
 
-/* S = RᵀD⁻¹R (k, k) with the diagonal D of R, by Gaussian elimination in a square of
-   `stride` numbers a side, a multiple of four, zeros from column k on: R takes the place
-   of S, 1/Dᵢᵢ is in `inverse`, zeros are beyond k; 0 where S is not positive definite. */
+/* S = RᵀD⁻¹R (k, k) with the diagonal D of R, by Gaussian elimination in an array (stride,
+   stride), with `stride` a multiple of four and zeros from column k on. R replaces S;
+   `inverse` receives 1/Dᵢᵢ, and zeros beyond k. Returns 0 if S is not positive
+   definite. */
 TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
 {
     for (Py_ssize_t i = 0; i < k; i++) {
@@ -848,7 +851,7 @@ TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t
             return 0;
         inverse[i] = 1 / r[i];
         for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < i; j++)
-            r[j] = 0; /* not part of R, and would grow from face to face */
+            r[j] = 0; /* this entry is not part of R and would grow from face to face */
         for (Py_ssize_t j = i + 1; j < k; j++) {
             four s = EACH(r[j] * inverse[i]);
             for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < stride; l += 4)
@@ -862,8 +865,8 @@ TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t
     return 1;
 }
 
-/* y = S⁻¹y with S as it was `eliminated`, four components at once; y has `stride` of
-   them, of which those from k on become zero. */
+/* y = S⁻¹y with the factors of S from `eliminated`, four components at once; y has
+   `stride` components, and those from k on become zero. */
 TWICE static void solve(const double *R, const double *inverse, double *y,
                         Py_ssize_t stride)
 {
@@ -973,7 +976,8 @@ INLINE double largest_of(four t)
 }
 
 /* x = shift + ν, clipped to [lb, ub], and equal to lb or ub where ν is at its bound: the
-   sum alone may differ from it in the last bit. `free` is 1 where ν is at no bound. */
+   sum alone may differ from the bound in the last bit. `free` is 1 where ν is at no
+   bound. */
 TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, out x,
                            out free, Py_ssize_t n)
 {
@@ -1092,7 +1096,7 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
         all += r;
         at_most = LARGER(r, at_most);
     }
-    /* the worst error is at least at_most / largest, so that few components are left */
+    /* the worst error is at least at_most / largest, so few components must be examined */
     worst = LARGER(at_most / largest, worst);
     for (Py_ssize_t i = 0; i < n; i++) {
         double r = fabs(forces[i]), step, room;
@@ -1106,8 +1110,8 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
     return isfinite(all) ? worst : INFINITY;
 }
 
-/* size = scale of each variable by the energy, 0 if that gives none; own = scale without
-   the energy. */
+/* size = scale of each variable from the energy, 0 if the energy defines none; own = scale
+   without the energy. */
 TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in Fx, out size,
                                      out own, Py_ssize_t n)
 {
