@@ -62,9 +62,9 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     """Determine the significantly faster solver of every pair, jointly at 95 %.
 
     If two solvers are equal, their times on a case are exchangeable: the sign of the
-    difference d of their logarithms is random. In each flip, the signs of some
-    chosen cases are reversed for all pairs. The statistic of a pair is compared with
-    the maxima over all pairs in the flips [3]_. There are two statistics: Σd/√Σd²,
+    difference d of their logarithms is random. In each flip, the signs of some cases
+    are reversed for all pairs. The statistic of a pair is compared with the maxima over
+    all pairs in the flips [3]_. There are two statistics: Σd/√Σd²,
     which is equivalent to Student's t, and the same expression for the signed ranks of
     d, which a few failures with a large penalty do not distort. A statistic is used
     only if its sign agrees with that of the mean. The more significant of the two is
