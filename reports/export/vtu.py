@@ -32,13 +32,13 @@ _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 def write_vtu(fields: Fields, path: Path) -> list[Path]:
     """Write a deformed state in SI units; return the .vtu and a CSV for each contact.
 
-    The point data are displacement (m), contact_force (N/m in the plane, N in space),
-    in_contact (0 or 1), pressure (Pa), gap (m) and the nodal fields. Forces and
-    pressures are zero except on slave nodes. The gap is NaN, which ParaView leaves out,
-    except on slave nodes that face a master. The cell data are the body and, for
-    decomposed bodies, the subdomain; triangles come before quadrilaterals. Plane
-    vectors get a zero third component, because *Warp By Vector* in ParaView needs three
-    components.
+    The point data are displacement (m), contact_force (force of the contact on a slave
+    node, N/m in the plane, N in space), in_contact (0 or 1), pressure (Pa), gap (m) and
+    the nodal fields. Forces and pressures are zero except on slave nodes. The gap is
+    NaN, which ParaView leaves out, except on slave nodes that face a master. The cell
+    data are the body and, for decomposed bodies, the subdomain; triangles come before
+    quadrilaterals. Plane vectors get a zero third component, because *Warp By Vector*
+    in ParaView needs three components.
 
     Raises
     ------

@@ -254,7 +254,7 @@ def extent(fields: Fields, name: str) -> Extent:
 
 
 def stress_figure(fields: Fields) -> FieldFigure:
-    """Draw the four components, each with one colour scale for both bodies."""
+    """Draw four stresses, each with one colour scale for both bodies."""
     points = moved(fields)
     pictures = []
     for name, title in STRESSES.items():
@@ -281,7 +281,7 @@ def stress_figure(fields: Fields) -> FieldFigure:
 
 
 def zoom_figure(fields: Fields) -> FieldFigure:
-    """Draw the mesh near the contact and pressures along their normals."""
+    """Draw the mesh near the contact, and contact pressures along the normals."""
     assert fields.contact_nodes is not None
     assert fields.contact_forces is not None
     points = moved(fields)

@@ -84,7 +84,7 @@ def write_paper(folder: Path) -> list[Path]:
     Raises
     ------
     InputError
-        When data/ is missing or damaged.
+        If data/ is missing or damaged.
 
     """
     experiment = load_experiment(folder / "data")

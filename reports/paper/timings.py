@@ -111,7 +111,7 @@ def medians(
 
 
 def times(rows: Iterable[Row], x: str, **where: Any) -> list[Point]:
-    """Return medians against column `x` of `select`ed rows, with parts summed."""
+    """Return medians of selected rows against column `x`; parts of a repeat add up."""
     by_size = medians(select(rows, **where), [x])
     return [Point(float(key), time) for (key,), time in sorted(by_size.items())]
 
@@ -354,7 +354,7 @@ def table_1(experiment: Experiment) -> Table:
 
 
 def timings(experiment: Experiment) -> Table:
-    """Tabulate the published times of Section 5 and ours."""
+    """Tabulate the published times of Section 5, and the times measured here."""
     rows = largest(experiment)
     steps = experiment.setting["plan"]["steps"]
     machine = here(experiment.setting["environment"].get("machine", {}))
