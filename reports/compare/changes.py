@@ -21,7 +21,7 @@ from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Out
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-DRAWS = 2000  #: bootstrap resamples; a tail of 2.5 % then consists of 50 of them
+DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding

@@ -2,9 +2,9 @@
 
 Two runs of the same code differ, because the speed of the machine varies in time, and
 differently for each case. A slowdown is therefore reported only if two intervals lie
-entirely above 1: that of the ratio after / before, and that of this ratio relative to
-the other solvers in the same blocks, which cancels a common slowdown. Both intervals
-are unpaired between the folders, which are different sessions.
+entirely above 1: the interval of the ratio after / before, and the interval of this
+ratio relative to the other solvers in the same blocks, which cancels a common slowdown.
+Both intervals are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases, at least three, with Student's interval
   over them. Their scatter includes the differences between runs on one case.
@@ -71,7 +71,7 @@ class _Change(NamedTuple):
     """Logarithms of the times of one cell, absolute and relative to other solvers."""
 
     outcome: Outcome
-    own: tuple[Floats, Floats]  #: after, before
+    own: tuple[Floats, Floats]  #: logarithms after and before
     relative: tuple[Floats, Floats]
 
 
@@ -87,7 +87,7 @@ def regressions(c: Comparison) -> Regressions:
     judged = {s: of.values() for s, of in cases.items() if len(of) >= FEWEST}
     cells = changes if len(changes) >= CELLS else []
     if not judged and not cells:
-        why = f"fewer than {FEWEST} cases of a solver, and of {CELLS} cells in all"
+        why = f"no solver has {FEWEST} cases, and there are fewer than {CELLS} cells"
         why = why if changes else _why_not(c)
         return Regressions(slower=(), solvers=0, cells=0, why_not=why)
     miss = (1 - COVERAGE) / 2 / c.folders
@@ -145,7 +145,7 @@ def _why_not(c: Comparison) -> str:
         return "; ".join(lacking)
     return (
         "no two solvers of both folders were measured in the same blocks, and the "
-        "change of one alone may be due to the machine; add a solver that does not "
+        "change of a lone solver may be due to the machine; add a solver that does not "
         "change"
     )
 

@@ -76,7 +76,7 @@ def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.
 
     Returns
     -------
-    cases, solvers : masks
+    cases, solvers : boolean masks
 
     """
     solvers = group.solved.mean(axis=0) >= 0.5

@@ -348,7 +348,7 @@ def _warn_of_contradictions(
             wrong.append(r.run_id)
     if wrong:
         warn(
-            f"{directory}: the journal says verified, but residuals exceed "
+            f"{directory}: residuals of verified records exceed "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; `run` does not "
             "write such records; judge the points again with `validate`"
         )

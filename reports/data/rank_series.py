@@ -221,7 +221,7 @@ def _ratio(
     *,
     paired: bool = True,
 ) -> Interval | None:
-    """Return factor·t(a)/t(b); for single runs, the interval is only the value.
+    """Return factor·t(a)/t(b); the interval of single runs has zero width.
 
     paired : True if times of a and b with the same block were measured in succession
     """

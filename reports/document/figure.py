@@ -252,7 +252,7 @@ def in_rows(panels: Sequence[Panel], columns: int) -> tuple[Row, ...]:
 
 
 def fitted(figure: Figure) -> Figure:
-    """Determine both ends of every axis, so that they contain all marks."""
+    """Determine both ends of every axis; automatic ends enclose all marks."""
     rows = tuple(
         replace(row, panels=tuple(_fitted(p, figure.panels) for p in row.panels))
         for row in figure.rows

@@ -85,7 +85,7 @@ def plain_value(value: object, limit: int = 96) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print with `digits` significant digits, without exponent if that is short."""
+    """Print with `digits` significant digits, and with an exponent only if needed."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:

@@ -208,7 +208,7 @@ def sources(records: Iterable[Record]) -> str:
 
 
 def named(title: str) -> list[str]:
-    """Return the run_ids in a hover text, as printed by `short`; undo `sources`."""
+    """Return the run_ids in a hover text, as printed by `short` (see `sources`)."""
     before, run, names = title.rpartition(_RUN)
     at_end = run and (not before or before.endswith(" "))
     return names.split(", ") if at_end else []

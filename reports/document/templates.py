@@ -68,7 +68,7 @@ class Sentences:
         return _SPACE.sub(" ", write(*args, **values)).strip()
 
     def parts(self, macro: str, *args: Any, **values: Any) -> list[str]:
-        """Return the paragraphs of a macro; those with a leading dash are points."""
+        """Return the paragraphs of a macro; a leading dash marks an entry of a list."""
         write: Callable[..., str] = getattr(self._macros, macro)
         texts = re.split(r"\n\s*\n", write(*args, **values).strip())
         lines = [_SPACE.sub(" ", text).strip() for text in texts if text]

@@ -35,7 +35,7 @@ from mortarbench.reports.figures.style import TITLE, below, legible, look
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
 WIDE = 10.0  #: ratio of longest to shortest run above which the axis is logarithmic
 CLOSEST = 5.0  #: minimum distance between markers of one step type on a curve, points
-COLUMNS = 4  #: columns of a legend
+COLUMNS = 4  #: number of columns of a legend
 FLOOR = 1e-5  #: smallest value shown, in tolerances; smaller values are rounding
 _BESIDE = 0.8  #: width of the labels left of the axes, inches
 _TOLERANCE = Look(colour=INK, width=0.6, dash=(1, 2))
@@ -44,7 +44,7 @@ Curves = Sequence[tuple[SolverRun, Vector]]
 
 
 def convergence_figure(c: CaseHistories) -> Figure | None:
-    """Plot projected gradient and infeasibility against work; None without either."""
+    """Plot projected gradient and infeasibility against work; None without both."""
     gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
     errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
     rows = []

@@ -78,7 +78,7 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return the end of the colour scale and the largest stress, Pa, or None."""
+    """Return end of colour scale and largest stress, Pa; None without a stress."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -92,7 +92,7 @@ class _Loaded(NamedTuple):
     nodes: NDArray[np.int64]  #: (k,)
     forces: Points  #: contact forces on the slave nodes, N/m
     friction: NDArray[np.str_]  #: (k,) states of `ContactSide`; "" without friction
-    #: (j, 2) pairs of adjacent nodes; the first slides without contact
+    #: (j, 2) pairs of adjacent nodes; the first node of a pair slides without contact
     sliding: NDArray[np.int64]
 
     @property
@@ -330,7 +330,7 @@ def _pressure_panel(
 def _friction_arrows(
     fields: Fields, side: ContactSide, camera: Camera, span: float
 ) -> tuple[list[Vectors], str]:
-    """Draw the shear traction on the slave nodes, and count their states.
+    """Return arrows of the shear on slave nodes, and text with counts of their states.
 
     span : size of the panel, m
     """

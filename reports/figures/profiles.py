@@ -34,15 +34,15 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
-ROW = 4  #: solvers in colour in one panel
-ROWS = 4  #: rows of panels; further solvers are grey in all of them
+ROW = 4  #: largest number of solvers in colour in one panel
+ROWS = 4  #: largest number of rows; further solvers are grey in every row
 PAIRS = 6  #: largest number of pairwise panels
 BANDED = (
     20  #: minimum number of cases for bands of three or more solvers, which overlap
 )
-_COLUMNS = 3  #: columns of pairwise panels
+_COLUMNS = 3  #: number of columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
-_COARSE = 60  #: points of a grey curve; a figure may have hundreds of them
+_COARSE = 60  #: points of a grey curve; few, since there may be hundreds of curves
 
 #: ticks by the largest ratio on an axis; longer axes have powers of ten
 _FACTORS = {

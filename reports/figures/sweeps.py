@@ -44,7 +44,7 @@ _MESH = Look(colour=INK, width=0.8, dash=DASHED)
 _TENTH = Look(colour=INK, width=0.8, dash=DOTTED)
 _BARS = {"cap": 1.5, "width": 0.6, "opacity": 0.55}
 
-Sweep = Mapping[str, Sequence[Outcome]]  #: solver → its answers in order of tolerance
+Sweep = Mapping[str, Sequence[Outcome]]  #: answers by solver, in order of tolerance
 
 
 def accuracy_figure(evidence: Evidence) -> Figure | None:

@@ -248,7 +248,7 @@ class Extent(NamedTuple):
 
 
 def extent(fields: Fields, name: str) -> Extent:
-    """Return a percentile and the maximum of a stress, which is singular at corners."""
+    """Return a percentile and the maximum of a stress's absolute nodal values."""
     size = np.abs(fields.nodal[name])
     return Extent(float(np.percentile(size, PERCENTILE)), float(size.max()))
 

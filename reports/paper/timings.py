@@ -308,7 +308,7 @@ def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Pa
 
 
 def here(machine: dict[str, Any]) -> str:
-    """Return a description of the machine of the measurements."""
+    """Describe the machine on which the times were measured."""
     cpu = machine.get("cpu") or "an unknown processor"
     return f"{cpu}, {machine.get('system', 'unknown system')}, one thread, Python"
 

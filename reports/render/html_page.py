@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs no network and cannot reach one."""
+"""The report as one HTML file, which neither needs nor permits network access."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _policy(code: str) -> str:
 
 
 def breakable(text: str) -> Markup:
-    """Allow a line break after every slash of a case name, and none within 1e-8.
+    """Allow line breaks after the slashes of case names, and none within numbers.
 
     Right-to-left text is isolated, so that it does not reorder the text around it.
     """

@@ -249,7 +249,7 @@ def rounded(values: Any, digits: int = 6) -> list[float | None]:
 
 
 def plain(text: str) -> str:
-    r"""Convert mathtext to plain text: "degrees of freedom $n$" loses its dollars.
+    r"""Convert mathtext to plain text: "size $n$" becomes "size n".
 
     An escaped dollar, as written by `reports.figures.style.legible`, becomes a dollar.
     """

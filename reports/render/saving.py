@@ -18,7 +18,7 @@ from mortarbench.reports.document.figure import Figure
 from mortarbench.reports.render.drawing import STYLE, draw_curves, draw_fields
 from mortarbench.reports.render.svg import PAPER, Svg
 
-ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
+ENDINGS = (".pdf", ".svg", ".png")  #: suffixes of figure files
 _METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}
 #: style without a layout engine, for printing a figure that is already laid out
 _LAID_OUT: Any = STYLE | {"figure.constrained_layout.use": False}

@@ -45,7 +45,7 @@ from mortarbench.reports.statistics.growth import Trend
 ACCURACIES = (
     3  #: most sentences per form, for the tightest, a middle and the loosest accuracy
 )
-FAILURES = 3  #: failures per form that are described one by one
+FAILURES = 3  #: largest number of failures per form that are described individually
 FIRST_ROWS = (
     8  #: most rows of the first figure: it fits on a phone, below the first sentence
 )
@@ -385,7 +385,7 @@ def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
 
 
 def _own_claims(solver: str, a: Analysis) -> Iterator[str]:
-    """Yield growth, condition numbers, iterations against H/h, and speed-up."""
+    """Yield sentences on growth, condition numbers, effect of H/h, and speed-up."""
     yield from _growth(solver, a.sizes)
     for series in a.sizes:
         curve = [(float(n), o) for n, o in series.curve(solver)]

@@ -149,7 +149,7 @@ def deformed(a: Analysis) -> Iterator[Part]:
         max(mine, key=_importance)
         for mine in grouped(_drawable(a), lambda o: o.first.family).values()
     ]
-    drawn: set[int] = set()  # dimensions
+    drawn: set[int] = set()  # dimensions (2 or 3) that are drawn already
     for chosen in sorted(largest, key=_importance, reverse=True):
         try:
             fields = load_fields(directory, chosen.first.fields or "")

@@ -37,7 +37,7 @@ from mortarbench.reports.statistics.intervals import Interval
 
 MOST_DRAWN = 4  #: largest number of series in a figure; all are tabulated
 MISFIT = 0.2  #: largest relative misfit of a model that is used to predict
-PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks to predict
+PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks with predicted speed-ups
 _CROWDED = "more ranks than CPUs: ranks shared CPUs"
 TEXT = Sentences(__name__, ALIKE=ALIKE, MISFIT=MISFIT, MOST_DRAWN=MOST_DRAWN)
 

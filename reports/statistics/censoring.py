@@ -46,7 +46,7 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     ----------
     times : (cases,) s; inf without a verified answer
     stopped : (cases,) s until the time limit; NaN for other endings
-    horizon : s
+    horizon : upper limit of the times that enter the mean, s
 
     """
     n = times.size

@@ -74,7 +74,7 @@ class Growth:
     def at(self, n: float) -> Interval:
         """Predict v at a size within the measured range, with its 95 % interval.
 
-        It is a prediction interval for one further measurement [1]_.
+        The interval is a prediction interval for one further measurement [1]_.
 
         Raises
         ------

@@ -39,7 +39,7 @@ TEXT = Sentences(__name__)
 def write_validation(
     directory: Path, data: Data, meshes: Sequence[Discretisation] = ()
 ) -> list[Path]:
-    """Write DIR/report/validation.html and .md from the data of `validate`.
+    """Write report/validation.html and .md in `directory` from the data of `validate`.
 
     meshes : discretisation errors, for cases solved on finer meshes
     """
@@ -52,7 +52,7 @@ def write_validation(
 
 
 def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
-    """Compose the page, verdict first."""
+    """Compose the page, beginning with the verdict."""
     sections = (
         Section.of(*each)
         for each in (
