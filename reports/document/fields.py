@@ -26,7 +26,7 @@ class ColourScale:
     low: float
     high: float
     label: str = ""
-    unit: float = 1.0  #: value labelled 1 on the bar
+    unit: float = 1.0  #: value that the bar labels as 1
     beyond: Literal["neither", "max", "both"] = "neither"  #: ends that clip values
     names: tuple[str, ...] = ()  #: names of the classes, shown at the colour bar
 
@@ -105,7 +105,7 @@ class Vectors:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """An arrow; its head has a name of matplotlib."""
+    """An arrow whose head is named as in matplotlib."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -144,8 +144,8 @@ class FieldPanel:
     title: str = ""
     xlabel: str = ""
     ylabel: str = ""
-    unit: float = 1.0  #: length labelled 1 on the axes
-    numbered: tuple[bool, bool] = (True, True)  #: tick labels of x and y
+    unit: float = 1.0  #: length that the axes label as 1
+    numbered: tuple[bool, bool] = (True, True)  #: True for tick labels, on x and y
     axes: Literal["lines", "frame", "none"] = "lines"
     scale: ColourScale | None = None  #: shown as a bar below the panel
 

@@ -63,9 +63,9 @@ class Series:
     y: Numbers
     look: Look
     intervals: Intervals | None = None
-    step: bool = False  #: step function, constant until the next point
-    few: bool = False  #: draw marks only at a few points
-    clipped: bool = True  #: cut at the edge of the panel
+    step: bool = False  #: True for a step function, constant until the next point
+    few: bool = False  #: True for marks at a few points only
+    clipped: bool = True  #: True to clip at the edge of the panel
     solver: str = ""  #: solver of the points; empty for none
     runs: Runs = ()  #: run_ids behind each point, or one entry for all points
 
@@ -143,11 +143,11 @@ class Axis:
     #: positions and labels; None: automatic
     ticks: tuple[tuple[float, str], ...] | None = None
     most: int | None = None  #: approximate number of automatic ticks
-    integers: bool = False  #: ticks are integers
-    plain: bool = False  #: tick labels without powers of ten
+    integers: bool = False  #: True for ticks at integers only
+    plain: bool = False  #: True for tick labels without powers of ten
     span: float = SPAN  #: smallest ratio of the ends of a logarithmic axis
-    numbered: bool = True  #: ticks have labels
-    marked: bool = True  #: ticks have strokes
+    numbered: bool = True  #: True if ticks have labels
+    marked: bool = True  #: True if ticks have strokes
     line: bool = True
     shared: str = ""  #: axes with the same name have the same ends
 

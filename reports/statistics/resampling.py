@@ -50,8 +50,10 @@ def limits(draws: Array, cases: int) -> tuple[Array, Array]:
     Percentiles are expanded [2]_, because statistics of resamples of n cases scatter
     too little by the factor √((n−1)/n), and have normal instead of Student's tails. The
     lower percentile is Φ(−√(n/(n−1))·t₀.₉₇₅,ₙ₋₁), where Φ is the normal distribution
-    function and t a quantile of Student's. A monotone transform of the statistic
-    transforms the interval in the same way.
+    function and t₀.₉₇₅,ₙ₋₁ is a quantile of Student's distribution. A monotone
+    transform of the statistic transforms the interval in the same way.
+
+    cases : number of cases n
     """
     tail = float(ndtr(-np.sqrt(cases / (cases - 1)) * student(cases - 1)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
@@ -64,13 +66,13 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     If two solvers are equal, their times on a case are exchangeable: the sign of the
     difference d of their logarithms is random. In each flip, the signs of some cases
     are reversed for all pairs. The statistic of a pair is compared with the maxima over
-    all pairs in the flips [3]_. There are two statistics: Σd/√Σd²,
-    which is equivalent to Student's t, and the same expression for the signed ranks of
-    d, which a few failures with a large penalty do not distort. A statistic is used
-    only if its sign agrees with that of the mean. The more significant of the two is
-    used, for the data and for every flip. Therefore, for any number of equal solvers,
-    at most one set of cases in twenty yields a significant pair. With fewer than six
-    cases no pair is significant: five signs agree in 2 of 2⁵ flips.
+    all pairs in the flips [3]_. There are two statistics: Σd/√Σd², which is equivalent
+    to Student's t, and the same expression for the signed ranks of d, which a few
+    failures with a large penalty do not distort. A statistic is used only if its sign
+    agrees with that of the mean. The more significant of the two is used, for the data
+    and for every flip. Therefore, for any number of equal solvers, at most one set of
+    cases in twenty yields a significant pair. With fewer than six cases no pair is
+    significant: five signs agree in 2 of 2⁵ flips.
 
     Parameters
     ----------
@@ -102,8 +104,9 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
     """Return the 95 % interval of a mean by inversion of the sign-flip test.
 
     The means of all subsets of the values divide the line into intervals that contain
-    the centre of a symmetric distribution with equal probability [4]_. Above `DRAWS`
-    subsets a random selection is used. For six values the interval is their range.
+    the centre of a symmetric distribution with equal probability [4]_. If there are too
+    many subsets (see `_signs`), a random selection is used. For six values the interval
+    is their range.
 
     values : (cases,) at least six, since fewer have no 95 % interval
     """
@@ -116,9 +119,9 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
 
 
 def _signs(cases: Sequence[str]) -> Array:
-    """Return all patterns of signs up to a common sign, or `DRAWS` random ones.
+    """Return all patterns of signs up to a common sign, or `DRAWS` random patterns.
 
-    The first pattern is that of the data, all ones.
+    The first pattern, with all signs positive, represents the data.
     """
     n = len(cases)
     if 2 ** (n - 1) <= DRAWS:
