@@ -58,7 +58,7 @@ def traction_figure(fields: Fields) -> Figure | None:
 
 
 def places(fields: Fields, side: ContactSide) -> Vector:
-    """Return signed distances (s,) from the middle of the undeformed side, m."""
+    """Return nodal positions (s,) along the undeformed side from its middle, m."""
     steps = np.linalg.norm(np.diff(fields.points[side.nodes], axis=0), axis=1)
     along = np.append(0.0, np.cumsum(steps))
     return np.asarray(along - along[-1] / 2)
