@@ -29,19 +29,21 @@ def write_report(
     *,
     pool_forms: bool = False,
 ) -> list[Path]:
-    """Write DIR/report from the journal in DIR; equal journals give equal bytes.
+    """Write the report of a result folder to `directory`/report.
 
-    html writes index.html, md report.md, tex and csv tables/, and parquet the journal
-    as records.parquet. Figures (pdf, svg, png) accompany html, md and tex in figures/.
+    The format html gives index.html and md gives report.md; tex and csv give tables in
+    tables/, and parquet gives the journal as records.parquet. With html, md or tex, all
+    figures are written to figures/ as PDF, SVG and PNG. Equal journals give files with
+    equal bytes.
 
     Parameters
     ----------
-    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
+    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
     pool_forms : compute means, ranks and profiles over the cases of all forms
 
     Returns
     -------
-    the files written
+    paths of the files written
 
     Raises
     ------
@@ -71,9 +73,9 @@ def write_report(
 def figures(
     directory: Path, factor: float = VERIFIED_FACTOR
 ) -> dict[str, Figure | FieldFigure]:
-    """Compute the figures of the report on a folder, by the names of their files.
+    """Return the figures of the report on a result folder by their file stems.
 
-    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
+    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
 
     Raises
     ------
@@ -87,12 +89,13 @@ def figures(
 
 
 def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
-    """Return the opening sentences of the report of a folder, one per line.
+    """Return the opening sentences of the report on a result folder.
 
-    The first one names the fastest combination of solver and form, from the mesh to a
-    verified answer; the others compare the solvers of each form and name failures.
+    The first sentence names the combination of solver and form that leads fastest from
+    the mesh to a verified answer. The others compare the solvers of each form and name
+    failures.
 
-    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
+    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
 
     Raises
     ------
@@ -105,13 +108,13 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
-    """Compose the report: the answer, then the evidence.
+    """Compose the report: first the conclusions, then the evidence for them.
 
-    The answer compares combinations of solver and form, and solvers within each form;
-    `pool_forms` does not change it.
+    The conclusions compare combinations of solver and form, and the solvers within each
+    form; `pool_forms` does not change these conclusions.
     """
     collecting = gc.isenabled()
-    gc.disable()  # cells have no cycles; traversing millions took a third of the time
+    gc.disable()  # table cells form no cycles; collection took a third of the time
     try:
         composed = tuple(sections(Analysis(evidence, pool_forms=pool_forms)))
     finally:

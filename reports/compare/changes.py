@@ -1,4 +1,4 @@
-"""Changes between two result folders, cell by cell and solver by solver.
+"""Changes between two result folders, for each cell and each solver.
 
 A cell is one solver in one mode on one case at one tolerance. Its times before and
 after are two unpaired samples, because the folders are different sessions.
@@ -21,22 +21,22 @@ from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Out
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-DRAWS = 2000  #: bootstrap resamples; a tail of 2.5 % then consists of 50 of them
+DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
 
-#: case (of a QP from a file its digest), tolerance, solver with its mode
+#: case (for a QP from a file, its digest), tolerance, and solver with its mode
 Key = tuple[str, float, str]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pair:
-    """A cell that is in both folders."""
+    """Outcomes of one cell before and after."""
 
     before: Outcome
     after: Outcome
-    same_machine: bool  #: times may be compared
+    same_machine: bool  #: True if the times may be compared
 
     @property
     def same_sizes(self) -> bool:
@@ -64,7 +64,7 @@ class Pair:
 
     @cached_property
     def ratio(self) -> Ratio | None:
-        """Time after over time before with Welch's interval; None below two repeats."""
+        """Time after / time before, with Welch's interval; None below two repeats."""
         # Not a bootstrap: with three to ten repeats, resampling reports a spurious
         # change three to five times as often as the nominal one in twenty.
         if self.log is None:
@@ -73,12 +73,12 @@ class Pair:
 
     @property
     def change(self) -> int:
-        """1: slower, -1: faster, 0: the interval contains 1 or is missing."""
+        """1 if slower, -1 if faster, 0 if the interval contains 1 or is missing."""
         return side(self.ratio)
 
     @property
     def turn(self) -> int:
-        """1: the verdict became worse, -1: it became better, 0: it did not change."""
+        """1 if the verdict became worse, -1 if it became better, 0 if unchanged."""
         a, b = (SEVERITY.index(o.verdict) for o in (self.after, self.before))
         return (a < b) - (a > b)
 
@@ -120,7 +120,7 @@ class Pair:
 
 
 class Mean(NamedTuple):
-    """Geometric mean of ratios over cells with its interval, which may be unbounded."""
+    """Geometric mean of ratios over cells, with an interval that may be unbounded."""
 
     value: float
     low: float
@@ -187,7 +187,7 @@ def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
 
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
-    """Average the ratios of times over cells (see `mean_of`); None if unknown."""
+    """Average the ratios of times over cells (see `mean_of`); None without times."""
     return _over_cells((p, p.log) for p in pairs)
 
 
@@ -236,11 +236,11 @@ def _over_cells(changes: Iterable[tuple[Pair, float | None]]) -> Mean | None:
 def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     """Average logarithms of ratios over cells, with a bootstrap interval over cells.
 
-    A cell is resampled as a pair of the times before and after. Percentile intervals of
-    n values are too narrow, by the factor √((n−1)/n) and because their tails are normal
-    instead of Student's. The distances of their ends from the mean are multiplied by
-    both factors [1]_. The names of the cells seed the generator. Below three cells the
-    interval is unbounded.
+    A cell is resampled as a whole, with its times before and after. Percentile
+    intervals of n values are too narrow, by the factor √((n−1)/n) and because their
+    tails are normal instead of Student's. The distances of their ends from the mean are
+    therefore increased to correct both effects [1]_. The names of the cells seed the
+    generator. For fewer than three cells the interval is unbounded.
 
     References
     ----------
@@ -265,7 +265,7 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
 
 
 def side(interval: Ratio | Mean | None) -> int:
-    """1: slower, -1: faster, 0: the interval contains 1 or is missing."""
+    """Return 1 if slower, -1 if faster, 0 if the interval contains 1 or is missing."""
     if interval is None:
         return 0
     return int(interval.low > 1) - int(interval.high < 1)

@@ -92,7 +92,7 @@ def _named_sentences(c: Comparison) -> dict[str, str]:
 
 
 def dates(c: Comparison) -> str:
-    """Return dates and machines of both folders; a common machine is named once."""
+    """Return dates and machines of both folders; name a common machine only once."""
     (then, there), (now, here) = (
         dateline(e).split(" · ", 1) for e in (c.before, c.after)
     )
@@ -102,14 +102,14 @@ def dates(c: Comparison) -> str:
 
 
 def change_word(interval: Ratio | Mean) -> str:
-    """Describe a change; "no change seen" only if a change would have been visible."""
+    """Return a change in words; "no change seen" if one would have been visible."""
     if way := side(interval):
         return "slower" if way > 0 else "faster"
     return "no change seen" if resolved(interval) else "not resolved"
 
 
 def named(c: Comparison) -> list[str]:
-    """Name the deteriorations: verdicts, answers, then times, the largest first."""
+    """List what became worse: verdicts, answers, then times, the largest first."""
     slower = [(p.ratio.low, p) for p in c.timed if p.ratio and p.change > 0]
     slower.sort(key=lambda each: each[0], reverse=True)
     worse = [("worse", p) for p in c.worse]

@@ -18,7 +18,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 def overview(found: Sequence[Comparison]) -> Page:
     """Compose the page: changes since the first folder, then all times.
 
-    found : comparisons of one folder with each of several others
+    found : comparisons of the first folder with each of the others
     """
     names = [clean(c.after.directory.resolve().name, 40) for c in found]
     first = clean(found[0].before.directory.resolve().name, 40)

@@ -2,9 +2,9 @@
 
 Two runs of the same code differ, because the speed of the machine varies in time, and
 differently for each case. A slowdown is therefore reported only if two intervals lie
-entirely above 1: that of the ratio after / before, and that of this ratio relative to
-the other solvers in the same blocks, which cancels a common slowdown. Both intervals
-are unpaired between the folders, which are different sessions.
+entirely above 1: the interval of the ratio after / before, and the interval of this
+ratio relative to the other solvers in the same blocks, which cancels a common slowdown.
+Both intervals are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases, at least three, with Student's interval
   over them. Their scatter includes the differences between runs on one case.
@@ -13,8 +13,9 @@ are unpaired between the folders, which are different sessions.
   distance, which is the standard deviation of a normal law). At least `CELLS` cells are
   needed to estimate the scatter.
 
-All intervals hold jointly with 95 %: half of the error probability of 5 % is assigned
-to the solvers and half to the cells, and each half is divided evenly (Bonferroni) [1]_.
+The joint coverage of all intervals is 95 %: half of the error probability of 5 % is
+assigned to the solvers and half to the cells, and each half is divided evenly
+(Bonferroni) [1]_.
 
 References
 ----------
@@ -41,7 +42,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 Floats = NDArray[np.float64]
 
 CELLS = 8  #: minimum number of cells for an estimate of their scatter
-_NORMAL = 1.4826  #: standard deviation of a normal law over its median distance
+_NORMAL = 1.4826  #: standard deviation / median distance from the mean, normal law
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,7 @@ class Slower:
     case: str = ""  #: empty for a solver over its cases
     tol: float | None = None
     ratio: Ratio  #: ratio of times, after over before, with a corrected interval
-    relative: Ratio  #: `ratio` over that of the other solvers in the same blocks
+    relative: Ratio  #: `ratio` divided by the ratio of the other solvers, by blocks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +62,8 @@ class Regressions:
 
     slower: tuple[Slower, ...]
     solvers: int  #: number of solvers judged over their cases
-    cells: int  #: number of cells judged one by one
-    why_not: str = ""  #: reason if nothing could be judged
+    cells: int  #: number of cells judged individually
+    why_not: str = ""  #: reason why nothing could be judged; empty otherwise
     unverified: tuple[str, ...] = ()  #: solvers without a verified answer in one folder
 
 
@@ -70,14 +71,15 @@ class _Change(NamedTuple):
     """Logarithms of the times of one cell, absolute and relative to other solvers."""
 
     outcome: Outcome
-    own: tuple[Floats, Floats]  #: after, before
+    own: tuple[Floats, Floats]  #: logarithms after and before
     relative: tuple[Floats, Floats]
 
 
 def regressions(c: Comparison) -> Regressions:
     """Find the solvers and cells that became slower from one folder to the other.
 
-    Where several folders are compared with one, all intervals hold jointly.
+    If several folders are compared with one, the intervals of all comparisons hold
+    jointly.
     """
     changes = _changes(c)
     by_solver = grouped(changes, lambda change: change.outcome.solver)
@@ -85,7 +87,7 @@ def regressions(c: Comparison) -> Regressions:
     judged = {s: of.values() for s, of in cases.items() if len(of) >= FEWEST}
     cells = changes if len(changes) >= CELLS else []
     if not judged and not cells:
-        why = f"fewer than {FEWEST} cases of a solver, and of {CELLS} cells in all"
+        why = f"no solver has {FEWEST} cases, and there are fewer than {CELLS} cells"
         why = why if changes else _why_not(c)
         return Regressions(slower=(), solvers=0, cells=0, why_not=why)
     miss = (1 - COVERAGE) / 2 / c.folders
@@ -112,7 +114,7 @@ def regressions(c: Comparison) -> Regressions:
 
 
 def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
-    """Describe the solvers without a verified answer in that number of `folders`."""
+    """Describe the solvers that lack a verified answer in `folders` of the folders."""
     found = []
     for solver in c.solvers:
         pairs = [p for p in c.of(solver) if not p.after.first.role]
@@ -143,7 +145,7 @@ def _why_not(c: Comparison) -> str:
         return "; ".join(lacking)
     return (
         "no two solvers of both folders were measured in the same blocks, and the "
-        "change of one alone may be due to the machine; add a solver that does not "
+        "change of a lone solver may be due to the machine; add a solver that does not "
         "change"
     )
 
@@ -171,7 +173,7 @@ def _logs(outcome: Outcome) -> Floats:
 
 
 def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
-    """Return logarithms of time over the geometric mean of the others, by block."""
+    """Return, by block, log(time / geometric mean of the times of the others)."""
     times = [o.by_block for o in others]
     return np.array(
         [
@@ -183,7 +185,7 @@ def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
 
 
 def _mean(logs: tuple[Floats, Floats]) -> float:
-    """Return the mean after minus the mean before."""
+    """Return the mean logarithm after minus the mean logarithm before."""
     return float(np.mean(logs[0]) - np.mean(logs[1]))
 
 

@@ -22,17 +22,17 @@ from mortarbench.reports.render.writing import RENDERED, write_page, write_text
 def write_comparison(
     before: Path, after: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
 ) -> tuple[list[str], list[Path]]:
-    """Write AFTER/report/against-NAME, where NAME is the name of the folder `before`.
+    """Write `after`/report/against-NAME, where NAME is the name of the folder `before`.
 
     The files are index.html for the format html, report.md for md, tables/ for tex, and
-    tables/changes with a row per cell for csv and parquet. Equal journals give files of
-    equal bytes.
+    tables/changes with a row per cell for csv and parquet. Equal journals give files
+    with equal bytes.
 
-    factor : verdicts are those at factor·tol, in both folders
+    factor : residuals may be up to factor·tol, in both folders
 
     Returns
     -------
-    the verdict in a few lines of text, and the files
+    conclusions in a few lines of text, and paths of the files
 
     Raises
     ------
@@ -69,15 +69,15 @@ def write_comparisons(
     formats: Sequence[str],
     factor: float = VERIFIED_FACTOR,
 ) -> tuple[list[Comparison], list[str], list[Path]]:
-    """Compare several folders with the first one, each as `write_comparison` does.
+    """Compare each further folder with the first one by `write_comparison`.
 
-    If there are several, LAST/report/since-NAME contains a page on all of them, where
-    NAME is the name of the first.
+    If there are several further folders, a page on all of them is written to
+    report/since-NAME in the last folder, where NAME is the name of the first.
 
     Returns
     -------
-    the comparisons, the verdicts in a few lines of text, and the files with that page
-    first
+    the comparisons, their conclusions in a few lines of text, and paths of the files,
+    beginning with those of the page on all folders
 
     Raises
     ------
@@ -101,7 +101,7 @@ def write_comparisons(
     return comparisons, lines, written
 
 
-#: columns of a cell of one folder, by their names there: type, and the value
+#: columns with results from one folder: name → type, and function from outcome to value
 _SIDE: dict[str, tuple[str, Callable[[Outcome], Any]]] = {
     "verdict": ("string", lambda o: o.verdict.value),
     "seconds": ("float64", lambda o: t.value if (t := o.seconds("total")) else None),
@@ -110,7 +110,7 @@ _SIDE: dict[str, tuple[str, Callable[[Outcome], Any]]] = {
     "energy": ("float64", lambda o: o.energy),
     "objective": ("float64", lambda o: o.first.objective),
 }
-#: columns of a cell that both folders hold
+#: columns for cells in both folders: name → type, and function from pair to value
 _BOTH: dict[str, tuple[str, Callable[[Pair], Any]]] = {
     "ratio": ("float64", lambda p: p.ratio and p.ratio.value),
     "ratio_low": ("float64", lambda p: p.ratio and p.ratio.low),

@@ -25,15 +25,15 @@ class Convention:
     """Choices in the averaging of times over cases."""
 
     shift: float = 1.0  #: shift of times, in units of the shift of the group
-    penalty: float = 3.0  #: charge for an unsolved case, in time limits
-    #: "verified", or "claimed", which accepts the solver's claim
+    penalty: float = 3.0  #: charge for an unsolved case, in multiples of the time limit
+    #: accepted answers: "verified" ones, or all that the solver "claimed" to be solved
     gate: str = "verified"
     common: bool = False  #: use only cases solved by all, see `common_cases`
 
 
-USUAL = Convention()  #: convention of tiers and ratios
+USUAL = Convention()  #: convention used for tiers and ratios
 
-#: Conventions with one choice changed, by the name of their column.
+#: Conventions that differ from `USUAL` in one choice, by the heading of their column.
 SINGLE = {
     "shift × 0.01": replace(USUAL, shift=0.01),
     "shift × 10": replace(USUAL, shift=10.0),
@@ -43,7 +43,7 @@ SINGLE = {
     "common": replace(USUAL, common=True),
 }
 
-_SAME = 1e-12  #: relative differences of means below this are rounding
+_SAME = 1e-12  #: smaller relative differences between means count as rounding
 
 #: Every combination of shift, penalty and gate.
 EVERY = tuple(
@@ -53,10 +53,11 @@ EVERY = tuple(
 
 
 def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
-    """Return shifted geometric means exp(mean log(t + s)) − s over cases, (solvers,) s.
+    """Return shifted geometric means of times over cases, s, (solvers,).
 
-    An unsolved case counts as `penalty` times the limit. With `common` there are no
-    unsolved cases, and solvers outside of that comparison have NaN.
+    The mean of times t is exp(mean log(t + shift)) − shift. An unsolved case counts as
+    `penalty` times the limit. With `common`, only cases without failures are averaged,
+    and the entries of excluded solvers are NaN.
     """
     logs, shift = _logs(group, convention)
     if not convention.common:
@@ -69,13 +70,13 @@ def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
 
 
 def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the cases solved by every solver that solved at least half of them.
+    """Return the cases solved by every solver that solved at least half of all cases.
 
-    Otherwise one solver that solves almost nothing would leave no common case.
+    If other solvers counted, one that solves almost nothing would leave no common case.
 
     Returns
     -------
-    cases, solvers : masks
+    cases, solvers : boolean masks
 
     """
     solvers = group.solved.mean(axis=0) >= 0.5
@@ -84,7 +85,7 @@ def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def _logs(group: ComparisonGroup, convention: Convention) -> tuple[Array, float]:
-    """Return the logarithms of t + s, (cases, solvers), and s in seconds."""
+    """Return log(time + shift), (cases, solvers), and the shift in seconds."""
     times = group.times if convention.gate == "verified" else group.claimed
     shift = convention.shift * group.shift
     charged = np.where(np.isinf(times), convention.penalty * group.horizon, times)
@@ -132,18 +133,20 @@ class Ranking:
 
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) True where row is significantly faster than column."""
+        """(solvers, solvers) True if the row solver is significantly faster."""
         logs, _ = _logs(self.group, USUAL)
         faster = resampling.significantly_faster(logs, self.group.cases)
-        if self.group.apart.any():  # different sessions, hence no pairs
+        if self.group.apart.any():  # different sessions have no common blocks to pair
             faster = np.where(self.group.apart, self.group.faster, faster)
         return faster
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
-        """Rank intervals: after all significantly faster solvers, before all slower.
+        """Intervals of ranks that significant differences between solvers allow.
 
-        The intervals jointly contain the true ranks with 95 % confidence [1]_.
+        A solver ranks after all significantly faster solvers and before all
+        significantly slower ones. The intervals contain all true ranks jointly with
+        95 % confidence [1]_.
 
         References
         ----------
@@ -157,11 +160,12 @@ class Ranking:
 
     @cached_property
     def tiers(self) -> NDArray[np.int64]:
-        """(solvers,) tiers from 1: the first whose head is not significantly faster.
+        """Tiers of the solvers, numbered from 1, (solvers,).
 
-        The leader heads the first tier; a solver that fits into no tier heads a new
-        one. An uncertain mean (because of failures) may thus be in an earlier tier than
-        a smaller one.
+        The leader heads the first tier. Each solver joins the first tier whose head is
+        not significantly faster; if there is no such tier, it heads a new one. A solver
+        whose mean is uncertain because of failures may thus be in an earlier tier than
+        a solver with a smaller mean.
         """
         tiers = np.zeros(len(self.group.solvers), dtype=np.int64)
         heads: list[int] = []
@@ -184,7 +188,7 @@ class Changed(NamedTuple):
     """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) True where the order is reversed
+    turned: NDArray[np.bool_]  #: (solvers, solvers) True if their order is reversed
 
 
 class Panel(NamedTuple):
@@ -196,13 +200,13 @@ class Panel(NamedTuple):
 
     @property
     def turned(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) True where some convention reverses the usual order."""
+        """(solvers, solvers) True if some convention reverses their usual order."""
         changes = (*self.every, *self.single.values())
         return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
 
 
 def panel(group: ComparisonGroup) -> Panel:
-    """Rank under the usual convention, each changed choice, and all combinations."""
+    """Rank under the usual convention, each single change, and all combinations."""
     usual = geometric_means(group, USUAL)
 
     def changed(convention: Convention) -> Changed:
@@ -217,13 +221,13 @@ def panel(group: ComparisonGroup) -> Panel:
 
 
 def ranks(means: Array) -> Array:
-    """Rank from 1; means that are equal up to rounding share the smaller rank."""
+    """Rank means from 1; means that are equal up to rounding share the smaller rank."""
     ahead = (order_of(means) > 0).sum(axis=1)  # number of solvers with smaller means
     return np.where(np.isnan(means), np.nan, 1.0 + ahead)
 
 
 def order_of(means: Array) -> NDArray[np.int64]:
-    """Compare means pairwise: (solvers, solvers) 1 where row is slower, −1 faster."""
+    """Compare means pairwise, (solvers, solvers): 1 if the row is slower, −1 faster."""
     logs = np.log(means)
     gap = logs[:, None] - logs[None, :]
     return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)

@@ -11,17 +11,17 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
 from mortarbench.reports.document.layout import Cell, Column, Table, sources
 
-#: mark behind a verdict in which a proven optimum overruled the residuals
+#: mark after a verdict that a proven optimum decided against the residuals
 BY_OPTIMUM = "⋆"
 
 
 def source(*outcomes: Outcome) -> str:
-    """Return a title with the measurements behind a cell; `named` is the inverse."""
+    """Return hover text with the run_ids behind a cell; `named` extracts them again."""
     return sources(r for o in outcomes for r in o.records)
 
 
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
-    """Return a cell of a verdict, with the number of repeats with this verdict.
+    """Return a cell with a verdict, and how many repeats share it if not all do.
 
     message : message of the solver, shown on hovering
     """
@@ -41,7 +41,7 @@ def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
 
 
 def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
-    """Return a cell of iterations, a range where repeats differ."""
+    """Return a cell with the number of iterations, a range if repeats differ."""
     its, title = outcome.iterations, source(outcome)
     if its is None:
         return Cell(kind=kind, title=title)
@@ -49,7 +49,7 @@ def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
 
 
 def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
-    """Return a note on `BY_OPTIMUM` if a verdict in the rows of a table has it."""
+    """Return a note on the mark `BY_OPTIMUM` if a verdict in the rows carries it."""
     kinds = {verdict.value for verdict in VERDICTS}
     marked = any(c.kind in kinds and BY_OPTIMUM in c.text for row in rows for c in row)
     note = f"{BY_OPTIMUM}: the proven optimum of a small QP overrules the residuals."
@@ -57,7 +57,7 @@ def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
 
 
 def explained(table: Table) -> Table:
-    """Append a note on `BY_OPTIMUM` if a verdict in the table has it."""
+    """Append a note on the mark `BY_OPTIMUM` if a verdict in the table carries it."""
     return replace(table, notes=(*table.notes, *legend(table.rows)))
 
 
@@ -78,7 +78,7 @@ def answer_columns(
 def solver_columns(
     solvers: Iterable[str], cell: Callable[[str, Any], Cell]
 ) -> Iterator[Column]:
-    """Yield a column per solver, whose cells are functions of solver and item."""
+    """Yield a column per solver; `cell` returns its entry from solver and item."""
     return ((clean(s, 40), partial(cell, s)) for s in solvers)
 
 

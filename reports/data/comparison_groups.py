@@ -17,13 +17,13 @@ from mortarbench.harness.running.pairs import ratio_of
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
-#: Minimum number of cases of a comparison. With fewer, no difference is significant at
-#: 95 %: five of five signs agree by chance in 2 of 2⁵ sets of cases.
+#: Minimum number of cases of a comparison. With fewer cases, no difference is
+#: significant at 95 %: five signs agree by chance with probability 2/2⁵.
 CASES = 6
-POOLED = "all forms"  #: name, instead of a form, of a group with cases of all forms
-LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
+POOLED = "all forms"  #: name that replaces the form if cases of all forms are pooled
+LARGEST_SHIFT = 10.0  #: s; the customary shift, which is too large for short times
 
-#: verdicts on the repeats of an outcome that counts as out of time
+#: verdicts allowed for the repeats of an outcome that counts as out of time
 _LATE = {v for v in Verdict if v is Verdict.TIME_LIMIT or v.is_verified}
 
 Times = NDArray[np.float64]
@@ -66,10 +66,11 @@ Answers = Mapping[GroupKey, Mapping[str, Row]]  #: outcomes by group and case
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonGroup:
-    """Cases of one form at one accuracy, and the solvers that were measured on each.
+    """Cases of one form at one accuracy, and the solvers measured on each of them.
 
-    Null arms are left out. Times are medians of prepare + solve over the repeats; in a
-    sweep of tolerances, those of the fastest verified (or claimed) answer.
+    Copies and null arms (a solver repeated under a second label) are left out. Times
+    are medians of prepare + solve over the repeats. If several tolerances were swept,
+    the time is that of the fastest verified (or claimed) answer.
     """
 
     key: GroupKey
@@ -83,13 +84,13 @@ class ComparisonGroup:
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of the cases
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
-    incomplete: int = 0  #: number of cases left out: not measured with every solver
+    incomplete: int = 0  #: number of cases left out because a measurement is missing
     apart: Pairs = field(default_factory=_no_pairs)
     "(solvers, solvers) True if two solvers have no common block on some case; may be "
     "empty."
     faster: Pairs = field(default_factory=_no_pairs)
-    "(solvers, solvers) True if `apart` and the row is faster than the column on all "
-    "cases."
+    "(solvers, solvers) True if `apart`, and the row solver is faster than the column "
+    "solver on all cases."
 
     @property
     def title(self) -> str:
@@ -152,7 +153,7 @@ class ComparisonGroup:
 
     @property
     def lack(self) -> str:
-        """Reason why there is no comparison over cases; empty if there is one."""
+        """Reason why cases cannot be compared; empty if they can."""
         if len(self.solvers) < 2:
             return plural(len(self.solvers), "solver")
         if len(self.cases) < CASES:
@@ -161,7 +162,7 @@ class ComparisonGroup:
 
     @cached_property
     def solved(self) -> NDArray[np.bool_]:
-        """(cases, solvers) True where verified."""
+        """(cases, solvers) True where the answer is verified."""
         return np.isfinite(self.times)
 
     @cached_property
@@ -172,7 +173,7 @@ class ComparisonGroup:
 
     @cached_property
     def horizon(self) -> float:
-        """Time limit, or the longest time of an answer if that is longer; s."""
+        """Time limit, or the longest time of an answer if it exceeds the limit; s."""
         both = np.concatenate([self.times, self.claimed])
         return float(max(self.limit, both[np.isfinite(both)].max()))
 
@@ -194,7 +195,7 @@ def all_groups(
     """Group the measurements by form, mode and accuracy.
 
     Forms are separate, since the primal and the dual QP of one problem are different
-    problems for a solver; so are cold solves and sequences.
+    problems for a solver. Cold solves and sequences are separate too.
 
     pool_forms : put all forms into one group, in which each QP remains a separate case
     """
@@ -219,13 +220,13 @@ def all_groups(
 
 
 def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
-    """Select the answer of every solver to every case; null arms are left out."""
+    """Select the answer of every solver to every case; omit copies and null arms."""
     cells = _cells(evidence, pool_forms=pool_forms)
     return {key: _answers(rows) for key, rows in cells.items()}
 
 
 def _cells(evidence: Evidence, *, pool_forms: bool) -> dict[GroupKey, Cells]:
-    """Group the outcomes by key, case and solver; a sweep of tolerances is one cell."""
+    """Group outcomes by group key, case and solver; a tolerance sweep is one cell."""
     cells: dict[GroupKey, Cells] = {}
     for o in evidence.flat:
         if not o.first.role:
@@ -242,9 +243,10 @@ def _answers(cells: Cells) -> dict[str, Row]:
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Select the answer of a solver to a case: in a sweep, the fastest verified one.
+    """Select one of a solver's answers to a case at several tolerances.
 
-    If none is verified, select the answer at the tightest tolerance.
+    This is the fastest verified answer; if no answer is verified, it is the one at the
+    tightest tolerance.
     """
     timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
     if timed:
@@ -259,7 +261,7 @@ def time_of(outcome: Outcome) -> float | None:
 
 
 def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
-    """Mark the solvers that were not measured together on every case."""
+    """Mark pairs of solvers without common blocks on some case."""
     n = len(group.solvers)
     apart, faster = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):
@@ -295,7 +297,7 @@ def _seconds(outcome: Outcome) -> float:
 def _group(
     key: GroupKey, cells: Cells, solvers: Sequence[str], limit: float
 ) -> ComparisonGroup:
-    """Form a group of the solvers with at least half of the cases."""
+    """Form a group of the solvers that were measured on at least half of the cases."""
     present = np.array([*cells], dtype=object)
     measured = {solver for row in cells.values() for solver in row}
     labels = np.array([s for s in solvers if s in measured], dtype=object)
@@ -327,7 +329,7 @@ def _group(
 
 
 def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
-    """Return a solver's entries of `times`, `claimed`, `stopped`; 1 if it declined."""
+    """Return a solver's `times`, `claimed`, `stopped` on a case, and 1 if declined."""
     times = [(_seconds(o), o) for o in outcomes]
     verified = [t for t, o in times if o.verified and t > 0]
     claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]

@@ -2,8 +2,8 @@
 
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
 fastest of the solvers that were measured on it; the primal form with multigrid is a
-separate route. Cases of a growing series are built anew for each repeat, so that all
-work between the mesh and the recovered displacements is charged:
+separate route. Cases of a growing series are built anew for each repeat, so that the
+time includes all work between the mesh and the recovered displacements:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
 """
@@ -24,13 +24,13 @@ from mortarbench.reports.statistics.intervals import Interval, median_interval
 MULTIGRID = "pdas-amg"  #: solver that forms a separate route
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
-#: routes that a complete map contains, on one rank
+#: kinds of routes in a complete map
 KINDS = ("primal", "primal, multigrid", "dual", "dual-bounds", "TFETI", "hybrid TFETI")
 PRIMAL = KINDS[:2]
 
 
 class Route(NamedTuple):
-    """A way from the mesh to the answer, independent of the solver."""
+    """Form, decomposition and number of ranks, independent of the solver."""
 
     kind: str  #: one of `KINDS`
     layout: str  #: keys of the decomposition, "feti=16"; empty without decomposition
@@ -44,16 +44,16 @@ class Route(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """End of a route: the first size without a verified answer."""
+    """First size of a route without a verified answer, and its verdicts."""
 
     dofs: int | None  #: None if every size was verified
-    verdict: Verdict | None  #: verdict of the best solver; None: not measured
+    verdict: Verdict | None  #: mildest verdict among the solvers; None: not measured
     outcomes: tuple[Outcome, ...]  #: answers of all solvers at that size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Map:
-    """Routes through one series of meshes."""
+    """Verified answers and ends of all routes on one series of meshes."""
 
     title: str
     sizes: tuple[int, ...]  #: dofs, ascending
@@ -63,7 +63,7 @@ class Map:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Kinds of routes without any measurement."""
+        """Kinds of routes without measurements."""
         present = {route.kind for route in self.routes}
         return tuple(kind for kind in KINDS if kind not in present)
 
@@ -95,9 +95,11 @@ class Map:
 class Crossover(NamedTuple):
     """Comparison of two routes on the sizes that both reached."""
 
-    pays: int | None  #: dofs from which on the dual route is significantly faster
-    smallest: int  #: common dofs
-    largest: int
+    #: number of dofs from which on the dual route is significantly faster; None if it
+    #: is not
+    pays: int | None
+    smallest: int  #: smallest number of dofs that both routes reached
+    largest: int  #: largest number of dofs that both routes reached
     ratio: Ratio  #: time of the primal route relative to the dual one, at `largest`
     beyond: bool  #: True if the dual route reached larger sizes
     answers: tuple[Outcome, Outcome]  #: answers of both routes at the size `largest`
@@ -118,8 +120,9 @@ def charged(o: Outcome) -> Interval | None:
 def memory(o: Outcome) -> Interval | None:
     """Return the median peak memory (MiB) of building and solving, with its interval.
 
-    Building and solving take place in different processes, in sequence. Ranks build
-    the case themselves; their memory is that of all ranks together.
+    Building and solving take place in successive processes, so the larger of their
+    peaks counts. On several ranks, the ranks build the case themselves, and the peak is
+    that of all ranks together.
     """
     peaks = [
         max(r.build_peak_mib or 0.0, r.peak_mib)
@@ -170,7 +173,7 @@ def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:
 
 
 def _inapplicable(answers: Mapping[int, Iterable[Outcome]]) -> bool:
-    """Return True if all solvers declined, as for undivided bodies on two ranks."""
+    """Return whether all solvers declined, as they do undivided bodies on two ranks."""
     every = [o for of in answers.values() for o in of]
     return all(o.verdict is Verdict.DECLINED for o in every)
 
@@ -185,7 +188,7 @@ def _stop(
     if beyond is None:
         return Stop(None, None, ())
     ends = answers.get(beyond, ())
-    # among repeats, the worst verdict counts; among solvers, the mildest
+    # the worst verdict counts among repeats, but the mildest one among solvers
     verdict = max(
         (o.verdict for o in ends if not o.verified), key=SEVERITY.index, default=None
     )
@@ -214,13 +217,13 @@ def _position(route: Route) -> tuple[Any, ...]:
 
 
 def _mesh(o: Outcome) -> tuple[Any, ...]:
-    """Return the keys of a case that do not concern its decomposition."""
+    """Return family and parameters of a case without those of its decomposition."""
     params = {k: v for k, v in o.first.params.items() if k not in DECOMPOSITION}
     return o.first.family, *sorted(params.items())
 
 
 def _dofs(answers: Iterable[Outcome]) -> dict[tuple[Any, ...], int]:
-    """Return the dofs of every mesh, from any answer or from the primal QP."""
+    """Return the number of dofs of every mesh, from any answer or the primal QP."""
     dofs: dict[tuple[Any, ...], int] = {}
     for o in answers:
         n = o.size("dofs")
@@ -237,6 +240,6 @@ def _by_block(o: Outcome) -> dict[tuple[str, int], float]:
 
 
 def _single(a: Outcome, b: Outcome) -> Ratio:
-    """Return the ratio of single runs, whose interval is unknown."""
+    """Return the ratio of single runs, with the unbounded interval (0, ∞)."""
     (t, *_), (s, *_) = _by_block(a).values(), _by_block(b).values()
     return Ratio(t / s, 0.0, float("inf"), 1)

@@ -12,7 +12,7 @@ QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 
 
 def busy_with(evidence: Evidence) -> float | None:
-    """Return the load average at the start of the run; None if low or unknown."""
+    """Return the load average at the start of the run; None if small or unknown."""
     state = evidence.environment.get("now")
     load = state.get("load") if isinstance(state, Mapping) else None
     return load if isinstance(load, int | float) and load > QUIET_LOAD else None
@@ -41,7 +41,7 @@ def machine(environment: Mapping[str, Any]) -> str:
 
 
 def flatten(data: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the leaves of nested plain data with dotted names."""
+    """Return the values in nested mappings and lists with their dotted names."""
     match data:
         case Mapping():
             items = [(str(k), v) for k, v in data.items()]

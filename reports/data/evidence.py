@@ -23,7 +23,7 @@ from mortarbench.harness.verify.kkt import allowed, rejudged
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 FROM_FILE = "file"  #: family of QPs from files, whose case names are paths
-_MARK_DIGITS = 6  #: digits of an environment's digest behind the label of a solver
+_MARK_DIGITS = 6  #: digits of an environment's digest appended to a solver label
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
@@ -74,7 +74,7 @@ class Outcome:
 
     @property
     def physical(self) -> str:
-        """Case name without the form: primal and dual are one physical case."""
+        """Case name without the form; primal and dual QPs of a problem share it."""
         return self.case.removesuffix(f"/{self.first.form}")
 
     @property
@@ -104,7 +104,7 @@ class Outcome:
 
     @cached_property
     def against_residuals(self) -> bool:
-        """True if a proven optimum overruled the residuals."""
+        """True if a proven optimum decided a verdict that the residuals contradict."""
         return any(
             r.decided_by == "reference"
             and r.verdict in (Verdict.VERIFIED, Verdict.INACCURATE, Verdict.WRONG)
@@ -136,16 +136,16 @@ class Outcome:
         return max(known) if len(known) == len(RESIDUALS) else None
 
     def seconds(self, phase: str) -> Interval | None:
-        """Return the median prepare, solve or total time of repeats that have it."""
+        """Return the median prepare, solve or total time, s; None if none is known."""
         return self._intervals[phase]
 
     @property
     def by_block(self) -> dict[Block, float]:
-        """Total seconds of each repeat that has them, see `harness.running.pairs`."""
+        """Total time by block (session and repeat), s; unknown times are omitted."""
         return self.seconds_by_block("total")
 
     def seconds_by_block(self, phase: str) -> dict[Block, float]:
-        """Return the seconds of one phase by block, without repeats that lack them."""
+        """Return the time of one phase by block, s; unknown times are omitted."""
         times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
         return {block: t for block, t in times.items() if t}
 
@@ -159,7 +159,7 @@ class Outcome:
     @cached_property
     def dualising(self) -> Interval | None:
         """Median time of dualisation over builds of the case; None for primal forms."""
-        # a set, because all measurements of one build share its time
+        # a set: all measurements on one build record the same time
         return _median({r.dualise_seconds for r in self.records if r.dualise_seconds})
 
     @cached_property
@@ -173,19 +173,19 @@ class Outcome:
 
     @cached_property
     def iterations(self) -> tuple[int, int] | None:
-        """Fewest and most iterations over the repeats."""
+        """Fewest and most iterations over the repeats; None if not reported."""
         its = [r.iterations for r in self.records if r.iterations is not None]
         return (min(its), max(its)) if its else None
 
     def counted(self, name: str) -> float | None:
-        """Return the mean of one of the solver's counts; None if a repeat lacks it."""
+        """Return the mean of a solver count over the repeats; None if one lacks it."""
         values = [v for r in self.records if (v := r.counts.get(name)) is not None]
         whole = len(values) == len(self.records)
         return float(sum(values) / len(values)) if whole else None
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results of the first repeat that has some."""
+        """Physical results of the first repeat that stored any; empty if none did."""
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:
@@ -195,36 +195,36 @@ class Outcome:
 
     @property
     def energy(self) -> float | None:
-        """Potential energy of the recovered answer, if the case has an energy."""
+        """Potential energy of the recovered answer; None if the case has no energy."""
         value = self.quantities.get("energy")
         return float(value) if isinstance(value, int | float) else None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evidence:
-    """All data of a report."""
+    """Measurements and metadata of a result folder, from which a report is composed."""
 
     directory: Path
     records: tuple[Record, ...]  #: judged at `factor`, in the order of the report
-    journal: tuple[Record, ...] = ()  #: all lines as read
+    journal: tuple[Record, ...] = ()  #: all journal lines, with their stored verdicts
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
     factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
     faults: tuple[
         Fault, ...
-    ] = ()  #: reasons of missing measurements that are not due to a solver
-    #: digest of an environment → mark behind the labels of its solvers, where a folder
-    #: has the same measurements from several environments
+    ] = ()  #: reasons for missing measurements that are not due to a solver
+    #: digest of an environment → mark appended to the labels of its solvers; empty
+    #: unless several environments repeat the same measurement
     marks: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """Name of the suite, or else of the folder."""
+        """Name of the suite; without a stored suite, name of the folder."""
         return str(self.suite.get("name", self.directory.resolve().name))
 
     @cached_property
     def solvers(self) -> tuple[str, ...]:
-        """Labels of the solvers, in the order of the suite, then alphabetically."""
+        """Solver labels in the order of the suite; unlisted solvers follow by name."""
         present = {r.solver for r in self.records}
         listed = [_label(entry) for entry in self.suite.get("solvers", ())]
         ordered = [*dict.fromkeys(listed), *sorted(present - set(listed))]
@@ -232,7 +232,7 @@ class Evidence:
 
     @cached_property
     def outcomes(self) -> dict[tuple[str, float], dict[str, Outcome]]:
-        """(case, tol) → solver → outcome, in the order of the report."""
+        """Outcomes by (case, tol) and by solver, in the order of the report."""
         grouped: dict[tuple[str, float], dict[str, list[Record]]] = {}
         for r in self.records:
             row = grouped.setdefault((r.case, r.tol), {})
@@ -248,7 +248,7 @@ class Evidence:
 
     @cached_property
     def flat(self) -> tuple[Outcome, ...]:
-        """Every outcome, row by row."""
+        """All outcomes, sorted by case and tolerance."""
         return tuple(o for row in self.outcomes.values() for o in row.values())
 
 
@@ -260,13 +260,14 @@ def read_evidence(
 ) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
 
-    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
-    warn : called with warnings on damaged lines and self-contradictory records
+    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    warn : function that receives warnings about damaged lines and records whose
+        residuals contradict their verdict
 
     Raises
     ------
     InputError
-        When the folder or its measurements are missing, or a file is malformed.
+        If the folder or its measurements are missing, or a file is malformed.
 
     """
     records = read_journal(directory, warn)
@@ -295,7 +296,7 @@ def read_evidence(
 
 
 def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Unite environments with comparable times under the digest of the first."""
+    """Replace environments whose times are comparable by the first of them."""
     representatives: dict[str, Mapping[str, Any]] = {}
     united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
@@ -320,7 +321,7 @@ def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
 
 
 def _one_name_per_qp(records: list[Record]) -> list[Record]:
-    """Rename the cases of equal QPs from several files after the first file."""
+    """Give cases with equal QPs from several files the case name of the first file."""
     first: dict[str, Record] = {}
     for r in records:
         if r.family == FROM_FILE and r.qp is not None:
@@ -336,7 +337,7 @@ def _one_name_per_qp(records: list[Record]) -> list[Record]:
 def _warn_of_contradictions(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
-    """Warn of verified records whose residuals are too large for that verdict."""
+    """Warn about verified records whose residuals are too large for that verdict."""
     wrong = []
     for r in records:
         names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
@@ -347,14 +348,14 @@ def _warn_of_contradictions(
             wrong.append(r.run_id)
     if wrong:
         warn(
-            f"{directory}: the journal says verified, but residuals exceed "
+            f"{directory}: residuals of verified records exceed "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; `run` does not "
             "write such records; judge the points again with `validate`"
         )
 
 
 def _environment(path: Path) -> dict[str, Any]:
-    """Read environment.json; return an empty table without a file."""
+    """Read environment.json; return an empty table if the file does not exist."""
     if not os.path.lexists(path):
         return {}
     table = read_json(path, _AS_WRITTEN)
@@ -366,10 +367,10 @@ def _environment(path: Path) -> dict[str, Any]:
 def _judged_and_labelled(
     record: Record, factor: float, marks: Mapping[str, str]
 ) -> Record:
-    """Judge a record at `factor`, and append mode and environment to the solver.
+    """Judge a record at `factor`, and append mode and environment to its solver label.
 
-    The mode is appended unless it is cold. The environment is appended if a folder has
-    the same measurements from several environments.
+    The mode is appended unless it is cold. The mark of the environment is appended if
+    several environments repeat the same measurement.
     """
     changes: dict[str, Any] = {}
     if factor != VERIFIED_FACTOR:
@@ -381,9 +382,11 @@ def _judged_and_labelled(
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
-    """Return marks of environments that share measurements, except one of them.
+    """Return label marks of environments that repeat the same measurement.
 
-    first : digest of the environment without a mark, if it is among them
+    One environment stays without a mark.
+
+    first : digest of the environment without a mark, if it repeats a measurement
     """
     cells: dict[tuple[Any, ...], dict[str, None]] = {}
     for r in records:
@@ -406,7 +409,7 @@ def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
 
 
 def shared(outcomes: Iterable[Outcome]) -> str:
-    """Name forms, tolerances and cases of some answers, for the title of a figure."""
+    """Return forms, tolerances and cases of outcomes in words, for a figure title."""
     answers = list(outcomes)
     forms = sorted({o.first.form for o in answers} - {""})
     tols = sorted({o.tol for o in answers}, reverse=True)
@@ -416,8 +419,8 @@ def shared(outcomes: Iterable[Outcome]) -> str:
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Sort by case, tolerance and repeat; of equal run_ids the last one is kept."""
-    # run_ids of one journal are distinct, those of several folders may not be
+    """Sort records by case, tolerance and repeat; keep the last of equal run_ids."""
+    # run_ids are unique within a journal, but not across several folders
     latest = {r.run_id: r for r in records}
     return tuple(sorted(latest.values(), key=_position))
 

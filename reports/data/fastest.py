@@ -1,15 +1,17 @@
 """The fastest solver at equal verified accuracy, per form, and its significance.
 
-A solver competes if its answers to all cases of the group that any solver solved are
-verified. The first one has the smallest geometric mean of times. It is called the
-fastest only if every other competitor is significantly slower:
+A solver competes if it was verified on every case of the group that at least one solver
+solved. The first competitor is the one with the smallest geometric mean of times. It is
+called the fastest only if every other competitor is significantly slower:
 
-- over at least `CASES` cases, if the interval of the ratio over the cases excludes 1;
-- over fewer cases, if on each of them the interval of the ratio within blocks does.
+- with at least `CASES` cases, if the interval of the ratio over the cases excludes 1;
+- with fewer cases, if the interval of the ratio within blocks (repeats of one session)
+  excludes 1 on each case.
 
-Every interval separately has 95 % coverage. If some competitor is not slower, its own
-interval must be wrong before the first solver is called the fastest; this
-intersection-union test needs no correction for the number of solvers [1]_.
+Each interval by itself has 95 % coverage. The first solver is wrongly called the
+fastest only if the interval of a competitor that is not slower misses its true ratio;
+therefore this intersection-union test needs no correction for the number of
+solvers [1]_.
 
 References
 ----------
@@ -63,14 +65,14 @@ class Competitor:
 
     solver: str
     outcomes: Mapping[str, Outcome]  #: outcomes by case
-    compared: tuple[str, ...] = ()  #: cases solved by it and the first
-    slower: bool = False  #: significantly slower than the first
+    compared: tuple[str, ...] = ()  #: cases that this and the first solver solved
+    slower: bool = False  #: True if significantly slower than the first solver
     #: ratio over the cases, or within the blocks of a single case
     ratio: Ratio | None = None
     #: ratios within blocks, by case
     by_case: Mapping[str, Ratio] = field(default_factory=dict)
-    form: str = ""  #: form of the QPs, in comparisons of forms
-    apart: bool = False  #: not measured in the blocks of the first on some case
+    form: str = ""  #: form of the QPs; empty unless forms are compared
+    apart: bool = False  #: True if on some case it shares no block with the first
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -81,7 +83,7 @@ class Competitor:
 
     @property
     def closest(self) -> Ratio | None:
-        """The ratio over the cases, or the smallest ratio of few cases."""
+        """Ratio over the cases; for few cases, the smallest ratio on a single case."""
         few = min(self.by_case.values(), key=lambda r: r.value, default=None)
         return few if self.ratio is None else self.ratio
 
@@ -90,22 +92,22 @@ class Competitor:
 class FastestSolver:
     """Comparison of the solvers of one form at one accuracy.
 
-    Competitors are sorted by their ratios. Cases are those on which all solvers were
-    measured and that at least one solved.
+    Competitors are sorted by the geometric mean of their times. The cases are those on
+    which all solvers were measured and which at least one solver solved.
     """
 
     key: GroupKey
     finding: Finding
     cases: tuple[str, ...]
     competitors: tuple[Competitor, ...]
-    others: tuple[Competitor, ...]  #: not verified on every case
-    over_cases: bool  #: ratios are over cases, else within blocks
-    unsolved: int  #: cases without a verified answer
-    notes: tuple[str, ...]  #: missing measurements, different sessions
+    others: tuple[Competitor, ...]  #: solvers that were not verified on every case
+    over_cases: bool  #: True if ratios are over cases, False if within blocks
+    unsolved: int  #: number of cases without a verified answer
+    notes: tuple[str, ...]  #: notes on missing measurements and different sessions
 
     @property
     def first(self) -> Competitor:
-        """The competitor with the smallest geometric mean; requires a competitor."""
+        """Competitor with the smallest geometric mean; requires at least one."""
         return self.competitors[0]
 
     @property
@@ -115,11 +117,11 @@ class FastestSolver:
 
     @property
     def following(self) -> Competitor | None:
-        """The next significantly slower competitor, or None."""
+        """First of the significantly slower competitors, or None."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return, by case, the fastest solver and all others that may be as fast."""
+        """Return, by case, the fastest solver and those not significantly slower."""
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]
@@ -131,7 +133,7 @@ class FastestSolver:
 
 
 class Unverified(NamedTuple):
-    """The answers of one solver that ended in one verdict other than verified."""
+    """Answers of one solver that share a verdict other than verified."""
 
     solver: str
     verdict: Verdict
@@ -208,13 +210,15 @@ def _geometric_mean(c: Competitor) -> float:
 def _compared(
     c: Competitor, first: Competitor, group: ComparisonGroup, over_cases: bool
 ) -> Competitor:
-    """Compare with the first on the cases that both solved, in one environment.
+    """Compare a competitor with the first one on the cases that both solved.
 
-    On each case, the ratio is taken within the blocks in which both were measured. Over
-    cases, Student's interval is widened to the interval of the sign-flip test if that
-    is wider. Student's interval assumes that logarithms are normally distributed, the
-    other that their distribution is symmetric. Neither assumption is safe for six
-    cases, so both intervals must exclude 1 for a significant difference.
+    If their times on a case come from different environments, return the competitor
+    without ratios. On each case, the ratio is taken within the blocks in which both
+    were measured. Over cases, each end of Student's interval is moved out to the end of
+    the sign-flip interval if that end is farther out. Student's interval assumes
+    normally distributed logarithms of ratios, the sign-flip interval only a symmetric
+    distribution. Neither assumption is safe for six cases, so both intervals must
+    exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
@@ -240,7 +244,7 @@ def _compared(
         low, high = map(float, np.exp(symmetric_interval(logs, both)))
         ratio = ratio._replace(low=min(ratio.low, low), high=max(ratio.high, high))
     slower, apart = ratio is not None and ratio.low > 1, False
-    if group.apart.any():  # different sessions, hence no pairs
+    if group.apart.any():  # different sessions have no common blocks to pair
         one, other = (group.solvers.index(s.solver) for s in (first, c))
         apart = bool(group.apart[one, other])
         slower = slower and (not apart or bool(group.faster[one, other]))

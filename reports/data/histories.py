@@ -1,4 +1,4 @@
-"""Histories of iterations that a report shows, and quantities derived from them."""
+"""Iteration histories shown in a report, and quantities derived from them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mortarbench.harness.files.store import load_history
 from mortarbench.harness.solution import History
 from mortarbench.reports.data.evidence import Evidence, Outcome
 
-MOST = 4  #: cases that are drawn
+MOST = 4  #: maximum number of cases that are drawn
 
 #: the selection rule of `chosen` in words
 RULE = (
@@ -28,7 +28,7 @@ RULE = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SolverRun:
-    """History of one solver on one case as it reported it, row by row."""
+    """History that one solver reported on one case, as columns of equal length."""
 
     outcome: Outcome
     record: Record  #: the repeat with this history
@@ -54,7 +54,11 @@ class SolverRun:
 
     @cached_property
     def gradient(self) -> Vector | None:
-        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
+        """(rows,) norm of the projected gradient relative to its first positive value.
+
+        The norm is √(‖φ‖² + ‖β‖²), with the free gradient φ and the chopped gradient β.
+        None if they are not recorded or always zero.
+        """
         phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:
             return None
@@ -70,7 +74,7 @@ class SolverRun:
 
     @property
     def two_sided(self) -> Vector | None:
-        """(rows,) number of active bounds of two-sided components: slipping rows."""
+        """(rows,) number of slipping rows: active components with two bounds."""
         return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:
@@ -89,10 +93,10 @@ class SolverRun:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaseHistories:
-    """Histories on one case at one tolerance, with a common axis of work."""
+    """Histories on one case at one tolerance, with a common measure of work."""
 
     runs: tuple[SolverRun, ...]  #: runs in the order of the suite; at least one
-    solvers: tuple[str, ...]  #: all of the report, in the order of their looks
+    solvers: tuple[str, ...]  #: all solvers of the report, which fixes their colours
 
     @property
     def counted(self) -> bool:
@@ -100,12 +104,12 @@ class CaseHistories:
         return all(c.products is not None for c in self.runs)
 
     def work(self, run: SolverRun) -> Vector:
-        """Return the work (rows,) in products or iterations, counted from one."""
+        """Return the work (rows,): products with P, or iterations counted from one."""
         products = run.products if self.counted else None
         return np.arange(1.0, run.rows + 1) if products is None else products
 
     def taken(self, kind: str) -> bool:
-        """Return whether any run has a step of this type."""
+        """Return whether any run contains a step of this type."""
         return any(c.steps(kind).any() for c in self.runs)
 
 
@@ -124,7 +128,7 @@ def chosen(evidence: Evidence) -> list[CaseHistories]:
 
 
 def unread(evidence: Evidence) -> list[str]:
-    """Return messages on stored histories that cannot be read."""
+    """Return error messages for stored histories that cannot be read."""
     lost = []
     for outcome in evidence.flat:
         for record in outcome.records:
@@ -144,7 +148,7 @@ def _runs(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[SolverRun]
             if record.vectors is not None:
                 with suppress(
                     InputError
-                ):  # vectors/ may be missing: the journal suffices
+                ):  # vectors/ may be missing: a report needs only the journal
                     history = load_history(evidence.directory, record.vectors)
             if history and next(iter(history.values())).size:
                 yield SolverRun(outcome=outcome, record=record, history=history)
@@ -152,7 +156,7 @@ def _runs(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[SolverRun]
 
 
 def _importance(row: Mapping[str, Outcome]) -> tuple[float, float, float, str]:
-    """Order by size, then load step, then accuracy; the name breaks ties."""
+    """Return a sort key: size, then load step, then accuracy; names break ties."""
     one = next(iter(row.values())).first
     step = one.params.get("step", 0)
     size = max(float(o.first.sizes.get("variables", 0)) for o in row.values())

@@ -31,8 +31,9 @@ _UNITS = {
     _CONTACTS: "Pa",  # tables show the largest pressure of each pair
 }
 _STRESS = "max_von_mises"  #: quantity that only elastic bodies have
-MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: stresses depend strongly on the mesh
-_MOST = 7  #: most digits of other quantities
+#: largest number of printed digits; few for stresses, which depend strongly on the mesh
+MOST_DIGITS = {"energy": 12, _STRESS: 3}
+_MOST = 7  #: largest number of printed digits of other quantities
 _COMPONENTS = "xyz"
 
 
@@ -47,7 +48,7 @@ Leaves = dict[tuple[str, ...], Leaf]  #: scalars by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Return whether quantities are in SI units, which only elastic bodies have."""
+    """Return whether the bodies are elastic, so that quantities are in SI units."""
     return _STRESS in outcome.quantities
 
 
@@ -68,7 +69,10 @@ def known_digits(doubt: float, most: int) -> int:
 
 
 def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
-    """Return every scalar by its path, vectors by component, in their order."""
+    """Return the scalars of the quantities by path, with vectors as components.
+
+    sizes : True for the quantities in `SIZES`, False for all others
+    """
     scalars: Leaves = {}
     for name, value in outcome.quantities.items():
         if (name in SIZES) is sizes:
@@ -134,7 +138,7 @@ def quantity(
 
 
 def _rounded(leaf: Leaf, digits: int) -> str:
-    """Format a number; a component is rounded like the largest of its vector."""
+    """Format a number; a component has the decimals of the largest in its vector."""
     if not leaf.value or not math.isfinite(leaf.value):
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))
@@ -145,26 +149,27 @@ class Spread(NamedTuple):
     """Energies of the verified answers to one physical case, and their differences."""
 
     answers: tuple[Outcome, ...]  #: answers of every solver and form; at least one
-    relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
-    pair: tuple[Outcome, Outcome] | None  #: where it occurs
+    #: largest |E − E'|/max(|E|, |E'|) over pairs of energies; None for a single answer
+    relative: float | None
+    pair: tuple[Outcome, Outcome] | None  #: answers with the largest difference
 
     @property
     def best(self) -> Outcome:
-        """The answer with the smallest worst residual."""
+        """Answer whose largest residual is smallest."""
         return best_of(self.answers)
 
     @property
     def digits(self) -> int:
-        """Digits of the printed energy; for one answer, as many as its tolerance."""
+        """Digits of the printed energy; the tolerance limits those of a lone answer."""
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 
 
 def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
-    """Compare energies pairwise by physical case and tolerance.
+    """Compare energies pairwise for each physical case and tolerance.
 
-    Answers are compared across solvers and across primal and dual forms; none serves as
-    the reference.
+    Answers are compared across solvers and across primal and dual forms; no answer
+    serves as the reference.
     """
     groups: dict[tuple[str, float], list[Outcome]] = {}
     for o in outcomes:
@@ -184,7 +189,7 @@ def _difference(a: Outcome, b: Outcome) -> float:
 
 
 def best_of(answers: Sequence[Outcome]) -> Outcome:
-    """Return the answer with the smallest worst residual; names break ties."""
+    """Return the answer whose largest residual is smallest; names break ties."""
     return min(
         answers,
         key=lambda o: (math.inf if o.worst is None else o.worst, o.case, o.solver),

@@ -1,9 +1,9 @@
 """Measured strong and weak scaling of one solve over the number of ranks.
 
-Strong scaling is one case on more ranks. Weak scaling is a case that grows with the
-ranks, so that the work of each rank stays the same. Both are reported separately for
-preparation and solve, and compared with copies: the same number of simultaneous
-independent solves on the same machine, which share its memory as ranks do.
+Strong scaling solves one case on an increasing number of ranks. Weak scaling enlarges
+the case with the number of ranks, so that the work per rank stays constant. Both are
+reported separately for preparation and solve. They are compared with copies: as many
+simultaneous independent solves as ranks, which share the machine's memory as ranks do.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from mortarbench.reports.statistics.cost_model import (
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
-ALIKE = 0.05  #: largest relative difference of the dofs of a rank in weak scaling
+ALIKE = 0.05  #: largest relative difference in dofs per rank within a weak series
 
 
 class Part(NamedTuple):
-    """Seconds, counts or memory of ranks: medians over the repeats."""
+    """Time, count or memory of the ranks of a solve: medians over the repeats."""
 
     mean: float  #: mean over the ranks
-    largest: float
+    largest: float  #: maximum over the ranks
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Scaling:
-    """Verified answers of one solver on several numbers of ranks."""
+    """Verified answers of one solver for several numbers of ranks."""
 
     solver: str  #: label of the solver on one rank
     copies: Mapping[int, Outcome]  #: simultaneous independent solves, by their number
     cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Return whether ranks shared CPUs; the model ignores such times."""
+        """Return whether ranks outnumber CPUs; the model ignores such times."""
         return self.cpus is not None and ranks > self.cpus
 
 
@@ -70,7 +70,7 @@ class StrongSeries(_Scaling):
 
     @property
     def several(self) -> tuple[int, ...]:
-        """Numbers of ranks above one."""
+        """Measured numbers of ranks greater than one."""
         return tuple(self.answers)[1:]
 
     def speed_up(self, ranks: int, phase: str) -> Interval | None:
@@ -91,9 +91,9 @@ class StrongSeries(_Scaling):
 
     @cached_property
     def model(self) -> CostModel | None:
-        """Cost model of the solve; None where records lack the messages of ranks.
+        """Cost model of the solve; None if times or message counts are missing.
 
-        Runs in which ranks shared CPUs are left out.
+        Runs with more ranks than CPUs are left out.
         """
         seconds, copies = (
             {
@@ -130,9 +130,9 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WeakSeries(_Scaling):
-    """Verified answers of one solver with equally many dofs per rank.
+    """Verified answers of one solver to cases with equally many dofs per rank.
 
-    Copies are those of the first case.
+    The copies solve the first case.
     """
 
     title: str  #: family, fixed parameters, solver, tolerance
@@ -175,7 +175,7 @@ def strong_series(evidence: Evidence) -> list[StrongSeries]:
 def weak_series(evidence: Evidence) -> list[WeakSeries]:
     """Return the series of cases with equally many dofs per rank, within 5 %.
 
-    Other parameters are fixed, as in series of sizes (`size_series`).
+    Parameters that do not determine the size are fixed, as in `size_series`.
     """
     series = []
     for key, of in by_series(sized(evidence), base_label).items():
@@ -221,10 +221,9 @@ def _ratio(
     *,
     paired: bool = True,
 ) -> Interval | None:
-    """Return the ratio of the times of a and b; single runs give no interval.
+    """Return factor·t(a)/t(b); the interval of single runs has zero width.
 
-    factor : multiplies the ratio
-    paired : True if blocks of the same name were measured in succession
+    paired : True if times of a and b with the same block were measured in succession
     """
     if a is None or b is None:
         return None
@@ -241,12 +240,12 @@ def _ratio(
 
 
 def rank_parts(o: Outcome) -> dict[str, Part]:
-    """Return the seconds of the ranks in each part of the solve, by name."""
+    """Return the time of the ranks in each part of the solve, s, by name."""
     return _parts(r.rank_seconds for r in o.records)
 
 
 def rank_counts(o: Outcome) -> dict[str, Part]:
-    """Return the reductions, messages and bytes of the ranks in the solve."""
+    """Return the numbers of reductions, messages and bytes of the ranks, by name."""
     return _parts(r.rank_counts for r in o.records)
 
 

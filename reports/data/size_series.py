@@ -1,4 +1,4 @@
-"""Series of cases that differ in size only, and their growth of time and iterations."""
+"""Series of cases that differ only in size, and growth of time and iterations."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
-SIZES = 3  #: minimum number of different sizes of a series
+SIZES = 3  #: minimum number of different sizes in a series
 
 Sized = tuple[int, Outcome]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SizeSeries:
-    """Cases that differ in size only, and the verified answers on each."""
+    """Cases that differ only in size, and the verified answers to each of them."""
 
     title: str  #: family, fixed parameters, form, tolerance
     solvers: tuple[str, ...]
-    sizes: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
+    #: number of dofs n, number of constraint rows m, and outcomes by solver
+    sizes: tuple[tuple[int, int | None, dict[str, Outcome]], ...]
 
     @property
     def answers(self) -> int:
@@ -30,7 +31,7 @@ class SizeSeries:
         return sum(len(row) for _, _, row in self.sizes)
 
     def curve(self, solver: str, against: str = "n") -> list[Sized]:
-        """Return sizes n or m, ascending, with the verified answers of one solver."""
+        """Return ascending sizes n or m with the verified answers of one solver."""
         return [
             (size, row[solver])
             for n, m, row in self.sizes
@@ -38,14 +39,14 @@ class SizeSeries:
         ]
 
     def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit median total time ~ nᵖ or mᵖ; None for fewer than three sizes."""
+        """Fit median total time ~ nᵖ or mᵖ; return None for fewer than three sizes."""
         timed = ((s, o.seconds("total")) for s, o in self.curve(solver, against))
         return _law((s, t and t.value) for s, t in timed)
 
     def iteration_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit iterations ~ nᵖ or mᵖ; None for fewer than three sizes.
+        """Fit iterations ~ nᵖ or mᵖ; return None for fewer than three sizes.
 
-        If repeats differ, the middle of their range is fitted.
+        If the repeats differ, the midpoint of their range is fitted.
         """
         counted = ((s, o.iterations) for s, o in self.curve(solver, against))
         return _law((s, i and sum(i) / 2) for s, i in counted)
@@ -56,12 +57,12 @@ class SizeSeries:
         return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
 
     def count_law(self, solver: str, name: str) -> PowerLaw | None:
-        """Fit the mean of one count ~ nᵖ; None for fewer than three sizes."""
+        """Fit the mean of one count ~ nᵖ; return None for fewer than three sizes."""
         return _law((n, o.counted(name)) for n, o in self.curve(solver))
 
 
 def _law(points: Iterable[tuple[int, float | None]]) -> PowerLaw | None:
-    """Fit a power law to the positive values; None for fewer than `SIZES` sizes."""
+    """Fit a power law to positive values; return None for fewer than `SIZES` sizes."""
     positive = [(n, v) for n, v in points if n > 0 and v is not None and v > 0]
     if len({n for n, _ in positive}) < SIZES:
         return None
@@ -72,14 +73,14 @@ class SeriesKey(NamedTuple):
     """Attributes that the cases of one series of sizes share."""
 
     family: str
-    fixed: tuple[tuple[str, Any], ...]  #: parameters
+    fixed: tuple[tuple[str, Any], ...]  #: names and values of the fixed parameters
     form: str
     tol: float
-    solver: str  #: empty where solvers are compared
+    solver: str  #: empty if the series includes the answers of all solvers
 
     @property
     def title(self) -> str:
-        """All attributes in one line."""
+        """Family, fixed parameters, form, solver and tolerance in one line."""
         keys = [f"{k}={v}" for k, v in self.fixed]
         name = clean(
             "/".join([self.family, *keys, *([self.form] if self.form else [])])
@@ -89,14 +90,14 @@ class SeriesKey(NamedTuple):
 
 
 def sized(evidence: Evidence) -> list[Sized]:
-    """Return the verified answers whose number of dofs is known, with this number."""
+    """Return (number of dofs, outcome) of verified answers whose dofs are known."""
     return [(n, o) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
 
 
 def by_series(
     answers: Iterable[Sized], solver: Callable[[Outcome], str] = lambda o: ""
 ) -> dict[SeriesKey, list[Sized]]:
-    """Group answers to cases that differ in size only.
+    """Group answers to cases that differ only in size.
 
     A parameter is fixed within a series if cases of equal size differ in it (the load
     step, for example); the other parameters determine the size.
@@ -115,9 +116,11 @@ def by_series(
 def fixed_keys(
     answers: Iterable[Sized], apart: Sequence[str] = ()
 ) -> dict[str, dict[str, None]]:
-    """Return, by family, the keys in which cases of equal size differ, in their order.
+    """Return, by family, the parameters in which cases of equal size differ.
 
-    apart : keys that are never fixed
+    Each inner dict serves as an ordered set; its values are None.
+
+    apart : parameters that are never fixed
     """
     seen: dict[tuple[str, str, int], set[Any]] = {}
     for n, o in answers:
@@ -132,9 +135,9 @@ def fixed_keys(
 
 
 def size_series(evidence: Evidence) -> list[SizeSeries]:
-    """Return the series of at least three sizes.
+    """Return all series with at least three sizes.
 
-    n is the number of dofs, and m is the number of equality and contact rows.
+    Size n is the number of dofs, and m is the number of equality and contact rows.
     """
     series = []
     answers = [(n, o) for n, o in sized(evidence) if o.first.role != COPIES]
@@ -157,15 +160,15 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sweep:
-    """Verified answers of one solver to cases that differ in one key only."""
+    """Verified answers of one solver to cases that differ only in one parameter."""
 
     title: str  #: family, other parameters, form, tolerance
     solver: str
-    answers: tuple[Sized, ...]  #: answers by the value of the key
+    answers: tuple[Sized, ...]  #: values of the parameter, ascending, with the answers
 
 
 def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
-    """Return the sweeps in which one key takes at least three positive values."""
+    """Return the sweeps in which parameter `key` has at least three positive values."""
     groups: dict[tuple[Any, ...], dict[int, Outcome]] = {}
     for o in evidence.flat:
         params = dict(o.first.params)

@@ -1,13 +1,13 @@
-"""Time at equal error: the time of a solver for an answer of given certified accuracy.
+"""Time at equal error: time that a solver needs for a prescribed certified error.
 
 A solver is run at several tolerances, which yields points (certified error, time).
-Between these points the time is interpolated linearly in the logarithms, after isotonic
-regression, because a better answer does not take less time [1]_. Nothing is
-extrapolated.
+Isotonic regression removes decreases of time with accuracy, because a more accurate
+answer should not take less time [1]_. The time is then interpolated linearly in the
+logarithms between the points, and never extrapolated.
 
-A point counts if the solver claimed success and a certificate bounds its error. The
-claim is not trusted; it shows that the solver's own test ended the solve, not a limit.
-Residuals that refute the claim do not matter here, since the error is certified.
+A point is used if the solver claimed success and a certificate bounds its error. The
+claim shows only that the solver stopped by its own criterion and not at a limit.
+Whether residuals refute the claim is irrelevant here, since the error is certified.
 
 References
 ----------
@@ -30,21 +30,24 @@ from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import limits
 
-RESAMPLES = 400  #: bootstrap resamples; a tail of 2.5 % then consists of 10 of them
+RESAMPLES = 400  #: number of bootstrap resamples; 10 of them form a tail of 2.5 %
 SMALLEST = 1e-17  #: lower bound of errors, so that zero has a logarithm
 
 Floats = NDArray[np.float64]
 
 
 class TimeAtAccuracy(NamedTuple):
-    """The time at one error; see `time_at_accuracy`."""
+    """Time at a prescribed error; see `time_at_accuracy`."""
 
-    kind: str  #: "between", "looser" (the loosest is already better), "not reached"
-    time: Interval | None  #: s; for "looser" the time at the loosest, an upper bound
+    #: "between" two measured errors; "looser" than every measured error; "not reached"
+    kind: str
+    #: s; None if not reached; if "looser", the time at the largest measured error,
+    #: which is an upper bound
+    time: Interval | None
 
 
 def counts(outcome: Outcome) -> bool:
-    """Return whether an outcome is a point of its solver's curve."""
+    """Return whether an outcome may be used as a point (certified error, time)."""
     limited = outcome.verdict in (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
     return (
         outcome.claims == ("solved",)
@@ -55,11 +58,11 @@ def counts(outcome: Outcome) -> bool:
 
 
 def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccuracy:
-    """Interpolate the time of answers with a certified error of at most `error`.
+    """Interpolate the time that a solver needs for a certified error of `error`.
 
-    The interval is a bootstrap over the repeats of each tolerance, seeded by run_ids
-    and widened for few repeats (see `resampling.limits`). A single repeat has no
-    interval.
+    The interval comes from a bootstrap over the repeats at each tolerance, seeded by
+    the run_ids, and is widened for few repeats (see `resampling.limits`). If a
+    tolerance has only one repeat, both ends of the interval equal the value.
 
     outcomes : outcomes of one solver on one case, at all tolerances
     """
@@ -87,11 +90,12 @@ def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccurac
 
 
 def times_at(error: float, errors: Floats, times: Floats) -> Floats:
-    """Interpolate monotonically in logarithms, between smallest and largest error.
+    """Interpolate times monotonically at `error`, linearly in the logarithms.
 
     Parameters
     ----------
-    errors : (k,) positive; equal ones are merged, with the geometric mean of times
+    error : between the smallest and the largest of `errors`
+    errors : (k,) positive; equal errors are merged, with the geometric mean of times
     times : (…, k) s, positive; any number of curves
 
     Returns
@@ -115,7 +119,7 @@ def isotonic(y: Floats, weights: NDArray[np.integer]) -> Floats:
     The fit at i is the maximum over start ≤ i of the minimum over end ≥ i of the
     weighted mean of y from start to end.
 
-    y : (…, k); each (k,) is fitted separately
+    y : (…, k); each row of k values is fitted separately
     weights : (k,) positive
     """
     before = np.cumsum([0, *weights])

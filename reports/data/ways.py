@@ -1,8 +1,8 @@
 """Ways from the mesh to a verified answer: combinations of a form and a solver.
 
 The primal and the dual QP of one problem are different problems for a solver, but a
-user with a mesh may choose either. Ways are compared by the time of dualisation, which
-only dual forms need, plus preparation and solve; assembly is the same for all.
+user with a mesh may choose either. The times compared are those of dualisation (dual
+forms only), preparation and solve; assembly is the same for all ways.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class Ways:
     """Comparison of all ways at each accuracy."""
 
     comparisons: tuple[FastestSolver, ...] = ()  #: cold solves, tight accuracies first
-    uncharged: int = 0  #: problems left out: their dual forms lack `dualise_seconds`
+    uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
 
 
 def compare_ways(evidence: Evidence) -> Ways:
     """Compare the ways to solve the same problems, including dualisation.
 
     A problem is included if it was measured in several forms, or if its only form has a
-    time of dualisation; for others the comparison of solvers is equivalent.
+    time of dualisation; for other problems this equals the comparison of solvers.
     """
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
@@ -105,8 +105,8 @@ def compare_ways(evidence: Evidence) -> Ways:
 
 
 def _has_all_times(r: Record) -> bool:
-    """Return whether a record has the time of dualisation, or needs none.
+    """Return whether a record includes the time of dualisation, or needs none.
 
-    Journals of older versions and cases emitted by ranks lack it.
+    Journals of older versions and cases built by ranks lack this time.
     """
     return r.form == PRIMAL or r.total_seconds is None or r.dualise_seconds is not None

@@ -1,6 +1,6 @@
 """Figures of bodies to scale, as data: meshes, coloured fields, arrows.
 
-They are drawn to files only; a page embeds the drawing.
+These figures are drawn to files only; the HTML page embeds the drawing.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Points = NDArray[np.float64]  #: (n, 2)
 class ColourScale:
     """Colour map of a range of values, with the label of its bar."""
 
-    #: a colour map of matplotlib; or colours of the kinds 0, 1, … called `names`
+    #: name of a matplotlib colour map, or colours of the classes 0, 1, … in `names`
     colours: str | tuple[str, ...]
     low: float
     high: float
     label: str = ""
-    unit: float = 1.0  #: value labelled 1 on the bar
-    beyond: Literal["neither", "max", "both"] = "neither"  #: ends with clipped values
-    names: tuple[str, ...] = ()  #: names of the kinds, shown at the colour bar
+    unit: float = 1.0  #: value that the bar labels as 1
+    beyond: Literal["neither", "max", "both"] = "neither"  #: ends that clip values
+    names: tuple[str, ...] = ()  #: names of the classes, shown at the colour bar
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -43,7 +43,7 @@ class ColourField:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Raster:
-    """Values of the square cells of a grid as colours, none where NaN."""
+    """Values of square grid cells as colours; cells with NaN stay blank."""
 
     low: tuple[float, float]  #: lower left corner
     high: tuple[float, float]
@@ -53,7 +53,7 @@ class Raster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Faces:
-    """Quadrilaterals drawn one over another; those without a value are outlines."""
+    """Quadrilaterals drawn one over another; those with the value NaN are outlines."""
 
     corners: NDArray[np.float64]  #: (k, 4, 2), back to front
     values: Vector  #: (k,) colours; NaN: a thin white outline
@@ -62,7 +62,7 @@ class Faces:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Polygons:
-    """Filled outlines."""
+    """Closed polygons with fill, hatching and outline."""
 
     corners: tuple[Points, ...]
     fill: str = "none"
@@ -75,9 +75,9 @@ class Polygons:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Strokes:
-    """Straight lines."""
+    """Straight line segments."""
 
-    ends: NDArray[np.float64]  #: (k, 2, 2)
+    ends: NDArray[np.float64]  #: (k, 2, 2) coordinates of both ends of each segment
     colour: str
     width: float
     opacity: float = 1.0
@@ -86,7 +86,7 @@ class Strokes:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Path:
-    """A line or marks at points."""
+    """Points joined by a line, drawn as marks, or both."""
 
     points: Points
     look: Look
@@ -94,7 +94,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Vectors:
-    """Arrows of a vector field, with lengths in units of the axes."""
+    """Arrows of a vector field, whose lengths are in units of the axes."""
 
     feet: Points
     vectors: Points
@@ -105,7 +105,7 @@ class Vectors:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """One arrow with a head named as in matplotlib."""
+    """An arrow whose head is named as in matplotlib."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -136,7 +136,7 @@ FieldMark = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldPanel:
-    """Bodies to scale, back to front."""
+    """Panel with bodies to scale, whose marks are drawn back to front."""
 
     low: tuple[float, float]  #: lower left corner
     high: tuple[float, float]
@@ -144,15 +144,15 @@ class FieldPanel:
     title: str = ""
     xlabel: str = ""
     ylabel: str = ""
-    unit: float = 1.0  #: length labelled 1 on the axes
-    numbered: tuple[bool, bool] = (True, True)  #: tick labels of x and y
+    unit: float = 1.0  #: length that the axes label as 1
+    numbered: tuple[bool, bool] = (True, True)  #: True for tick labels, on x and y
     axes: Literal["lines", "frame", "none"] = "lines"
     scale: ColourScale | None = None  #: shown as a bar below the panel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FieldFigure:
-    """Panels of bodies in a grid."""
+    """Grid of panels with bodies to scale."""
 
     panels: tuple[FieldPanel, ...]
     height: float  #: inches
@@ -164,7 +164,7 @@ class FieldFigure:
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return lower left and upper right corner around bodies, with a margin."""
+    """Return lower left and upper right corners of a box around bodies, with margin."""
     points = np.vstack(bodies)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (high - low)

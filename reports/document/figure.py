@@ -31,7 +31,7 @@ MARGIN = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """Look of a line and its marks; widths and sizes in points."""
+    """Appearance of a line and its marks; widths and sizes are in points."""
 
     colour: str
     marker: str = ""  #: one of "o s ^ D v P X < > x + * _ |", or empty for none
@@ -63,9 +63,9 @@ class Series:
     y: Numbers
     look: Look
     intervals: Intervals | None = None
-    step: bool = False  #: step function, constant until the next point
-    few: bool = False  #: draw marks only at a few points
-    clipped: bool = True  #: cut at the edge of the panel
+    step: bool = False  #: True for a step function, constant until the next point
+    few: bool = False  #: True for marks at a few points only
+    clipped: bool = True  #: True to clip at the edge of the panel
     solver: str = ""  #: solver of the points; empty for none
     runs: Runs = ()  #: run_ids behind each point, or one entry for all points
 
@@ -128,7 +128,7 @@ class Text:
         False,
     )  #: True if `place` is relative to the panel, for x and y
     offset: tuple[float, float] = (0.0, 0.0)  #: points
-    align: tuple[str, str] = ("left", "center")  #: alignment in the words of matplotlib
+    align: tuple[str, str] = ("left", "center")  #: alignment, named as in matplotlib
     size: float = 8.5
 
 
@@ -138,16 +138,16 @@ class Axis:
 
     label: str = ""
     log: bool = False
-    low: float | None = None  #: ends; None for slightly beyond the points
-    high: float | None = None
+    low: float | None = None  #: lower end; None: slightly below the points
+    high: float | None = None  #: upper end; None: slightly above the points
     #: positions and labels; None: automatic
     ticks: tuple[tuple[float, str], ...] | None = None
     most: int | None = None  #: approximate number of automatic ticks
-    integers: bool = False  #: ticks are integers
-    plain: bool = False  #: tick labels without powers of ten
+    integers: bool = False  #: True for ticks at integers only
+    plain: bool = False  #: True for tick labels without powers of ten
     span: float = SPAN  #: smallest ratio of the ends of a logarithmic axis
-    numbered: bool = True  #: ticks have labels
-    marked: bool = True  #: ticks have strokes
+    numbered: bool = True  #: True if ticks have labels
+    marked: bool = True  #: True if ticks have strokes
     line: bool = True
     shared: str = ""  #: axes with the same name have the same ends
 
@@ -158,7 +158,7 @@ class Axis:
 
 
 def categories(names: Sequence[str], **how: Any) -> Axis:
-    """Return an axis of names from top to bottom, the k-th at −k."""
+    """Return an axis with names from top to bottom; the k-th name is at −k, from 0."""
     ticks = tuple((-float(k), name) for k, name in enumerate(names))
     defaults = {"low": 0.4 - max(len(names), 1), "high": 0.6, "ticks": ticks}
     return Axis(**{**defaults, "marked": False, **how})
@@ -181,7 +181,7 @@ class Legend:
     title: str = ""
     columns: int = 1
     place: Literal["below", "right", "upper left"] = (
-        "below"  #: the last is within a panel
+        "below"  #: "upper left" is within a panel
     )
     size: float = 9.0
 
@@ -252,7 +252,7 @@ def in_rows(panels: Sequence[Panel], columns: int) -> tuple[Row, ...]:
 
 
 def fitted(figure: Figure) -> Figure:
-    """Determine both ends of every axis, so that they contain all marks."""
+    """Determine both ends of every axis; automatic ends enclose all marks."""
     rows = tuple(
         replace(row, panels=tuple(_fitted(p, figure.panels) for p in row.panels))
         for row in figure.rows
@@ -272,9 +272,10 @@ def _fitted(panel: Panel, panels: Iterable[Panel]) -> Panel:
 
 
 def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
-    """Return the ends of an axis shared by panels: given, or just beyond the points.
+    """Return the ends of an axis that panels share.
 
-    A single value is centred; without values a default range is used.
+    Ends that are not prescribed lie just beyond the points. A single value is centred;
+    without values a default range is used.
     """
     axis: Axis = getattr(panels[0], direction)
     shown = [v for panel in panels for v in _values(panel, direction) if isfinite(v)]

@@ -12,9 +12,9 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.files.csvfile import inert
 from mortarbench.reports.statistics.intervals import Interval, PowerLaw
 
-ABSENT = "–"  #: a value that was not or cannot be measured
+ABSENT = "–"  #: text for a value that was not or cannot be measured
 
-#: definition of a time, stated wherever times are shown
+#: definition of the times, stated wherever times are shown
 TIMED = (
     "Times are solver times, which start with the assembled QP: assembly, "
     "linearisation and, for dual forms, dualisation are not included."
@@ -35,7 +35,7 @@ VERDICTS = {
     Verdict.DECLINED: ("○", "declined"),
 }
 
-#: Predicates for solvers without a verified answer.
+#: Verb phrases whose subject is a solver without a verified answer.
 ENDINGS = {
     Verdict.INACCURATE: "claimed success but was inaccurate",
     Verdict.WRONG: "claimed success but was wrong",
@@ -57,11 +57,12 @@ _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 
 @lru_cache(1 << 16)
 def clean(text: str, limit: int = 96) -> str:
-    """Sanitise foreign text for a table: one line of at most `limit` characters.
+    """Sanitise untrusted text for a table: one line of at most `limit` characters.
 
-    Control characters are replaced. Long texts lose their middle, since names differ
-    at their ends. A letter keeps at most two accents; an accent without a letter gets
-    a circle. Text that a spreadsheet would read as a formula gets an apostrophe.
+    Control characters are replaced. Long texts are abbreviated in the middle, since
+    names differ at their ends. A letter keeps at most two accents; an accent without a
+    letter is set on a circle. Text that a spreadsheet would evaluate as a formula is
+    prefixed with an apostrophe.
     """
     line = inert(" ".join(text.split()))
     if not line.isascii() or not line.isprintable():
@@ -79,12 +80,12 @@ def clean(text: str, limit: int = 96) -> str:
 
 
 def plain_value(value: object, limit: int = 96) -> str:
-    """Print a value of plain data: a number as it is, other values through `clean`."""
+    """Return a number as text without rounding, and other values cleaned by `clean`."""
     return str(value) if isinstance(value, int | float) else clean(str(value), limit)
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print with `digits` significant digits; short results have no exponent."""
+    """Print with `digits` significant digits, and with an exponent only if needed."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:
@@ -119,8 +120,8 @@ def tolerance(value: float) -> str:
 def seconds(interval: Interval | None) -> str:
     """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
 
-    Both ends have the decimals of the median, which are enough to distinguish the ends
-    and to show three digits. A single run has no interval; the text says "1 run".
+    The median and both ends have equally many decimals: enough to show three digits of
+    the median and to distinguish the ends. For a single run, "1 run" replaces the ends.
     """
     if interval is None:
         return ABSENT
@@ -153,18 +154,18 @@ def bracketed(value: float, low: float, high: float) -> str:
 
 
 def estimate(of: Sequence[float]) -> str:
-    """Print an estimate and its interval, its first three items."""
+    """Print an estimate and its interval, which are the first three items of `of`."""
     return bracketed(*of[:3])
 
 
 def fixed(of: Sequence[float], digits: int = 3) -> str:
-    """Print a value and its interval with `digits` decimals each."""
+    """Print a value and its interval, the first three items, with `digits` decimals."""
     value, low, high = (f"{v + 0.0:.{digits}f}" for v in of[:3])
     return f"{value} [{low}, {high}]"
 
 
 def span(least_most: tuple[int, int] | None) -> str:
-    """Print a count, or its range where repeats differ."""
+    """Print a count, or its range if the two values differ."""
     if least_most is None:
         return ABSENT
     least, most = least_most
@@ -172,7 +173,7 @@ def span(least_most: tuple[int, int] | None) -> str:
 
 
 def listing(names: Sequence[str], limit: int = 3) -> str:
-    """Name the first few of a list and count the others."""
+    """Enumerate the first `limit` names and count the others."""
     shown = ", ".join(clean(n) for n in names[:limit])
     more = len(names) - limit
     return f"{shown} and {more} more" if more > 0 else shown

@@ -19,7 +19,7 @@ from mortarbench.reports.document.formatting import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_RUN = "run "  #: prefix of the run_ids in a title
+_RUN = "run "  #: prefix of the run_ids in the title of a cell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,9 +28,9 @@ class Cell:
 
     text: str = ABSENT
     symbol: str = ""  #: symbol before the text, if the format supports it
-    after: str = ""  #: small print behind the text
+    after: str = ""  #: small print after the text
     kind: str = ""  #: a verdict, "best", "tied", "void" (not comparable) or "total"
-    title: str = ""  #: shown on hovering; run_ids in the form of `source` become links
+    title: str = ""  #: hover text; run_ids in the format of `sources` become links
     value: float | None = None  #: sort key; None to sort by text
 
     @classmethod
@@ -51,7 +51,7 @@ class Cell:
 
     @classmethod
     def number(cls, value: Any, show: Callable[[Any], str] = str, **more: Any) -> Cell:
-        """Return a cell of a number or of an estimate with its value; "–" for None.
+        """Return a cell with a number or an estimate; its text is "–" for None.
 
         show : formatter, such as those of `reports.document.formatting`
         """
@@ -60,26 +60,26 @@ class Cell:
 
     @classmethod
     def time(cls, interval: Interval | None, **more: str) -> Cell:
-        """Return a cell of a time with its interval."""
+        """Return a cell with a time and its interval."""
         return cls.number(interval, seconds, **more)
 
     @classmethod
     def ratio(cls, ratio: Any, **more: str) -> Cell:
-        """Return a cell of an estimate with its interval."""
+        """Return a cell with an estimate and its interval."""
         return cls.number(ratio, estimate, **more)
 
     @classmethod
     def power(cls, value: float | None, **more: str) -> Cell:
-        """Return a cell of a number with two significant digits."""
+        """Return a cell with a number, printed with two significant digits."""
         return cls.number(value, power, **more)
 
     @classmethod
     def tolerance(cls, tol: float) -> Cell:
-        """Return a cell of a tolerance."""
+        """Return a cell with a tolerance, printed in short form."""
         return cls.number(tol, tolerance)
 
 
-Column = tuple[str, Callable[[Any], Cell]]  #: heading, and the cell of an item
+Column = tuple[str, Callable[[Any], Cell]]  #: heading, and function from item to cell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,17 +117,18 @@ class Table:
 class Picture:
     """A figure with its caption and the stem of its files.
 
-    The page draws figures of curves itself, with zoom; figures of bodies are embedded.
+    The script of the page draws figures of curves, with zoom; figures of bodies are
+    embedded as drawings.
     """
 
-    name: str
+    name: str  #: stem of the files
     caption: str
     figure: Figure | FieldFigure
 
 
 @dataclass(frozen=True, kw_only=True)
 class Statement:
-    """Conclusions on one subject in complete sentences, which precede the evidence."""
+    """Conclusions on one subject in complete sentences, printed before the evidence."""
 
     subject: str
     claims: tuple[str, ...]
@@ -151,7 +152,7 @@ Part = Statement | str | Point | Table | Picture
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Section:
-    """One part of the report; `name` is its anchor and the stem of its files."""
+    """One section of the report; `name` is its anchor and the stem of its files."""
 
     name: str
     title: str
@@ -186,12 +187,12 @@ class Section:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Page:
-    """A whole page."""
+    """Contents of a page, and the records behind its numbers."""
 
     title: str
     dateline: str
     sections: tuple[Section, ...]
-    footer: str = ""  #: location of the numbers; empty for a result folder
+    footer: str = ""  #: text on where the data are; empty for a result folder
     records: tuple[Record, ...] = ()  #: measurements behind the numbers
     solvers: tuple[str, ...] = ()  #: labels, in the order of their looks in figures
 
@@ -201,19 +202,19 @@ class Page:
 
 
 def sources(records: Iterable[Record]) -> str:
-    """Return a title that names measurements; empty if there are none."""
+    """Return hover text with the run_ids of records; empty if there are none."""
     names = ", ".join(short(r.run_id) for r in records)
     return _RUN + names if names else ""
 
 
 def named(title: str) -> list[str]:
-    """Return the run_ids in a title, shortened by `short`; inverse of `sources`."""
+    """Return the run_ids in a hover text, as printed by `short` (see `sources`)."""
     before, run, names = title.rpartition(_RUN)
     at_end = run and (not before or before.endswith(" "))
     return names.split(", ") if at_end else []
 
 
 def short(run_id: str) -> str:
-    """Print a run_id, sanitised if it does not have the form of ours."""
+    """Print a run_id; sanitise it unless it is short, alphanumeric and ASCII."""
     is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
     return run_id if is_ours else clean(run_id, 40)

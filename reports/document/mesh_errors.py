@@ -42,8 +42,8 @@ def mesh_table(meshes: Sequence[Discretisation]) -> Table:
             ("note", note),
         ),
         notes=(
-            "Estimated from reference solutions on meshes with every cell halved once "
-            "and twice, without a solver under test. Rate: exponent of h in the "
+            "Estimated from reference solutions on meshes whose cell size h is halved "
+            "once and twice, without a solver under test. Rate: exponent of h in the "
             "error.",
         ),
     )

@@ -35,7 +35,7 @@ _SPACE = re.compile(r"[ \n]+")
 
 @cache
 def environment() -> Environment:
-    """Return the common environment of all templates, with formats as filters."""
+    """Return the Jinja environment of all templates, with the formats as filters."""
     common = Environment(
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
@@ -46,10 +46,10 @@ def environment() -> Environment:
 
 
 class Sentences:
-    """The macros of a template.
+    """Macros of a template, called by name.
 
     module : full name of the module beside the template
-    names : further names that all macros may use
+    names : further variables for all macros
     """
 
     def __init__(self, module: str, **names: Any) -> None:
@@ -68,7 +68,7 @@ class Sentences:
         return _SPACE.sub(" ", write(*args, **values)).strip()
 
     def parts(self, macro: str, *args: Any, **values: Any) -> list[str]:
-        """Return the paragraphs of a macro; those with a leading dash are points."""
+        """Return the paragraphs of a macro; a leading dash marks an entry of a list."""
         write: Callable[..., str] = getattr(self._macros, macro)
         texts = re.split(r"\n\s*\n", write(*args, **values).strip())
         lines = [_SPACE.sub(" ", text).strip() for text in texts if text]

@@ -36,11 +36,12 @@ _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
 def csv_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Return every nonempty table by the name of its file.
+    """Return every nonempty table by the stem of its file.
 
-    measurements: one row per journal line. outcomes: one row per case, tolerance and
-    solver, with medians of times and their intervals. energies, scaling: as in the
-    report. contests, means: see `comparison_tables`.
+    The table `measurements` has one row per journal line; `outcomes` has one row per
+    case, tolerance and solver, with medians of times and their intervals; `energies`
+    and `scaling` contain the numbers of these sections of the report. For `contests`
+    and `means`, see `comparison_tables`.
 
     pool_forms : compare the cases of all forms together
     """
@@ -68,7 +69,7 @@ def csv_tables(
 
 
 def frame_csv(frame: pd.DataFrame) -> str:
-    """Write a data frame as CSV, see `harness.files.csvfile`."""
+    """Return a data frame as CSV text, see `harness.files.csvfile`."""
     rows = frame.astype(object).where(frame.notna(), None)
     return csv_text(list(frame.columns), rows.itertuples(index=False, name=None))
 
@@ -139,11 +140,12 @@ def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
 def comparison_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Return the tables of all groups of cases.
+    """Return the tables `contests` and `means` of all groups of cases.
 
-    contests: a row per case and solver with its time and its ratio to the best, both
-    infinite for a failure; profiles are the distributions of these ratios. means: a row
-    per solver and convention; the usual convention has intervals and tiers.
+    `contests` has one row per case and solver with the time and its ratio to the best
+    time, both infinite for a failure; performance profiles are the distributions of
+    these ratios. `means` has one row per solver and convention; intervals and tiers are
+    given for the usual convention only.
     """
     groups = comparison_groups(evidence, pool_forms=pool_forms)
     return {

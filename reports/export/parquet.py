@@ -48,8 +48,9 @@ def _column(values: Sequence[Any], annotation: str) -> Any:
 
 
 def texts(values: Iterable[Any]) -> list[str | None]:
-    """Convert values to text, nested ones to JSON; shared objects only once."""
-    json_of: dict[int, str] = {}  # by identity: records of a journal share objects
+    """Convert values to text: nested values to JSON, other values by `str`."""
+    # cached by identity, because records of a journal share objects
+    json_of: dict[int, str] = {}
 
     def text(value: Any) -> str | None:
         if value is None or type(value) is str:

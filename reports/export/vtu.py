@@ -20,30 +20,30 @@ from mortarbench.harness.files.csvfile import csv_text
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.plugin import SLIDING
 
-#: a node is in contact if its force exceeds this times the largest force or, with
-#: friction, if it sticks or slips
+#: a node is in contact if its force exceeds this fraction of the largest nodal force
+#: or, with friction, if it sticks or slips
 IN_CONTACT = 1e-6
-#: states of friction, numbered in VTU files
+#: friction states; VTU files store the index of a state
 STATES = ("open", "stick", "slip", SLIDING)
 #: States by increasing priority, for nodes on several contact sides.
 _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
 
 def write_vtu(fields: Fields, path: Path) -> list[Path]:
-    """Write a deformed state, SI units; plane vectors get a third component 0.
+    """Write a deformed state in SI units; return the .vtu and a CSV for each contact.
 
-    Point data: displacement (m), contact_force (N/m in the plane, N in space; on slave
-    nodes, else 0), in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m,
-    on slave nodes that face a master, else NaN, which ParaView leaves out) and the
-    nodal fields; cell data: body, and subdomain of decomposed bodies. Triangles come
-    before quadrilaterals. *Warp By Vector* in ParaView needs three components.
-
-    Returns the files written: the .vtu, and a CSV for each contact.
+    The point data are displacement (m), contact_force (force of the contact on a slave
+    node, N/m in the plane, N in space), in_contact (0 or 1), pressure (Pa), gap (m) and
+    the nodal fields. Forces and pressures are zero except on slave nodes. The gap is
+    NaN, which ParaView leaves out, except on slave nodes that face a master. The cell
+    data are the body and, for decomposed bodies, the subdomain; triangles come before
+    quadrilaterals. Plane vectors get a zero third component, because *Warp By Vector*
+    in ParaView needs three components.
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        If a file cannot be written.
 
     """
     nodes = len(fields.points)
@@ -89,9 +89,11 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
-    """Return the largest pressure and the smallest gap of all sides at the nodes (N,).
+    """Return the nodal fields (N,) of all contact sides: pressure, gap, friction.
 
-    With friction, add the shear traction and the index of each state in `STATES`.
+    At nodes of several sides, the pressure is the largest and the gap is the smallest.
+    With friction, the fields include the shear traction and the index of the state in
+    `STATES`.
     """
     if not sides:
         return {}
@@ -115,10 +117,10 @@ def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     """Write a CSV of one contact, with a row per node of the slave side.
 
-    In the plane, nodes are in the order of the side, and the first column is its arc
-    length; in space they are ascending.
+    In the plane, nodes are in the order of the side, and the first column is the arc
+    length along it; in space, node numbers are ascending.
     """
-    # names of pairs come from users: keep letters, digits and dashes
+    # names of pairs come from users: keep letters, digits and underscores
     name = "-".join(re.findall(r"\w+", side.name)) or "contact"
     path = vtu.with_name(f"{vtu.stem}-{name}.csv")
     points = fields.points[side.nodes]
@@ -143,7 +145,7 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
 
 
 def _arc_length(points: NDArray[np.float64]) -> Vector:
-    """Return the distance (s,) of points along a chain from its first one."""
+    """Return the arc length (s,) from the first point of a chain to each point, m."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps))
 
@@ -154,14 +156,14 @@ def _without_nan(value: float | str) -> float | str | None:
 
 
 def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Path]:
-    """Write states with their times as path.pvd, and the files of each beside it.
+    """Write states with their times as a .pvd file, and the .vtu files beside it.
 
-    Returns the files written, the .pvd first, which is the one to open in ParaView.
+    Return the files written; the first is the .pvd, to be opened in ParaView.
 
     Raises
     ------
     InputError
-        When a file cannot be written.
+        If a file cannot be written.
 
     """
     written, lines = [], []

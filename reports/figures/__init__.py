@@ -1,1 +1,1 @@
-"""Figures as values: content, style and the measurements behind each point."""
+"""Figures as data: content, style and the measurements behind each point."""

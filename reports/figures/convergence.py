@@ -30,12 +30,13 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import VERDICTS, tolerance
 from mortarbench.reports.figures.style import TITLE, below, legible, look
 
-#: letter, name and marker of a kind of step; other steps, mostly CG, have no marker
+#: kinds of steps that are marked: letter in the history, name and marker; most other
+#: steps are CG steps
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
 WIDE = 10.0  #: ratio of longest to shortest run above which the axis is logarithmic
 CLOSEST = 5.0  #: minimum distance between markers of one step type on a curve, points
-COLUMNS = 4  #: columns of a legend
-FLOOR = 1e-5  #: times the tolerance; smaller values are rounding and are not shown
+COLUMNS = 4  #: number of columns of a legend
+FLOOR = 1e-5  #: smallest value shown, in tolerances; smaller values are rounding
 _BESIDE = 0.8  #: width of the labels left of the axes, inches
 _TOLERANCE = Look(colour=INK, width=0.6, dash=(1, 2))
 
@@ -43,7 +44,7 @@ Curves = Sequence[tuple[SolverRun, Vector]]
 
 
 def convergence_figure(c: CaseHistories) -> Figure | None:
-    """Plot projected gradient and infeasibility against work; None if unknown."""
+    """Plot projected gradient and infeasibility against work; None without both."""
     gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
     errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
     rows = []
@@ -80,7 +81,7 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
 
 
 def active_set_figure(c: CaseHistories) -> Figure | None:
-    """Plot the number of active bounds against work; return None if none is recorded.
+    """Plot the number of active bounds against work; None if it is not recorded.
 
     A second panel shows active components with two bounds, if any are recorded.
     """
@@ -156,7 +157,7 @@ def _work(c: CaseHistories) -> Axis:
 
 
 def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
-    """Mark the ends of outer iterations, one row per solver."""
+    """Return a panel that marks the ends of outer iterations, one row per solver."""
     marks = tuple(
         Segments(
             ends=tuple(

@@ -32,7 +32,7 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-#: letters at the end of a line, by the verdict that ended it; "?" where not measured
+#: letters at the end of a line, by the verdict at the next size; "?": not measured
 LETTERS = {
     Verdict.TIME_LIMIT: "t",
     Verdict.MEMORY_LIMIT: "m",
@@ -41,8 +41,8 @@ LETTERS = {
 }
 FAILED = "f"  #: letter of all other verdicts
 UNMEASURED = "?"
-_HEIGHT = 2.75  #: of a row of panels, inches
-_LETTER = 1.7  #: ratio of values whose letters would overlap on four decades
+_HEIGHT = 2.75  #: height of a row of panels, inches
+_LETTER = 1.7  #: letters overlap below this ratio of values on an axis of four decades
 _LIMIT = Look(colour=INK, width=0.7, dash=DOTTED)
 _BARS = {"cap": 2.2, "width": 0.9}
 
@@ -61,7 +61,7 @@ def crossover_figure(
         title = legible(one.title, 44)
         panels = (
             _panel(one, charged, "time from mesh to answer in s", time_limit, title),
-            # letters would overlap here: the peaks of several routes are close
+            # no letters here: the peaks of several routes are close together
             replace(
                 _panel(one, memory, "peak memory in MiB", memory_limit, title),
                 texts=(),
@@ -138,13 +138,13 @@ def _index(route: Route) -> int:
 def _short(route: Route) -> str:
     """Return the name of a route without the keys of its decomposition.
 
-    The same route has other keys in other families; tables show them.
+    Families differ in the keys of the same kind of route; the tables show the keys.
     """
     return route._replace(layout="").label
 
 
 def _look(route: Route) -> Look:
-    """Return colour and marker of the kind; several ranks are dashed and hollow."""
+    """Return the look of a route's kind; dashed and hollow for several ranks."""
     i = _index(route)
     style = Look(colour=COLOURS[i], marker=MARKERS[i], width=1.3, size=4.2)
     if route.ranks == 1:

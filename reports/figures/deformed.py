@@ -37,7 +37,7 @@ from mortarbench.reports.figures.projection import (
     visible_faces,
 )
 
-#: Quantile of the nodal stresses at the end of the colour scale, since stresses are
+#: Percentile of the nodal stresses at which the colour scale ends, since stresses are
 #: singular at corners.
 PERCENTILE = 99.5
 SCALE = 1.0  #: factor of the displacement in figures drawn to scale
@@ -47,7 +47,7 @@ SEEN, SHOWN = 0.01, 0.05
 #: largest number of cells with mesh lines; more lines would hide the colours
 _MESH_SHOWN = 6000
 _ACTIVE = (
-    1e-6  #: share of the largest force above which a contact node counts as loaded
+    1e-6  #: fraction of the largest force above which a contact node counts as loaded
 )
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on any page, as arrows are drawn on coloured bodies
@@ -67,18 +67,18 @@ _PLAIN = ColourScale(colours="Greys", low=0, high=1)
 #: subdomains would overlap
 _NUMBERED = {9.5: 16, 6.5: 100}
 _SUBDOMAIN = Look(colour="white", width=0.9)  #: borders of subdomains
-#: arrows of open nodes that carry a share of their neighbours' forces
+#: colour of arrows at open nodes, which carry a part of the force on adjacent nodes
 _OPEN = "#6b7480"
 _STATES = FRICTION | {"open": (_OPEN, "grey")}
 _OUTLINE = Look(colour=INK, width=0.7)
-_ALONG = 0.9  #: cosine of the angle from an axis, above which normals count as parallel
-_MARGIN = 0.03  #: around arrows at the edge of a panel, relative to its size
-_CREASE = np.radians(40)  #: least angle between faces whose edge is outlined
+_ALONG = 0.9  #: cosine of the angle to an axis above which normals count as parallel
+_MARGIN = 0.03  #: margin around arrows at the edge of a panel, relative to its size
+_CREASE = np.radians(40)  #: smallest angle between faces whose common edge is outlined
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return end of colour scale and largest stress, Pa; None if they are unknown."""
+    """Return end of colour scale and largest stress, Pa; None without a stress."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -86,18 +86,18 @@ def clipped_at(fields: Fields) -> tuple[float, float] | None:
 
 
 class _Loaded(NamedTuple):
-    """Slave nodes of one contact pair under load or sliding without contact."""
+    """Slave nodes of one contact pair that carry a force or slide without contact."""
 
     name: str  #: name of the pair; empty if the fields do not distinguish pairs
     nodes: NDArray[np.int64]  #: (k,)
-    forces: Points  #: nodal forces, N/m
+    forces: Points  #: contact forces on the slave nodes, N/m
     friction: NDArray[np.str_]  #: (k,) states of `ContactSide`; "" without friction
-    #: (j, 2) pairs of adjacent nodes; the first slides without contact
+    #: (j, 2) pairs of adjacent nodes; the first node of a pair slides without contact
     sliding: NDArray[np.int64]
 
     @property
     def closed(self) -> NDArray[np.bool_]:
-        """(k,) mask of nodes under pressure; others carry shear only (Tresca's law)."""
+        """(k,) mask of nodes under pressure; others may carry shear (Tresca's law)."""
         touching = np.isin(self.friction, _TOUCHING)
         return touching if touching.any() else ~touching
 
@@ -105,7 +105,7 @@ class _Loaded(NamedTuple):
 def automatic_scale(fields: Fields) -> float:
     """Return a magnification of the displacement: 1, 2 or 5 times a power of ten.
 
-    Visible displacements are not magnified.
+    Displacements that are visible without magnification are drawn to scale.
     """
     largest = float(np.abs(fields.displacement).max(initial=0.0))
     span = float(np.ptp(fields.points, axis=0).max())
@@ -119,16 +119,16 @@ def automatic_scale(fields: Fields) -> float:
 
 
 def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
-    """Show all bodies, and for each contact under load an enlargement.
+    """Draw all bodies, and an enlargement of each contact under load.
 
-    In space, bodies are seen by a still camera, and contacts by their pressure.
+    In space, draw the surface of the bodies, and the pressure on each contact side.
 
     scale : magnification of the displacement; None: `automatic_scale`
 
     Raises
     ------
     InputError
-        When displacement or stress is not finite, or when the bodies have zero extent.
+        If displacement or stress is not finite, or the bodies have zero extent.
 
     """
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
@@ -181,7 +181,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
             ),
         ]
     bands = [mark for contact in loaded for mark in _bands(contact, points)]
-    there = moved(fields)  # magnified bodies would overlap in contact
+    there = moved(fields)  # not magnified: magnified bodies would overlap in contact
     near = (
         *_bodies(fields, there, colours),
         *(Path(points=there[o], look=_OUTLINE) for o in outlines(fields.cells)),
@@ -210,10 +210,10 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 
 def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
-    """Show the surface of bodies in space, and the pressure on each contact side.
+    """Draw the surface of bodies in space, and the pressure on each contact side.
 
-    Sides between bodies are hidden from everywhere, so that the camera stands above; a
-    single body shows its side that touches a rigid one.
+    Several bodies are seen from above, since sides between them are hidden from every
+    direction. A single body is seen from the side that touches a rigid body.
     """
     faces = boundary_facets(fields.cells, 3)
     sides = [
@@ -274,9 +274,9 @@ def _pressure_panel(
     letter: str,
     span: float,
 ) -> FieldPanel:
-    """Show the pressure on the undeformed faces of a side, along its mean normal.
+    """Draw the pressure on the undeformed faces of a side, seen along its mean normal.
 
-    If this normal is nearly parallel to an axis, the view is along the axis, and
+    If this normal is nearly parallel to an axis, the side is seen along that axis, and
     positive axes point to the right.
     """
     camera = camera_towards(
@@ -310,7 +310,7 @@ def _pressure_panel(
     labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
     size = float((high - low).max())
     arrows, key = _friction_arrows(fields, side, camera, size)
-    if arrows:  # none is cut off at the frame
+    if arrows:  # extend the panel, so that its frame cuts off no arrow
         ends = [(mark.feet, mark.feet + mark.vectors) for mark in arrows]
         shown_ends = np.vstack([*itertools.chain(*ends), low, high])
         low = shown_ends.min(axis=0) - _MARGIN * size
@@ -330,7 +330,7 @@ def _pressure_panel(
 def _friction_arrows(
     fields: Fields, side: ContactSide, camera: Camera, span: float
 ) -> tuple[list[Vectors], str]:
-    """Draw the shear traction on the slave nodes, and count their states.
+    """Return arrows of the shear on slave nodes, and text with counts of their states.
 
     span : size of the panel, m
     """
@@ -403,7 +403,7 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
         if size is not None:
             centres = points[cells].mean(axis=1)
             middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
-            place = _pair(centres[middle])  # a cell: the centroid may lie outside
+            place = _pair(centres[middle])  # of a cell: the centroid may lie outside
             marks.append(
                 Label(
                     text=f"{number}",
@@ -422,7 +422,7 @@ def _pair(point: Vector) -> tuple[float, float]:
 
 
 def _scale(fields: Fields) -> ColourScale | None:
-    """Return the colour scale in Pa common to all bodies; None if it is unknown."""
+    """Return the stress scale in Pa of all bodies; None if the stress is unknown."""
     limits = clipped_at(fields)
     if limits is None:
         return None
@@ -439,7 +439,7 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Return factor and prefix of the unit in which `value` is between 1 and 1000."""
+    """Return factor and prefix of the unit in which `value` is from 1 to 1000."""
     prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 
@@ -511,7 +511,7 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def length_unit(span: float) -> tuple[float, str]:
-    """Return size in m and name of the unit for a length: m, mm or µm."""
+    """Return the size in m and the name of a unit suitable for a length: m, mm, µm."""
     return next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
 
 
@@ -531,7 +531,7 @@ def _loaded(fields: Fields) -> list[_Loaded]:
         sides = [("", fields.contact_nodes, fields.contact_forces, None)]
     contacts = []
     for name, nodes, forces, friction in sides:
-        # nodes without a row may still carry a share of their neighbours' forces
+        # nodes without a contact row may carry a part of the force on adjacent nodes
         states = (
             np.full(len(nodes), "")
             if friction is None
@@ -550,7 +550,7 @@ def _loaded(fields: Fields) -> list[_Loaded]:
 
 
 def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
-    """Mark the nodes that slide without contact, because their arrows are short."""
+    """Draw lines along nodes that slide without contact: their arrows are short."""
     if not len(contact.sliding):
         return []
     at, beside = points[contact.sliding[:, 0]], points[contact.sliding[:, 1]]
@@ -559,7 +559,7 @@ def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
 
 
 def _window(places: Points, span: float) -> tuple[Vector, Vector]:
-    """Return lower left and upper right corner of an enlargement.
+    """Return the lower left and upper right corners of an enlargement.
 
     span : size of all bodies, m
     """

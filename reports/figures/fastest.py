@@ -30,7 +30,7 @@ from mortarbench.reports.figures.style import curve, legible, look
 
 PANELS = 4  #: largest number of forms in a figure
 SOLVERS = 12  #: largest number of solvers in a panel
-_NAME = 28  #: characters of a name beside an axis
+_NAME = 28  #: largest number of characters of a name beside an axis
 _ROW = 0.3  #: height of a row, inches
 _BESIDE = 0.24  #: distance between a mean and the ratios of its cases, rows
 _TALL = 0.38  #: height of rows with ratios and a verdict, inches
@@ -63,7 +63,7 @@ def fastest_figure(
 
 
 def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
-    """Return the first competitors, including the best one of every form."""
+    """Return the first competitors, including the best one of each form."""
     every = (*f.competitors, *f.others)
     best = {c.form: c for c in reversed(every)}.values()
     late = [c for c in every[most:] if any(c is one for one in best)]
@@ -169,7 +169,7 @@ def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]
 
 
 def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
-    """Return the run ids of a solver on `cases`."""
+    """Return the run_ids of a solver on `cases`."""
     return tuple(name for case in cases for name in c.outcomes[case].run_ids)
 
 

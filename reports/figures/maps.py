@@ -33,10 +33,10 @@ _CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
 
 def traction_maps(fields: Fields) -> FieldFigure | None:
-    """Show the tractions on the surface of half-spaces; None if there are no tractions.
+    """Draw the tractions on the surface of half-spaces; None if there are no tractions.
 
-    With friction, arrows are the direction in which the upper body slips, opposite to
-    the shear traction on it. Circles are the exact contact and the exact stick zone.
+    With friction, arrows show the direction in which the upper body slips, opposite to
+    the shear traction on it. Circles are the exact edges of contact and stick zone.
     """
     if fields.dim != 3 or len(fields.cells) or len(fields.contacts) != 1:
         return None
@@ -116,10 +116,10 @@ class _Grid:
     def arrows(
         self, vectors: NDArray[np.float64], at: NDArray[np.bool_]
     ) -> tuple[FieldMark, ...]:
-        """Draw the directions of vectors (k, 2) on a coarser grid, at some cells."""
+        """Draw the directions of vectors (k, 2) at cells `at` on a coarser grid."""
         extent = self.places.max(axis=0)
         step = max(1, round(self.size / self.h / _ARROWS))
-        step += (step + int(extent[0])) % 2  # a lattice centred like the cells
+        step += (step + int(extent[0])) % 2  # centres the coarser grid on the cells
         lattice = (2 * self.places - extent) % (2 * step) == step
         drawn = at & lattice.all(axis=1)
         if not drawn.any():

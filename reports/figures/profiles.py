@@ -34,17 +34,17 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
-ROW = 4  #: solvers in colour in one panel
-ROWS = 4  #: rows of panels; further solvers are grey in all of them
+ROW = 4  #: largest number of solvers in colour in one panel
+ROWS = 4  #: largest number of rows; further solvers are grey in every row
 PAIRS = 6  #: largest number of pairwise panels
 BANDED = (
     20  #: minimum number of cases for bands of three or more solvers, which overlap
 )
-_COLUMNS = 3  #: columns of pairwise panels
+_COLUMNS = 3  #: number of columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
-_COARSE = 60  #: points of a grey curve; a figure may have hundreds of them
+_COARSE = 60  #: points of a grey curve; few, since there may be hundreds of curves
 
-#: largest ratio on an axis → its ticks; beyond, powers of ten
+#: ticks by the largest ratio on an axis; longer axes have powers of ten
 _FACTORS = {
     3.5: (1, 1.5, 2, 3),
     15.0: (1, 2, 5, 10),
@@ -76,7 +76,7 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
 
 
 def rivals(ranking: Ranking) -> list[int]:
-    """Choose the solvers that the leader is paired with: the next ones by rank."""
+    """Select the solvers compared with the leader in pairs: the next ones by rank."""
     return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 
@@ -87,7 +87,7 @@ def banded(ranking: Ranking) -> bool:
 
 
 def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
-    """Plot both profiles of every solver; each row of panels colours some of them."""
+    """Plot performance and data profiles; each row of panels colours some solvers."""
     group = ranking.group
     ratios = performance_ratios(group.times)
     solved = group.times[group.solved]
@@ -168,7 +168,7 @@ def _grey(values: Array, ends: Ends, solver: str) -> Series:
 def _profile(
     values: Array, ends: Ends, style: Look, solver: str, *, band: bool = True
 ) -> list[Mark]:
-    """Return a step function with few markers, and its band."""
+    """Return the band of a profile, if any, and its step function with few markers."""
     at, share = curve(values, *ends)
     x = numbers(at)
     line = Series(

@@ -15,13 +15,13 @@ Integers = NDArray[np.int64]
 
 #: direction of a camera that sees three sides of a box at different angles
 _STANDARD = np.array([0.62, -0.64, 0.45])
-#: tiles of the visible surface; fewer show steps of the colours
+#: number of tiles on the visible surface; with fewer tiles, colours change in steps
 _TILES = 12_000
 _MAX_TILES = 20  #: largest number of tiles along an edge of a face
 
 
 class Camera(NamedTuple):
-    """An orthographic camera; its three unit vectors are a right-handed system."""
+    """An orthographic camera, given by a right-handed system of unit vectors."""
 
     right: Vector
     up: Vector
@@ -33,7 +33,7 @@ class Camera(NamedTuple):
 
 
 def camera_towards(direction: Vector) -> Camera:
-    """Return a camera in some direction from the bodies, with z up where possible."""
+    """Return a camera in a given direction from the bodies, with z up if possible."""
     towards = direction / np.linalg.norm(direction)
     vertical = np.eye(3)[2 if abs(towards[2]) < 0.9 else 1]
     right = np.cross(vertical, towards)
@@ -42,18 +42,18 @@ def camera_towards(direction: Vector) -> Camera:
 
 
 def camera_seeing(normal: Vector) -> Camera:
-    """Return a camera that sees a side with an outward normal, oblique to all axes."""
+    """Return a camera, oblique to all axes, that sees a side with outward `normal`."""
     away = (np.abs(normal) > 0.5) & (normal * _STANDARD < 0)
     return camera_towards(np.where(away, -_STANDARD, _STANDARD))
 
 
 def camera_above(normal: Vector) -> Camera:
-    """Return a camera that looks down, from where a horizontal normal points."""
+    """Return a camera that looks down from the side to which a normal points."""
     return camera_seeing(normal * [1, 1, 0])
 
 
 def face_normals(points: Points, faces: Integers) -> Points:
-    """Return normals (k, 3) of faces (k, 4), their lengths twice the areas."""
+    """Return normals (k, 3) of faces (k, 4), whose lengths are twice the areas."""
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
     return np.asarray(np.cross(c - a, d - b))
 
@@ -67,13 +67,13 @@ def visible_faces(
     *,
     mesh: bool,
 ) -> Faces:
-    """Return the faces (k, 4) towards the camera in tiles, back to front.
+    """Divide the faces (k, 4) towards the camera into tiles, sorted back to front.
 
-    Tiles are sorted by depth instead of faces. A face may be large compared with the
-    distance between bodies, so that sorting faces would draw hidden parts on top.
+    A face may be large compared with the distance between bodies. Sorting whole faces
+    by depth could then draw hidden parts on top, which sorting tiles avoids.
 
-    values : (N,) colours at the nodes, bilinear within faces
-    mesh : also outline each face
+    values : (N,) values at the nodes, shown as colours and bilinear within faces
+    mesh : True to outline each face
     """
     visible = faces[face_normals(points, faces) @ camera.towards > 0]
     tiles = int(np.clip(np.sqrt(_TILES / max(len(visible), 1)), 1, _MAX_TILES))
@@ -123,7 +123,7 @@ def crease_edges(
 
     Edges of faces that all point away from the camera are left out.
 
-    least : smallest angle, rad; edges of a single face count too
+    least : smallest angle, rad; edges of a single face are always included
     """
     normal = face_normals(points, faces)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -42,11 +42,11 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_BAND = 0.18  #: opacity
-_PALE = "#a9cde6"  #: key of a band in the first colour
-_LONG = 72  #: characters of a name in a legend of one column
+_BAND = 0.18  #: opacity of a band
+_PALE = "#a9cde6"  #: colour of a band in the legend: the first colour with this opacity
+_LONG = 72  #: largest number of characters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
-_BEYOND = 1.5  #: largest extension of an axis for intervals, factor of the values
+_BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the values
 _REST = "#9aa2ad"  #: time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 _MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
@@ -55,7 +55,7 @@ _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 
 def strong_figure(series: Sequence[StrongSeries]) -> Figure:
-    """Plot speed-up against ranks for each phase, with that of simultaneous copies."""
+    """Plot speed-ups of ranks and of simultaneous copies against ranks, by phase."""
     shown = sorted({n for s in series for n in s.answers})
     panels, keys = [], []
     for phase in PHASES:
@@ -101,7 +101,7 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
 def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
     """Plot the speed-up predicted beyond the measured ranks.
 
-    predicted : series with a model, each with the ranks of the prediction
+    predicted : series with a model, each with the numbers of ranks to predict
     """
     panels = []
     for i, (s, asked) in enumerate(predicted):
@@ -158,7 +158,7 @@ def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Fig
 
 
 def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
-    """Draw the parts of each solve on several ranks as a bar; means over the ranks."""
+    """Draw each solve on several ranks as a bar of its parts, as means over ranks."""
     parts = [rank_parts(s.answers[n]) for s, n in series]
     named = list(dict.fromkeys(name for of in parts for name in of))
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(named)}
@@ -253,7 +253,7 @@ def _ranks_axis(ranks: Sequence[int]) -> Axis:
 def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
     """Return a logarithmic axis with powers of two as ticks.
 
-    Wide intervals are clipped; all values are shown.
+    The axis contains all values, but wide intervals are clipped.
     """
     curves = [m for m in marks if isinstance(m, Series)]
     shown = [v for m in curves for v in m.y]

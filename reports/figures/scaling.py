@@ -46,14 +46,14 @@ from mortarbench.reports.statistics.intervals import PowerLaw
 MOST_SERIES = 6  #: largest number of plotted series; all are tabulated
 _SIZE = "degrees of freedom $n$"
 SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: slopes of guide lines, the steepest last
-#: panels of counts, named as by SMALBE; other counts are in the tables only
+#: panels of counts, with the names that SMALBE uses; other counts are only tabulated
 PANELS = (
     ("products", ("P_products", "preconditioner_applies")),
     ("steps", ("cg", "expansion", "proportioning")),
 )
 KAPPA = "kappa"  #: prefix of the names of condition numbers
 _FITTED = 24  #: points of a fitted curve
-_FOOT = 0.04  #: minimum share of the axis below and above the guides
+_FOOT = 0.04  #: minimum fraction of the axis below and above the guide lines
 
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
@@ -83,7 +83,7 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
 
 
 def iterations_figure(plotted: Sequence[SizeSeries], solver: str) -> Figure | None:
-    """Plot the iterations of one solver in every series; None if there are none."""
+    """Plot the iterations of one solver in every series; None without iterations."""
     curves = list[Series]()
     keys = list[Key]()
     for series in plotted[:MOST_SERIES]:
@@ -104,7 +104,7 @@ def iterations_figure(plotted: Sequence[SizeSeries], solver: str) -> Figure | No
 
 
 def _counts(series: SizeSeries, solver: str, style: Look) -> list[Series]:
-    """Plot iterations against size, as midpoints of their ranges."""
+    """Return iterations against size; if repeats differ, midpoints of their range."""
     answers = ((n, o.iterations, o) for n, o in series.curve(solver))
     return curve([(n, i and sum(i) / 2, o) for n, i, o in answers], style, solver)
 
@@ -141,7 +141,7 @@ def along(ends: Limits, part: float) -> float:
 
 
 def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
-    """Plot counts of one solver against dofs with fits c·nᵖ; None if there are none."""
+    """Plot counts of one solver against dofs with fits c·nᵖ; None without counts."""
     points = [(float(n), o) for n, o in series.curve(solver)]
     laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
     title = f"{solver}, {series.title}"
@@ -149,7 +149,7 @@ def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
 
 
 def subdomain_figure(sweep: Sweep) -> Figure | None:
-    """Plot the counts of one solver against H/h; None if it reports no counts."""
+    """Plot counts of one solver against H/h; None if it reports no counts."""
     points = [(float(value), o) for value, o in sweep.answers]
     shown = tuple((x, f"{x:g}") for x, _ in points)
     low, high = points[0][0] / 1.15, points[-1][0] * 1.15

@@ -54,9 +54,9 @@ def legible(label: str, limit: int = 32) -> str:
 
 
 def look(index: int) -> Look:
-    """Return colour, marker and dashes of a solver, also distinct in greyscale.
+    """Return colour, marker and dashes of a solver, which differ in greyscale as well.
 
-    Colours recur with other markers beyond the length of `COLOURS`.
+    Beyond the length of `COLOURS`, colours recur with other markers.
     """
     # complete cycles of (colour, marker)
     rounds = index // lcm(len(COLOURS), len(MARKERS))
@@ -88,7 +88,7 @@ def below(keys: Sequence[Key], columns: int, title: str = "") -> Legend:
 
 
 def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
-    """Return the run ids of the measurements behind a point."""
+    """Return the run_ids of the measurements behind a point."""
     return tuple(r.run_id for r in records)
 
 
@@ -104,7 +104,7 @@ def curve(
     points : (x, y), or (x, y, answer or its run_ids); estimates with an interval
         (`Interval`, `Ratio`) have error bars; points without x or y are omitted
     bars : cap, width and opacity of the error bars
-    how : further attributes of the series
+    how : further attributes of `Series`
     """
     complete = [p for p in points if p[0] is not None and p[1] is not None]
     if not complete:

@@ -35,16 +35,16 @@ from mortarbench.reports.figures.style import (
     with_legend,
 )
 
-SHARE = 0.1  #: largest solver error, relative to the discretisation error
-CROWDED = 1000  #: markers; more than these are drawn smaller and more transparent
+SHARE = 0.1  #: largest sufficient solver error, relative to the discretisation error
+CROWDED = 1000  #: number of markers above which they are smaller and more transparent
 _COLUMNS = 4  #: columns of the legend
 _LEAST = 1e-17  #: smaller residuals, including zero, are drawn at this value
-_LEAST_RATIO = 1e-10  #: the same for the ratio of residual to tolerance
+_LEAST_RATIO = 1e-10  #: smaller ratios of residual to tolerance are drawn at this value
 _MESH = Look(colour=INK, width=0.8, dash=DASHED)
 _TENTH = Look(colour=INK, width=0.8, dash=DOTTED)
 _BARS = {"cap": 1.5, "width": 0.6, "opacity": 0.55}
 
-Sweep = Mapping[str, Sequence[Outcome]]  #: solver → its answers in order of tolerance
+Sweep = Mapping[str, Sequence[Outcome]]  #: answers by solver, in order of tolerance
 
 
 def accuracy_figure(evidence: Evidence) -> Figure | None:
@@ -118,7 +118,7 @@ def _panel(
 
 
 def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the answers of one solver; markers of unverified ones are hollow."""
+    """Join the answers of one solver; markers of unverified answers are hollow."""
     points = [
         (t.value, max(o.worst, _LEAST), o)
         for o in outcomes
@@ -162,7 +162,7 @@ def certified_figure(
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the points that count; show the others as separate hollow markers."""
+    """Join the points that `counts` accepts; draw the others as hollow markers."""
     points = [
         (o.seconds("total"), max(e, SMALLEST), o)
         for o in outcomes

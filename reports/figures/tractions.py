@@ -23,7 +23,7 @@ SHOWN = 1e-6  #: fraction of the largest pressure below which a node is not load
 BESIDE = 0.15  #: margin on either side, relative to the length of the loaded part
 _EXACT = Look(colour=INK, width=0.9)
 _NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)
-#: markers of nodes by friction state; frictionless pairs use that of open nodes
+#: markers of nodes by friction state; frictionless pairs use the marker of open nodes
 LOOKS = {"open": _NODE} | {
     state: replace(_NODE, colour=colour, marker=marker)
     for (state, (colour, _)), marker in zip(FRICTION.items(), "so^", strict=True)
@@ -58,7 +58,7 @@ def traction_figure(fields: Fields) -> Figure | None:
 
 
 def places(fields: Fields, side: ContactSide) -> Vector:
-    """Return the distance (s,) of nodes from the middle of the undeformed side, m."""
+    """Return nodal positions (s,) along the undeformed side from its middle, m."""
     steps = np.linalg.norm(np.diff(fields.points[side.nodes], axis=0), axis=1)
     along = np.append(0.0, np.cumsum(steps))
     return np.asarray(along - along[-1] / 2)

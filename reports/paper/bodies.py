@@ -248,13 +248,13 @@ class Extent(NamedTuple):
 
 
 def extent(fields: Fields, name: str) -> Extent:
-    """Return a percentile and the maximum of a stress, which is singular at corners."""
+    """Return a percentile and the maximum of a stress's absolute nodal values."""
     size = np.abs(fields.nodal[name])
     return Extent(float(np.percentile(size, PERCENTILE)), float(size.max()))
 
 
 def stress_figure(fields: Fields) -> FieldFigure:
-    """Draw the four components, each with one colour scale for both bodies."""
+    """Draw four stresses, each with one colour scale for both bodies."""
     points = moved(fields)
     pictures = []
     for name, title in STRESSES.items():
@@ -281,7 +281,7 @@ def stress_figure(fields: Fields) -> FieldFigure:
 
 
 def zoom_figure(fields: Fields) -> FieldFigure:
-    """Draw the mesh near the contact and pressures along their normals."""
+    """Draw the mesh near the contact, and contact pressures along the normals."""
     assert fields.contact_nodes is not None
     assert fields.contact_forces is not None
     points = moved(fields)

@@ -1,4 +1,4 @@
-"""SMALBE and other solvers, primal and dual forms, time to certified accuracy."""
+"""SMALBE and other solvers: primal and dual forms, and time to certified accuracy."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _FAILED = Look(colour=INK, marker="x", dash=None)
 
 
 class Place(NamedTuple):
-    """Answer with its problem size."""
+    """Answer of a solver with the size of its problem."""
 
     size: int
     outcome: Outcome
@@ -53,7 +53,7 @@ class Place(NamedTuple):
 
     @property
     def time(self) -> Interval | None:
-        """Median time, including any dualisation if sizes are in dofs."""
+        """Median time; if sizes are in dofs, it includes any dualisation."""
         dualised = self.outcome.with_dualising if self.dofs else None
         return dualised or self.outcome.seconds("total")
 
@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """True if it was tried and not verified; its time is then not shown."""
+        """True if the problem was tried but not verified; then no time is shown."""
         return self.tried and not self.outcome.verified
 
 
@@ -106,7 +106,7 @@ def primal_dual_figure(evidence: Evidence) -> Figure:
 def _figure(
     evidence: Evidence, titles: dict[str, str], size: str, *, dofs: bool
 ) -> Figure:
-    """Plot times in a panel for each form, above a strip of unverified answers."""
+    """Plot times in a panel for each form, above a strip that marks failures."""
     found = {form: places(evidence, form, dofs=dofs) for form in titles}
     every = {
         s: [p for f in found.values() for p in f.get(s, ())] for s in evidence.solvers

@@ -63,7 +63,7 @@ def active(rows: Sequence[Row], contact: str) -> dict[int, list[Row]]:
 def pressure_figure(rows: Sequence[Row]) -> Figure:
     """Plot pressure against arc angle, and the active set against load steps.
 
-    Angles cover all nodes ever in contact, and two more nodes on either side.
+    Angles include all nodes that are ever in contact, and two more on either side.
     """
     touched = {
         contact: [
@@ -189,7 +189,7 @@ def errors(rows: Sequence[Row], relin: int, quantity: str) -> list[tuple[int, fl
 
 
 def order(rows: Sequence[Row], relin: int, quantity: str) -> PowerLaw | None:
-    """Fit error ~ (1/steps)ᵖ from SINCE steps on; return None below three points."""
+    """Fit error ~ (1/steps)ᵖ from SINCE steps on; None for fewer than three points."""
     kept = [
         (1 / n, e) for n, e in errors(rows, relin, quantity) if n >= SINCE and e > 0
     ]

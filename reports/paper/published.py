@@ -1,4 +1,4 @@
-"""Published numbers of the paper, whose figures have no tables."""
+"""Numbers published in the paper; its figures have no tables of values."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ ERRATA = (
     "dual problem, but the matrices of the two multiplications differ.",
     "The text refers to Figure 6 as “Figure 7” and to Figure 5 as “Figure ??”.",
     "Tolerances, penalty, contact rows and active rows are not stated, nor whether "
-    "the 0.078 s of the Cholesky factor refer to both bodies. Here, SMALBE solves "
-    "each dual QP to 1e-8; for the paper's method, it uses the parameters of the "
-    "paper's reference [3].",
+    "the 0.078 s of the Cholesky factorisation refer to both bodies. Here, SMALBE "
+    "solves each dual QP to 1e-8; for the paper's method, it uses the parameters of "
+    "the paper's reference [3].",
     "89 % of the published 29.99 s are spent on dualisation and 3.6 % on the QPs: the "
     "conclusions of the paper on QP algorithms rest on these 3.6 %.",
     "Rotations reach 20° and bending stresses several GPa, far beyond the validity of "

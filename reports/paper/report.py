@@ -1,4 +1,4 @@
-"""Page of the paper's figures and tables, and further ones, from measured data."""
+"""Page with the paper's figures and tables, and further ones, from measured data."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def write_paper(folder: Path) -> list[Path]:
     Raises
     ------
     InputError
-        When data/ is missing or damaged.
+        If data/ is missing or damaged.
 
     """
     experiment = load_experiment(folder / "data")
@@ -116,7 +116,7 @@ def write_paper(folder: Path) -> list[Path]:
 def compose(
     experiment: Experiment, suites: Mapping[str, Evidence] = MappingProxyType({})
 ) -> Page:
-    """Compose the page: sections of the paper in its order, then further ones.
+    """Compose the page: the sections of the paper, then further sections.
 
     suites : measured suites by name; those of `BEYOND` have sections
     """

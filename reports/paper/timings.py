@@ -111,7 +111,7 @@ def medians(
 
 
 def times(rows: Iterable[Row], x: str, **where: Any) -> list[Point]:
-    """Return medians against column `x` of `select`ed rows, with parts summed."""
+    """Return medians of selected rows against column `x`; parts of a repeat add up."""
     by_size = medians(select(rows, **where), [x])
     return [Point(float(key), time) for (key,), time in sorted(by_size.items())]
 
@@ -308,7 +308,7 @@ def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Pa
 
 
 def here(machine: dict[str, Any]) -> str:
-    """Return a description of the machine of the measurements."""
+    """Describe the machine on which the times were measured."""
     cpu = machine.get("cpu") or "an unknown processor"
     return f"{cpu}, {machine.get('system', 'unknown system')}, one thread, Python"
 
@@ -354,7 +354,7 @@ def table_1(experiment: Experiment) -> Table:
 
 
 def timings(experiment: Experiment) -> Table:
-    """Tabulate the published times of Section 5 and ours."""
+    """Tabulate the published times of Section 5, and the times measured here."""
     rows = largest(experiment)
     steps = experiment.setting["plan"]["steps"]
     machine = here(experiment.setting["environment"].get("machine", {}))

@@ -94,7 +94,7 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
 }
-_VAST = 100.0  #: decades of an axis, reached only by diverged answers
+_VAST = 100.0  #: number of decades that only axes with diverged answers exceed
 #: distance between a legend and the curves below it, relative to the axes height
 _GAP = 0.03
 _FRONT = 2.0  #: zorder of the first mark; each further one is slightly higher
@@ -104,14 +104,14 @@ _PLACES: dict[str, Any] = {
     "upper left": "upper left",
 }
 
-_CASING = 1.6  #: width of the white around arrows and frames, points
+_CASING = 1.6  #: width of the white outline of arrows and frames, points
 _LETTER_CASING = (
-    3.2  #: width of the white around letters, wide enough to fill their inside
+    3.2  #: width of the white outline of letters, enough to fill their inside, points
 )
 
 
 def draw_curves(figure: Figure) -> Canvas:
-    """Draw a figure; the layout is computed on printing."""
+    """Draw a figure of curves; its layout is computed when it is printed."""
     whole = fitted(figure)
     heights = [row.height for row in whole.rows]
     with rc_context(STYLE):
@@ -221,7 +221,7 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     low, high = log10(axis.low), log10(axis.high)
     decades = high - low
     ticked.set_minor_formatter(NullFormatter())
-    if decades > _VAST:  # matplotlib would search ticks beyond the ends, up to infinity
+    if decades > _VAST:  # matplotlib would search for ticks far beyond the ends
         exponents = range(ceil(low), ceil(high), ceil(decades / 6))
         ticked.set_major_locator(FixedLocator([10.0**k for k in exponents]))
         ticked.set_minor_locator(NullLocator())
@@ -353,7 +353,7 @@ def _bar(axes: Axes, bar: ColourBar) -> None:
 
 
 def draw_fields(figure: FieldFigure) -> Canvas:
-    """Draw a figure of bodies; the layout is computed on printing."""
+    """Draw a figure of bodies; its layout is computed when it is printed."""
     with rc_context(STYLE):
         canvas = Canvas(figsize=(figure.width, figure.height))
         grid = canvas.add_gridspec(

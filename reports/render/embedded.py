@@ -58,7 +58,7 @@ def details(records: Sequence[Record]) -> str:
 
 
 def _as_journalled(record: Record) -> Record:
-    """Remove the suffix that the report gives to a solver that solved a sequence."""
+    """Restore the solver label of the journal, without the mode of a sequence."""
     mode = f" ({record.mode})"
     suffixed = record.mode != "cold" and record.solver.endswith(mode)
     return (
@@ -77,7 +77,7 @@ def strict(content: Any) -> str:
     write = partial(json.dumps, allow_nan=False, separators=(",", ":"))
     try:
         return write(content)
-    except ValueError:  # rare: searching for NaN first would cost more than writing
+    except ValueError:  # rare: checking for NaN first would cost more than writing
         return write(finite(content))
 
 
@@ -102,7 +102,7 @@ def _numbered(panel: Data, rows: Rows) -> Data:
 
 
 def table(t: Table, rows: Rows) -> Data:
-    """Return headings, cells, and the solver of a table on one solver."""
+    """Return headings and cells, and the solver if the table concerns only one."""
     return {
         "columns": list(t.columns),
         "words": t.text_columns,
@@ -114,7 +114,7 @@ def table(t: Table, rows: Rows) -> Data:
 def cell(c: Cell, rows: Rows) -> Any:
     """Return the text of a plain cell, or else all fields up to the last nonempty one.
 
-    The last field packs the measurements, see `spans`.
+    The last field contains the measurements as packed by `spans`.
     """
     value = None if c.value is None else float(f"{c.value:.9g}")
     runs = runs_of(c, rows)
@@ -131,7 +131,7 @@ def runs_of(c: Cell, rows: Rows) -> list[int]:
 
 
 def spans(ids: Iterable[str], rows: Rows) -> list[int]:
-    """Pack indices of known measurements into pairs (first, count)."""
+    """Pack the indices of measurements into pairs (first, count); omit unknown ids."""
     packed: list[int] = []
     for at in (rows[i] for i in ids if i in rows):
         if packed and at == packed[-2] + packed[-1]:
@@ -159,10 +159,10 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Encode a column by distinct values if that is shorter; 1, 1.0 and True differ."""
+    """Encode a column by distinct values if few; 1, 1.0 and True are distinct."""
     tables = {
         id(v): v for v in values if type(v) in (dict, list)
-    }  # many records share one
+    }  # many records share one object
     known = {place: json.dumps(v) for place, v in tables.items()}
     keys = [known.get(id(v)) or (type(v), v) for v in values]
     first = dict(zip(reversed(keys), reversed(values), strict=True))

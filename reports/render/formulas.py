@@ -28,7 +28,7 @@ def mathml(tex: str, *, display: bool = False) -> str:
     Raises
     ------
     ValueError
-        When a command is unknown or a brace is missing.
+        If a command is unknown or a brace is missing.
 
     """
     from math_core import LatexError  # imported here: only pages with formulas need it

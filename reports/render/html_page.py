@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs no network and cannot reach one."""
+"""The report as one HTML file, which neither needs nor permits network access."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mortarbench.reports.render.embedded import (
 from mortarbench.reports.render.formulas import mathml, split
 from mortarbench.reports.render.svg import Svg, inline
 
-FIRST = 50  #: rows of a table in the HTML itself; the script has the others
+FIRST = 50  #: number of table rows in the HTML itself; the script adds the others
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
 _NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
 _LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
@@ -80,7 +80,7 @@ def _policy(code: str) -> str:
 
 
 def breakable(text: str) -> Markup:
-    """Allow a line break after every slash of a case name, and none within 1e-8.
+    """Allow line breaks after the slashes of case names, and none within numbers.
 
     Right-to-left text is isolated, so that it does not reorder the text around it.
     """
@@ -101,7 +101,7 @@ def prose(text: str, rows: Rows) -> Markup:
     for i in range(1, len(parts), 2):
         try:
             parts[i] = mathml(parts[i])
-        except ValueError:  # a name of a foreign folder, not a formula
+        except ValueError:  # a user's name that only looks like a formula
             parts[i] = str(breakable(rf"\({parts[i]}\)"))
     return Markup("".join(parts))
 

@@ -62,8 +62,8 @@ def latex(
     r"""Render statements as a list, then tables; the first line names the packages.
 
     All tables need booktabs; tables of more than `ROWS` rows also need longtable. Times
-    carry their unit and interval; all other numbers are plain (1.2e-09), as siunitx
-    reads them.
+    are printed with unit and interval; all other numbers are plain (1.2e-09), in a
+    format that siunitx can read.
 
     name : name of the section; the k-th table has the label tab:NAME-k, a single table
         has tab:NAME

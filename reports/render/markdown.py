@@ -10,12 +10,12 @@ from mortarbench.reports.render.formulas import split
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
 _LIST = re.compile(r"^(\d*)([-+.)])(?=\s)")
-#: anything that needs escaping; most cells of a large report have nothing
+#: text that needs escaping; most cells of a large report contain none
 _ANY = re.compile(r"[&<>\\`*_\[\]|~#$@]|://|www\.|^\d*[-+.)]\s", re.IGNORECASE)
 
 
 def markdown(page: Page) -> str:
-    """Render the whole report; figures are linked, tables are pipes."""
+    """Render the whole report, with links to figures and with pipe tables."""
     parts = [f"# {escaped(page.title)}", escaped(page.dateline)]
     for section in page.sections:
         parts += _section(section, page)
@@ -37,7 +37,7 @@ def _section(section: Section, page: Page) -> list[str]:
 
 
 def _prose(text: str) -> str:
-    """Escape prose except its formulas, which Markdown sets between dollars."""
+    """Escape prose except its formulas, which are enclosed in dollars."""
     parts = split(text)
     parts[::2] = map(escaped, parts[::2])
     parts[1::2] = [f"${tex}$" for tex in parts[1::2]]

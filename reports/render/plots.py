@@ -32,7 +32,7 @@ from mortarbench.reports.document.figure import (
 
 Data = dict[str, Any]
 
-#: maximum number of points of a line; longer lines keep extremes of short stretches
+#: maximum number of points of a line; longer lines keep only local extremes
 MOST = 4000
 _NAMED = {
     "lambda": "λ",
@@ -60,7 +60,7 @@ _LOWERED = str.maketrans("0123456789kij", "₀₁₂₃₄₅₆₇₈₉ₖᵢ�
 def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
     """Return the panels of a figure.
 
-    solvers : name → position on the page
+    solvers : label → position in the order of the page
     """
     whole = fitted(figure)
     heights = [row.height for row in whole.rows]
@@ -70,7 +70,7 @@ def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
     groups: dict[str, int] = {}
     for row in whole.rows:
         for panel in row.panels:
-            own = panel.x.shared or f"\0{len(parts)}"  # a unique name: not shared
+            own = panel.x.shared or f"\0{len(parts)}"  # unique name of an unshared axis
             parts.append(
                 {
                     **_panel(panel, solvers),
@@ -202,7 +202,7 @@ def _outline(area: Area) -> Iterator[float]:
     """Yield the outline of an area: along its upper curve, and back along the lower."""
     for values, direction in ((area.high, 1), (area.low, -1)):
         points = list(zip(area.x, values, strict=True))
-        if area.step:  # each value holds until the next point
+        if area.step:  # each value applies until the next point
             stairs = [((x, y0), (x, y)) for (_, y0), (x, y) in pairwise(points)]
             points[1:] = [point for step in stairs for point in step]
         for point in points[::direction]:
@@ -249,7 +249,7 @@ def rounded(values: Any, digits: int = 6) -> list[float | None]:
 
 
 def plain(text: str) -> str:
-    r"""Convert mathtext to plain text: "degrees of freedom $n$" loses its dollars.
+    r"""Convert mathtext to plain text: "size $n$" becomes "size n".
 
     An escaped dollar, as written by `reports.figures.style.legible`, becomes a dollar.
     """

@@ -18,26 +18,26 @@ from mortarbench.reports.document.figure import Figure
 from mortarbench.reports.render.drawing import STYLE, draw_curves, draw_fields
 from mortarbench.reports.render.svg import PAPER, Svg
 
-ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
+ENDINGS = (".pdf", ".svg", ".png")  #: suffixes of figure files
 _METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}
 #: style without a layout engine, for printing a figure that is already laid out
 _LAID_OUT: Any = STYLE | {"figure.constrained_layout.use": False}
 
 
 def draw(figure: Figure | FieldFigure) -> Canvas:
-    """Draw a figure with matplotlib; it is laid out when it is printed."""
+    """Draw a figure with matplotlib; its layout is computed when it is printed."""
     if isinstance(figure, Figure):
         return draw_curves(figure)
     return draw_fields(figure)
 
 
 def save(figure: Figure | FieldFigure, path: Path) -> None:
-    """Write a figure in the format of the file's ending, with reproducible bytes.
+    """Write a figure in the format of the file's suffix, with reproducible bytes.
 
     Raises
     ------
     InputError
-        When the ending is none of `ENDINGS`.
+        If the suffix is not in `ENDINGS`.
 
     """
     if path.suffix not in ENDINGS:
@@ -75,7 +75,7 @@ def save_all(
 
 
 def _save(canvas: Canvas, box: Bbox, paths: Sequence[Path]) -> Svg:
-    """Write files in the formats of their endings."""
+    """Write files in the formats of their suffixes, and return the SVG."""
     svg = _svg(canvas, box)
     for path in paths:
         if path.suffix == ".svg":
@@ -94,7 +94,7 @@ def _svg(canvas: Canvas, box: Bbox) -> Svg:
 
 
 def _print(canvas: Canvas, box: Bbox, target: Path | StringIO, **how: Any) -> None:
-    """Print on paper, cut to the box."""
+    """Write a figure on a white background, cropped to the box."""
     with rc_context(_LAID_OUT):
         canvas.savefig(target, bbox_inches=box, facecolor=PAPER, **how)
 

@@ -12,7 +12,7 @@ PAPER = "#ffffff"
 
 @dataclass(frozen=True)
 class Svg:
-    """Text of an SVG file with a paper background, cropped to the drawing."""
+    """Text of an SVG file with a white background, cropped to the drawing."""
 
     text: str
     frame: tuple[float, float, float, float]

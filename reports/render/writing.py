@@ -20,7 +20,8 @@ RENDERED = frozenset({"html", "md", "tex"})  #: formats that contain a page
 def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]:
     """Write a page in those formats that `RENDERED` contains, and its figures.
 
-    html: index.html. md: report.md. tex: tables/SECTION.tex. Figures go to figures/.
+    The format html gives index.html, md gives report.md, and tex gives a file in
+    tables/ for each section. The figures are written to figures/.
     """
     figures, drawings = write_figures(page, target)
     written: list[Path] = []
@@ -73,7 +74,7 @@ def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Sv
 
 
 def _remove_numbered(folder: Path, keep: Collection[Path]) -> None:
-    """Delete numbered figures (such as scaling-2) that only an earlier report had."""
+    """Delete numbered figures of earlier reports (such as scaling-2), except `keep`."""
     for path in folder.iterdir():
         if _NUMBERED.fullmatch(path.name) and path not in keep:
             path.unlink()

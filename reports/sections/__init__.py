@@ -1,7 +1,8 @@
-"""The sections of a report: each registers itself, with its place among the others.
+"""Sections of a report, each registered with its position by a decorator.
 
-A module NAME.py contains related sections, and NAME.j2 their sentences. A new section
-is a generator of its parts, decorated with `@section`, in any module of this package.
+A module NAME.py contains related sections, and NAME.j2 contains their sentences. A new
+section is a generator of paragraphs, tables and pictures in any module of this package,
+decorated with `@section`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from mortarbench.reports.document.layout import Part, Section
 
 
 class Analysis:
-    """The evidence of a folder, and results that several sections share.
+    """Evidence of a result folder, and derived results that several sections use.
 
     pool_forms : compute means, ranks and profiles over the cases of all forms together
     """
@@ -38,7 +39,7 @@ class Analysis:
 
     @cached_property
     def sizes(self) -> list[SizeSeries]:
-        """Series of cases that differ in size only."""
+        """Series of cases that differ only in size."""
         return size_series(self.evidence)
 
     @cached_property
@@ -53,7 +54,7 @@ class Analysis:
 
     @property
     def groups(self) -> tuple[ComparisonGroup, ...]:
-        """Groups of cases that means, ranks and profiles are computed over."""
+        """Groups of cases over which means, ranks and profiles are computed."""
         return self.pooled if self.pool_forms else self.forms
 
     @cached_property
@@ -73,7 +74,7 @@ class Analysis:
 
     @cached_property
     def rankings(self) -> list[Ranking]:
-        """Rankings of the groups that are large enough."""
+        """Rankings of the groups that can be compared over cases."""
         return [ranking_of(group) for group in self.groups if group.comparable]
 
 
@@ -87,18 +88,18 @@ class _Entry(NamedTuple):
 
 
 _ENTRIES: list[_Entry] = []
-EVIDENCE = 10  #: place after the sections that answer the reader's question
-APPENDIX = 90  #: place of conditions and definitions
+EVIDENCE = 10  #: position after the sections with conclusions
+APPENDIX = 90  #: position of conditions and definitions
 
 
 def section(
     place: float, name: str, title: str | Callable[[Analysis], str], needs: str = ""
 ) -> Callable[[Write], Callable[[Analysis], Section | None]]:
-    """Register a generator of the parts of a section; one without parts is left out.
+    """Register a generator of a section; a section without contents is left out.
 
-    place : position in the report, in increasing order
+    place : number that determines the position; sections are in increasing order
     name : anchor, and stem of the section's files
-    needs : title and required measurements, listed by reports that lack the section
+    needs : title and required measurements, listed in reports without this section
     """
 
     def register(write: Write) -> Callable[[Analysis], Section | None]:
@@ -132,7 +133,7 @@ def sections(analysis: Analysis) -> Iterator[Section]:
 
 
 def opening(analysis: Analysis) -> list[Section]:
-    """Compose the sections that answer the reader's question; the rest is evidence."""
+    """Compose the sections with conclusions, which precede the evidence."""
     composed = [e.compose(analysis) for e in _entries() if e.place < EVIDENCE]
     return [one for one in composed if one is not None]
 

@@ -43,14 +43,14 @@ from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps
 from mortarbench.reports.statistics.growth import Trend
 
 ACCURACIES = (
-    3  #: most sentences per form: the loosest, a middle and the tightest accuracy
+    3  #: most sentences per form, for the tightest, a middle and the loosest accuracy
 )
-FAILURES = 3  #: failures per form that are described one by one
+FAILURES = 3  #: largest number of failures per form that are described individually
 FIRST_ROWS = (
-    8  #: rows of the first figure, so that a phone shows it below the first sentence
+    8  #: most rows of the first figure: it fits on a phone, below the first sentence
 )
 REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
-MOST_SERIES = 4  #: number of series of sizes that are described in a separate sentence
+MOST_SERIES = 4  #: largest number of size series that are described by a sentence each
 _FROM_MESH = "From the mesh to a verified answer, including dualisation: "
 _TRENDS = {
     Trend.FLAT: "stay flat",
@@ -68,7 +68,7 @@ def _title(a: Analysis) -> str:
 
 @section(1, "answer", _title)
 def answer(a: Analysis) -> Iterator[Part]:
-    """Name the fastest way over all forms, or the fastest solver of each form."""
+    """Name the fastest combination of solver and form, or the fastest of each form."""
     if a.ways.comparisons:
         comparisons = _by_subject(a.ways.comparisons)
         for subject, mine in comparisons.items():
@@ -93,18 +93,18 @@ def answer(a: Analysis) -> Iterator[Part]:
     yield from TEXT.parts("cautions", a.ways.uncharged, machines, busy)
 
 
-@section(2, "forms", "Solver times, form by form")
+@section(2, "forms", "Solver times for each form")
 def forms(a: Analysis) -> Iterator[Part]:
     """Compare solvers within each form; empty if the first section already does so."""
     if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED
         yield from _picture("forms", shown(a.fastest), a, SOLVERS)
-    del a.ways  # its copies of all records take memory
+    del a.ways  # frees the copies of all records
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Return a sentence for use after a colon; lower case unless a name begins it."""
+    """Return a sentence for use after a colon: lower case unless a name begins it."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
@@ -131,7 +131,7 @@ def _picture(
 
 
 def _by_subject(found: Sequence[FastestSolver]) -> dict[str, list[FastestSolver]]:
-    """Group by form and mode, cold solves first; tightest accuracy first."""
+    """Group comparisons by form and mode: cold solves and tight accuracies first."""
     order = sorted(found, key=lambda f: (f.key.mode != "cold", f.key.mode))
     grouped: dict[str, list[FastestSolver]] = {}
     for f in order:
@@ -140,7 +140,7 @@ def _by_subject(found: Sequence[FastestSolver]) -> dict[str, list[FastestSolver]
 
 
 def _selected(found: list[FastestSolver]) -> list[FastestSolver]:
-    """Select the ends and the middle of many accuracies."""
+    """Select the tightest, a middle and the loosest of many accuracies."""
     if len(found) <= ACCURACIES:
         return found
     return [found[0], found[len(found) // 2], found[-1]]
@@ -205,7 +205,7 @@ def _statement(
 
 
 def claim(f: FastestSolver) -> str:
-    """Return a sentence that names the fastest solver, or says why none is named."""
+    """Return a sentence that names the fastest solver, or states why none is named."""
     return TEXT("claim", f)
 
 
@@ -215,7 +215,7 @@ def _name(c: Competitor) -> str:
 
 
 def _named(competitors: Iterable[Competitor], most: int = 4) -> str:
-    """Enumerate the first few names as in a sentence."""
+    """Enumerate the names in words, at most `most` of them."""
     names = list(map(_name, competitors))
     if len(names) > most:
         return listing(names, most)
@@ -231,7 +231,7 @@ def _forms(f: FastestSolver) -> list[str]:
 def _next_behind(
     f: FastestSolver,
 ) -> tuple[Competitor | None, list[tuple[str, Competitor | None]]]:
-    """Return the next significantly slower entry, and the best of every other form."""
+    """Return the next significantly slower solver, and the best of each other form."""
     slower = [c for c in f.competitors[1:] if c.slower and c.closest]
     following = slower[0] if slower else None
     named = {c.form for c in (f.first, *f.tied, *slower[:1])}
@@ -244,7 +244,7 @@ def _next_behind(
 
 
 def _depends_on_case(f: FastestSolver) -> bool:
-    """Return whether every tie is between a faster case and a slower one."""
+    """Return whether every tied solver is faster on one case and slower on another."""
     known = [c.by_case.values() for c in f.tied]
     return bool(known) and all(
         any(r.low > 1 for r in of) and any(r.high < 1 for r in of) for of in known
@@ -252,13 +252,13 @@ def _depends_on_case(f: FastestSolver) -> bool:
 
 
 def _repeats(f: FastestSolver) -> str:
-    """Name the option of `run` that narrows the intervals of a comparison."""
+    """Return the option of `run` that narrows the intervals of a comparison."""
     made = max(len(o.records) for o in f.first.outcomes.values())
     return f"--repeats {max(REPEATS, 3 * made)}"
 
 
 def _roughly(f: FastestSolver) -> str:
-    """Compare the first with the next and other forms, where intervals are missing."""
+    """Return ratios to the first solver in words, for times without intervals."""
 
     def ratio(c: Competitor) -> str:
         logs = [
@@ -279,7 +279,7 @@ def _roughly(f: FastestSolver) -> str:
 
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
-    """Name entrants that are faster than the first but not verified on every case."""
+    """Name solvers that are faster than the first but not verified on every case."""
     faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 
@@ -341,7 +341,7 @@ def _reservations(found: Sequence[FastestSolver]) -> list[str]:
 def own_results(a: Analysis) -> Iterator[Statement | Picture]:
     """Summarise growth of iterations, condition numbers and speed-up on ranks.
 
-    Applies to suites of one solver; yields nothing where solvers are compared.
+    Suites of several solvers yield nothing.
     """
     firsts = (o.first for o in a.evidence.flat)
     cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
@@ -361,7 +361,7 @@ def own_results(a: Analysis) -> Iterator[Statement | Picture]:
 
 
 def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
-    """Judge the growth of iterations in one sentence, then series by series."""
+    """Yield a sentence on the growth of iterations, and then one for each series."""
     fits = [(s, fit) for s in sizes if (fit := iteration_growth(s, solver))]
     if not fits:
         return
@@ -385,7 +385,7 @@ def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
 
 
 def _own_claims(solver: str, a: Analysis) -> Iterator[str]:
-    """Yield growth, condition numbers, iterations against H/h, and speed-up."""
+    """Yield sentences on growth, condition numbers, effect of H/h, and speed-up."""
     yield from _growth(solver, a.sizes)
     for series in a.sizes:
         curve = [(float(n), o) for n, o in series.curve(solver)]

@@ -26,7 +26,7 @@ TEXT = Sentences(__name__, FLOOR=FLOOR, RULE=RULE)
     "option history store one if the suite sets it to true.",
 )
 def convergence(a: Analysis) -> Iterator[Part]:
-    """Draw the cases that `RULE` selects; yield nothing without a stored history."""
+    """Draw the cases that `RULE` selects; yield nothing if no history is stored."""
     pictures = []
     for i, c in enumerate(chosen(a.evidence), 1):
         facts = {

@@ -1,4 +1,4 @@
-"""Sizes from which on dualisation pays: all routes from the mesh to the answer."""
+"""Sizes from which on dualisation pays, and all routes from the mesh to the answer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import Interval
 
 TEXT = Sentences(__name__)
-#: parts of the charged time, in the order in which they are spent
+#: parts of the time from the mesh to the answer, in chronological order
 PARTS: dict[str, Callable[[Record], float]] = {
     "mesh, assembly": lambda r: (r.build_seconds or 0.0) - (r.dualise_seconds or 0.0),
     "dualisation": lambda r: r.dualise_seconds or 0.0,
@@ -49,7 +49,7 @@ PARTS: dict[str, Callable[[Record], float]] = {
     "three or more sizes (see suites/crossover.toml).",
 )
 def crossover(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw all routes of every series with fresh builds."""
+    """Tabulate and draw all routes of every series measured with fresh builds."""
     maps = crossover_maps(a.evidence)
     if not maps:
         return
@@ -82,8 +82,8 @@ def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
 def _answer(one: Map) -> list[tuple[str, int | None, str]]:
     """Return each primal route with the least size from which on a dual route pays.
 
-    Only dual routes count that reach all sizes of the primal one. The size is None if
-    none of them pays.
+    Only dual routes that reach all sizes of the primal route are considered. The size
+    is None if none of these dual routes pays.
     """
     best = dict[str, tuple[str, int | None, str]]()
     for dual, primal, at in _comparisons(one):
@@ -182,7 +182,7 @@ def _parts_table(one: Map) -> Table:
 
 
 def _stops_table(one: Map) -> Table:
-    """State for every route where it ends, and why each solver ended there."""
+    """Tabulate the size at which every route ends, and the reason for each solver."""
 
     def reasons(route: Route) -> Cell:
         ends = [

@@ -97,7 +97,7 @@ def _solver_and_form(outcome: Outcome) -> str:
     "Physical results: no verified answer has physical quantities.",
 )
 def physics(a: Analysis) -> Iterator[Part]:
-    """Show sizes and physical results, one verified answer per physical case."""
+    """Tabulate sizes and physical results of one verified answer per physical case."""
     answered = [o for o in a.evidence.flat if o.verified and o.quantities]
     cases = grouped(answered, lambda o: o.physical).values()
     chosen = [(best_of(answers), answers) for answers in cases]
@@ -149,7 +149,7 @@ def deformed(a: Analysis) -> Iterator[Part]:
         max(mine, key=_importance)
         for mine in grouped(_drawable(a), lambda o: o.first.family).values()
     ]
-    drawn: set[int] = set()  # dimensions
+    drawn: set[int] = set()  # dimensions (2 or 3) that are drawn already
     for chosen in sorted(largest, key=_importance, reverse=True):
         try:
             fields = load_fields(directory, chosen.first.fields or "")
@@ -157,7 +157,7 @@ def deformed(a: Analysis) -> Iterator[Part]:
             if not len(fields.cells) or fields.dim in drawn:
                 continue
             figure = deformed_figure(fields)
-        except InputError as e:  # vectors/ may be missing: the journal suffices
+        except InputError as e:  # the journal may exist without vectors/
             missing = str(e).removeprefix(f"{directory}{os.sep}")
             yield TEXT("missing", chosen.case, missing)
             return
@@ -176,7 +176,7 @@ def deformed(a: Analysis) -> Iterator[Part]:
     "Tractions along the contact: no verified answer has a contact side.",
 )
 def tractions(a: Analysis) -> Iterator[Part]:
-    """Draw the tractions of the largest case of each family and law."""
+    """Draw the tractions of the largest case of each family and friction law."""
     laws = grouped(_drawable(a), lambda o: (o.first.family, o.first.params.get("law")))
     for (family, law), mine in laws.items():
         chosen = max(reversed(mine), key=_importance)
@@ -197,12 +197,12 @@ def tractions(a: Analysis) -> Iterator[Part]:
 
 
 def _drawable(a: Analysis) -> list[Outcome]:
-    """Return verified answers with a stored state."""
+    """Return the verified answers whose deformed state is stored."""
     return [o for o in a.evidence.flat if o.verified and o.first.fields]
 
 
 def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
-    """Order by size, then load step, then accuracy; names break ties."""
+    """Return a sort key: size, then load step, then accuracy; names break ties."""
     step = outcome.first.params.get("step", 0)
     size = outcome.size("dofs") or outcome.size("contact_rows") or 0
     last = float(step) if isinstance(step, int | float) else 0.0

@@ -42,7 +42,7 @@ from mortarbench.reports.statistics.censoring import restricted_mean
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.profiles import performance_ratios, solved_within
 
-DRAWN = 4  #: groups whose profiles are drawn; all are tabulated
+DRAWN = 4  #: largest number of groups whose profiles are drawn; all are tabulated
 #: multiples of the best time; columns of the table of profiles
 FACTORS = (1.0, 2.0, 5.0, 10.0)
 TEXT = Sentences(
@@ -59,7 +59,7 @@ TEXT = Sentences(
 def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
     """List the groups that are not compared over cases.
 
-    reasons : True to state the reasons, False to refer to the section that does
+    reasons : True to state the reasons, False to refer to the section that states them
     """
     lacking = [group for group in a.groups if not group.comparable]
     if not lacking:
@@ -142,12 +142,12 @@ def _means_table(ranking: Ranking) -> Table:
 
 
 def _share(p: float) -> str:
-    """Print a share of the draws, with no more digits than 2000 draws support."""
+    """Print a share of the draws with as many digits as 2000 draws support."""
     return "0" if p == 0 else "< 0.01" if p < 0.01 else f"{p:.2f}"
 
 
 def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
-    """Compare with the leader on the cases that both solved, without a penalty."""
+    """Return a solver's ratio to the leader on the cases that both of them solved."""
     mine, its = (
         {p: float(t) for p, t in enumerate(group.times[:, s]) if np.isfinite(t)}
         for s in (i, leader)
@@ -215,9 +215,9 @@ def _reading(
 ) -> str:
     """Describe the reliability of the rank of one solver.
 
-    turned : (solvers,) whether some convention reverses the order relative to another
-    separated : (solvers,) whether the difference from another is significant
-    unique : the rank interval is a single rank
+    turned : (solvers,) True if some convention reverses the order with that solver
+    separated : (solvers,) True if the difference from that solver is significant
+    unique : True if the rank interval is a single rank
     """
     if (turned & separated).any():
         return "depends on the convention"

@@ -1,4 +1,4 @@
-"""One solve on several ranks: strong and weak scaling, parts, a model of the cost."""
+"""One solve on several ranks: strong and weak scaling, parts of times, cost model."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.cost_model import CostModel
 from mortarbench.reports.statistics.intervals import Interval
 
-MOST_DRAWN = 4  #: series in a figure; all are tabulated
+MOST_DRAWN = 4  #: largest number of series in a figure; all are tabulated
 MISFIT = 0.2  #: largest relative misfit of a model that is used to predict
-PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks to predict
+PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks with predicted speed-ups
 _CROWDED = "more ranks than CPUs: ranks shared CPUs"
 TEXT = Sentences(__name__, ALIKE=ALIKE, MISFIT=MISFIT, MOST_DRAWN=MOST_DRAWN)
 
-#: a series, a number of ranks, and the answer on them
+#: a series, a number of ranks, and the answer on this number of ranks
 Solve = tuple[StrongSeries, int, Outcome]
 _ONE = Cell(text="1", value=1.0)
 _SERIES = ("case", "solver", "tol")
@@ -156,7 +156,7 @@ def _weak_table(series: WeakSeries) -> Table:
 
 
 def _part_tables(solves: Sequence[Solve]) -> Iterator[Table]:
-    """Tabulate time, messages and memory of the ranks, as far as records have them."""
+    """Tabulate the recorded times, messages and memory of the ranks."""
     parts = [rank_parts(o) for *_, o in solves]
     counts = [rank_counts(o) for *_, o in solves]
     if any(parts):
@@ -205,7 +205,7 @@ def _part(part: Part | None, o: Outcome) -> Cell:
 def _model_tables(
     modelled: Sequence[StrongSeries], asked: Sequence[StrongSeries]
 ) -> Iterator[Table]:
-    """Tabulate the terms of the models, and the predictions of those that fit."""
+    """Tabulate the terms of the cost models, and predictions of models that fit."""
 
     def row(s: StrongSeries, m: CostModel) -> tuple[Cell, ...]:
         runs = source(*(s.answers[n] for n in m.measured))
@@ -260,7 +260,7 @@ def _model_tables(
 def predicted(s: StrongSeries) -> tuple[int, ...]:
     """Return the numbers of ranks, beyond the measured ones, for which to predict.
 
-    Empty if the model misfits the measured times by more than `MISFIT`.
+    The tuple is empty if the misfit of the model exceeds `MISFIT`.
     """
     assert s.model is not None
     if s.model.misfit > MISFIT:

@@ -67,7 +67,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
 @section(18, "verdicts", "Claims and verdicts")
 def claims(a: Analysis) -> Iterator[Part]:
-    """Tabulate claims beside our verdicts, and list the refuted claims."""
+    """Tabulate claims and verdicts, and list the refuted claims."""
     yield from TEXT.parts("claims")
     yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
     kinds = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
@@ -84,7 +84,7 @@ def claims(a: Analysis) -> Iterator[Part]:
 
 
 def _refutation(outcome: Outcome) -> Cell:
-    """Name the residual or the distance that refutes a claim."""
+    """Return a cell with the residual or the distance that refutes a claim."""
     values = {name: outcome.largest(name) for name in RESIDUALS}
     errors = {name: value for name, value in values.items() if value is not None}
     if (error := outcome.largest("optimum_error")) is not None:
@@ -145,7 +145,7 @@ def _counts(outcome: Outcome, names: Iterable[str]) -> Iterator[Cell]:
 
 @section(56, "errors", "Errors")
 def errors(a: Analysis) -> Iterator[Part]:
-    """Tabulate the four residuals and, where there is one, the certified bound."""
+    """Tabulate the four residuals and, if available, the certified error bound."""
     answers = [o for o in a.evidence.flat if o.worst is not None]
     bounded = any(o.largest("energy_bound") is not None for o in a.evidence.flat)
     yield from TEXT.parts("errors", answers, bounded)

@@ -29,8 +29,8 @@ from mortarbench.reports.statistics.growth import (
 )
 from mortarbench.reports.statistics.intervals import PowerLaw
 
-MOST_DRAWN = 8  #: figures of counts; all are tabulated
-#: counts listed first; the others follow in the order of the solver
+MOST_DRAWN = 8  #: largest number of figures of counts; all counts are tabulated
+#: counts listed first; the others follow in the order in which the solver reports them
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
 
@@ -188,7 +188,7 @@ def per_decade(fit: Growth) -> str:
     "Steps of each kind against size: no solver reports counts on three or more sizes.",
 )
 def steps(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw the counts of each solver, by kind, against n and H/h."""
+    """Tabulate and draw the counts that solvers report, against n and H/h."""
     by_subdomain = sweeps(a.evidence, "feti")
     against_size = [
         (series, solver)

@@ -24,7 +24,7 @@ TEXT = Sentences(__name__)
 
 @section(14, "cases", "Cases")
 def cases(a: Analysis) -> Iterator[Part]:
-    """Tabulate every case by family; records contain defaults as well."""
+    """Tabulate the cases of each family with all parameters, including defaults."""
     yield from TEXT.parts("cases")
     found = [
         # a declined or crashed build has no sizes
@@ -36,7 +36,7 @@ def cases(a: Analysis) -> Iterator[Part]:
 
 
 def _table(family: str, found: Sequence[tuple[Outcome, str]]) -> Table:
-    """Return a table with a column per varying parameter, the others in a note."""
+    """Return a table with a column per varying parameter; a note lists the others."""
     params = [o.first.params for o, _ in found]
     keys = dict.fromkeys(key for of in params for key in of)
     values = {key: {_parameter(key, each).text for each in found} for key in keys}
@@ -66,7 +66,7 @@ def _parameter(key: str, each: tuple[Outcome, str]) -> Cell:
 
 
 def _value(value: Any, limit: int, title: str = "") -> Cell:
-    """Return a cell of plain data; numbers are sorted by value."""
+    """Return a cell with a number or text; numbers are sorted by value."""
     number = float(value) if isinstance(value, int | float) else None
     return Cell(text=plain_value(value, limit), value=number, title=title)
 

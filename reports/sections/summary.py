@@ -80,7 +80,7 @@ def summary(a: Analysis) -> Iterator[Part]:
 
 
 def _marks(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
-    """List the marks behind labels, their environments, and the differing keys."""
+    """List the marks after solver labels, their environments, and keys that differ."""
     found: list[tuple[str, str, list[str]]] = []
     for digest, mark in evidence.marks.items():
         try:
@@ -94,9 +94,9 @@ def _marks(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
 
 
 def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
-    """Count the measurements: done, planned, declined and missing.
+    """Return the numbers of measurements: completed, planned, declined and missing.
 
-    The journal has one line for a case that a solver declined, whatever the repeats.
+    If a solver declines a case, the journal has one line for all repeats.
     """
     made = sum(r.verdict is not Verdict.DECLINED for r in evidence.records)
     asked = evidence.suite.get("repeats")
@@ -110,7 +110,11 @@ def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
 
 
 def _cells(evidence: Evidence) -> int:
-    """Count the planned cells: cold solvers on cold cases, sequences on sequences."""
+    """Count the planned pairs of case and solver.
+
+    Every solver is planned on the cases of its mode (cold or a sequence) and
+    environment.
+    """
 
     def kind(r: Record) -> tuple[str, str]:
         return r.mode, evidence.marks.get(r.environment, "")
@@ -124,7 +128,7 @@ def _cells(evidence: Evidence) -> int:
 
 
 def sentences(evidence: Evidence, solver: str) -> list[str]:
-    """Return one sentence per tolerance on the cases that a solver misses."""
+    """Return one sentence per tolerance on the cases that a solver did not solve."""
     mine = [o for o in evidence.flat if o.solver == solver]
     tols = sorted({o.tol for o in mine}, reverse=True)
     return [_sentence(solver, tol, [o for o in mine if o.tol == tol]) for tol in tols]

@@ -1,4 +1,4 @@
-"""Time to accuracy: tolerances are swept, and all answers judged at one accuracy."""
+"""Time to accuracy: tolerances are swept, and answers are judged at one accuracy."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import Interval
 
 TEXT = Sentences(__name__)
-_PANELS = 4  #: cases that are drawn; all are tabulated
+_PANELS = 4  #: largest number of cases that are drawn; all are tabulated
 ERRORS = (1e-2, 1e-4, 1e-6)  #: certified errors at which times are compared
-LEAST = 3  #: fewest tolerances of a sweep
+LEAST = 3  #: minimum number of tolerances in a sweep
 
-Sweeps = Mapping[str, Mapping[str, Sequence[Outcome]]]  #: case → solver → by tolerance
-Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
+#: outcomes by case and solver, loosest tolerance first
+Sweeps = Mapping[str, Mapping[str, Sequence[Outcome]]]
+Key = tuple[str, float]  #: case, and the accuracy at which answers are judged
 
 
 @section(
@@ -49,7 +50,7 @@ Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
     "certified error at three or more tolerances (see suites/accuracy.toml).",
 )
 def accuracy(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw every sweep: certified errors, or else the largest residual."""
+    """Tabulate and draw every sweep, by certified errors or else by residuals."""
     solvers = a.evidence.solvers
     if certified := certified_sweeps(a.evidence):
         yield from TEXT.parts("certified")
@@ -137,7 +138,7 @@ def certified_sweeps(evidence: Evidence) -> dict[str, dict[str, list[Outcome]]]:
 def by_solver(
     outcomes: Iterable[Outcome], name: Callable[[Outcome], Name]
 ) -> dict[Name, dict[str, list[Outcome]]]:
-    """Group by a name and by solver, loosest tolerance first."""
+    """Group outcomes by a name and by solver, loosest tolerance first."""
     ordered = sorted(outcomes, key=lambda o: -o.tol)
     groups = grouped(ordered, name).items()
     return {key: grouped(of, lambda o: o.solver) for key, of in groups}
@@ -176,10 +177,10 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
 
 
 def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
-    """Rank the times of a row: "best", "tied" or neither, by solver.
+    """Return "best" or "tied" for the fastest solvers of a row.
 
-    A time that is only bounded from above is not ranked. It may be the smallest, so
-    no time of its row is then called the best.
+    A time that is only bounded from above gets no mark. Because it may be the smallest,
+    no other time of its row is called the best.
     """
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:

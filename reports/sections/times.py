@@ -1,7 +1,8 @@
 """Times of verified answers, their ratios, and their precision.
 
-The precision is measured by null arms (one solver under two labels) and by the canary
-of each record; journals of older versions have neither.
+The precision is measured by null arms (a solver repeated under a second label) and by
+canaries (a fixed computation that is timed before each measurement). Journals of older
+versions contain neither.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
 
 TEXT = Sentences(__name__, LEAST=COVERAGE, BY_OPTIMUM=BY_OPTIMUM)
-_PARTS = 3  #: the drift of the canary is from the first third to the last
+_PARTS = 3  #: canary drift is measured from the first to the last of this many parts
 
 
 @section(20, "times", "Times")
@@ -67,7 +68,7 @@ def times(a: Analysis) -> Iterator[Part]:
 def _charged_table(
     charged: Sequence[Mapping[str, Outcome]], solvers: Sequence[str]
 ) -> Table:
-    """Tabulate total times of dual forms including dualisation, where it was timed."""
+    """Tabulate total times of dual forms including dualisation, if it was timed."""
     rows = []
     for row in charged:
         one = next(o for o in row.values() if o.dualising is not None)
@@ -150,7 +151,7 @@ def ratios(a: Analysis) -> Iterator[Part]:
 
 
 def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
-    """Return the verified answer with the smallest median; null arms do not compete."""
+    """Return the verified answer with the smallest median time; ignore null arms."""
     medians = {
         s: median(times)
         for s, o in row.items()
@@ -160,7 +161,7 @@ def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
 
 
 class _Twins(NamedTuple):
-    """One solver measured under two labels, and the ratio of the times by blocks."""
+    """One solver measured under two labels, and its ratio of times within blocks."""
 
     twin: Outcome
     null: Outcome
@@ -222,7 +223,7 @@ def precision(a: Analysis) -> Iterator[Part]:
 
 
 def _null_ratios(evidence: Evidence) -> list[_Twins]:
-    """Pair every null arm with the solver that it repeats, by blocks."""
+    """Compare every null arm with the solver that it repeats, within blocks."""
     twins = []
     for row in evidence.outcomes.values():
         for null in (o for o in row.values() if o.first.role == "null"):

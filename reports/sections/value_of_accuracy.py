@@ -35,7 +35,7 @@ Meshes = Mapping[str, Discretisation]
     '"mortarbench validate DIR" computes them for later reports.',
 )
 def value_of_accuracy(a: Analysis) -> Iterator[Part]:
-    """Tabulate certified errors relative to discretisation errors, where known."""
+    """Tabulate certified errors relative to discretisation errors, if known."""
     known = read_discretisation(a.evidence.directory)
     physical = dict.fromkeys(o.physical for o in a.evidence.flat)
     meshes = {name: known[name] for name in physical if name in known}
@@ -103,7 +103,7 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
 
 
 def share_of(outcome: Outcome, meshes: Meshes) -> float | None:
-    """Return the certified error over the discretisation error; None if unknown."""
+    """Return certified error divided by discretisation error; None if unknown."""
     bound, mesh = outcome.largest("energy_bound"), meshes.get(outcome.physical)
     if bound is None or mesh is None or mesh.kind not in _KNOWN or not mesh.error:
         return None

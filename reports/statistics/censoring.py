@@ -21,12 +21,12 @@ Array = NDArray[np.float64]
 
 
 class Restricted(NamedTuple):
-    """Mean of min(t, horizon) over the cases, with the numbers of endings."""
+    """Mean of min(t, horizon) over the cases, and the number of cases by ending."""
 
     mean: Interval  #: s
     solved: int
-    stopped: int  #: stopped at the time limit: censored
-    never: int  #: ended by themselves without a verified answer
+    stopped: int  #: number of cases stopped at the time limit, which are censored
+    never: int  #: number of cases that ended before it without a verified answer
 
 
 def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
@@ -35,15 +35,18 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     S is the Kaplan-Meier estimate [1]_ of the share of cases that are unsolved at t. A
     case that reached the time limit is censored: its t exceeds the limit. A refuted
     answer, a crash and an iteration limit do not depend on time, so t is infinite. If
-    every time limit is at the horizon, this is the plain mean of min(t, horizon). The
-    variance is Σ (∫ₜᵢ S)²·dᵢ/(nᵢ(nᵢ − dᵢ)) [2]_, times n/(n − 1). The interval is
-    Student's with n − 1 degrees of freedom, truncated at 0 and at the horizon.
+    every time limit is at the horizon, this is the plain mean of min(t, horizon).
+
+    At time tᵢ, dᵢ of the nᵢ cases at risk are solved, and Aᵢ is the integral of S from
+    tᵢ to the horizon. The variance is Σ Aᵢ²·dᵢ/(nᵢ(nᵢ − dᵢ)) [2]_, multiplied by
+    n/(n − 1) for n cases. The interval is Student's with n − 1 degrees of freedom,
+    truncated at 0 and at the horizon.
 
     Parameters
     ----------
     times : (cases,) s; inf without a verified answer
     stopped : (cases,) s until the time limit; NaN for other endings
-    horizon : s
+    horizon : upper limit of the times that enter the mean, s
 
     """
     n = times.size

@@ -2,27 +2,26 @@
 
     t(N) = s(N)·(W/N + C) + R·α_R(N) + M(N)·α + b·β
 
-W is the work that the ranks share, in seconds of one rank. C is the work that each rank
-repeats or waits for (Amdahl [1]_). s is the slowdown of a rank while the others are
-busy: the time of simultaneous copies of the job, one per rank, divided by the time of a
-single job. A rank of a shared job uses less memory than a copy, and may disturb the
-others less; therefore s is limited to the largest value that leaves C ≥ 0, but is at
-least 1. The rest is communication [2]_: R reductions over all ranks, M messages and b
-bytes to
-neighbours, with the latencies α_R and α of a reduction and of a message, and β seconds
-per byte.
+W is the work that the ranks share, in seconds of one rank. C is the time in which each
+rank repeats work or waits for others (Amdahl [1]_). s is the slowdown of a rank while
+the other ranks are busy: the time of simultaneous copies of the job, one per rank,
+divided by the time of a single job. A rank of a shared job uses less memory than a copy
+and may disturb the other ranks less; therefore s is limited to the largest value that
+leaves C ≥ 0, but is at least 1. The other terms are communication [2]_: R reductions
+over all ranks, and M messages with b bytes in total to neighbouring ranks. A reduction
+has the latency α_R, a message has the latency α, and a byte takes β seconds.
 
 W and C are fitted to measured times, s and the latencies are measured, and R, M and b
 are counted, all on the ranks of the run. Superlinear speed-up cannot be fitted even
-with s = 1, and shows in the misfit. Beyond the measured ranks, the model is extended as
+with s = 1; it increases the misfit. Beyond the measured ranks, the model is extended as
 follows:
 
-- s is constant: further ranks bring their own memory, like the measured ones;
-- α_R grows with ⌈log₂N⌉, the depth of a tree of ranks;
-- M grows with the neighbours of a rank, N − 1 and at most six: a planar graph has fewer
-  than three edges per vertex (Euler);
-- b is constant: one half of a square touches the other half along one side, and an
-  inner sixteenth touches its neighbours along four quarters of a side.
+- s is constant, because further ranks are assumed to bring their own memory;
+- α_R is proportional to ⌈log₂N⌉, the depth of a tree of ranks;
+- M is proportional to the number of neighbours of a rank, N − 1 but at most six, since
+  a planar graph has fewer than three edges per vertex (Euler);
+- b is constant: each half of a square touches the other half along one side, and an
+  inner sixteenth of the square touches its neighbours along four quarters of a side.
 
 References
 ----------
@@ -45,27 +44,27 @@ from numpy.typing import ArrayLike, NDArray
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import DRAWS, limits
 
-NEIGHBOURS = 6  #: bound of the average degree of a planar graph (Euler)
-MAX_RANKS = 2**20  #: end of the search of `CostModel.ranks_at`
+NEIGHBOURS = 6  #: upper bound of the average degree of a planar graph (Euler)
+MAX_RANKS = 2**20  #: largest number of ranks that `CostModel.ranks_at` tries
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """Messages of a rank in one solve on `ranks` ranks, and their costs."""
+    """Communication of a rank in one solve on `ranks` ranks, and its unit costs."""
 
     ranks: int  #: number of ranks, at least two
     reductions: float  #: number of reductions over all ranks
-    messages: float  #: number of messages to neighbours
-    sent: float  #: bytes
+    messages: float  #: number of messages to neighbouring ranks
+    sent: float  #: number of bytes in these messages
     reduction_seconds: float  #: time to reduce one number over all ranks
     message_seconds: float  #: time of the shortest message
     seconds_per_byte: float
 
     @property
     def seconds(self) -> Array:
-        """Seconds of reductions, messages and bytes on these ranks, (3,)."""
+        """Time of reductions, messages and bytes on these ranks, s, (3,)."""
         return np.array(
             [
                 self.reductions * self.reduction_seconds,
@@ -76,7 +75,10 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Return growth factors (…, 3) of reductions, messages and bytes on other ranks."""
+    """Return the growth (…, 3) of communication times relative to `measured` ranks.
+
+    The last axis contains the factors of reductions, messages and bytes.
+    """
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)
@@ -85,24 +87,24 @@ def growth(ranks: ArrayLike, measured: int) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CostModel:
-    """Cost model of one solve, with draws that represent the scatter of the repeats."""
+    """Cost model of one solve, with bootstrap draws for the scatter of the repeats."""
 
-    work: float  #: W, s
-    repeated: float  #: C, s
-    slowdown: float  #: s on the largest measured number of ranks
-    #: seconds of reductions, messages and bytes on the largest measured number of ranks
+    work: float  #: shared work W, s
+    repeated: float  #: repeated work C, s
+    slowdown: float  #: slowdown s on the largest measured number of ranks
+    #: time of reductions, messages and bytes on the largest measured number of ranks, s
     communication: tuple[float, float, float]
-    measured: tuple[int, ...]  #: ranks, ascending
-    misfit: float  #: largest |t/t_measured − 1|
-    #: (draws, 6) W, C, s and communication of every draw; empty if some number of ranks
-    #: was measured only once
+    measured: tuple[int, ...]  #: measured numbers of ranks, ascending
+    misfit: float  #: largest |t/t_measured − 1| of the modelled times t
+    #: (draws, 6) W, C, slowdown and communication of every draw; empty if some number
+    #: of ranks was measured only once
     draws: Array
     samples: int  #: smallest number of repeats
 
     def speed_up(self, ranks: int) -> Interval:
         """Predict t(1)/t(N) on more ranks than were measured, with its 95 % interval.
 
-        The interval is that of the fit; it does not cover errors of the model itself.
+        The interval reflects the scatter of the repeats, not errors of the model.
         """
         value = float(self._speed_up(ranks, self._own)[0])
         if not len(self.draws):
@@ -111,7 +113,7 @@ class CostModel:
         return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def ranks_at(self, efficiency: float) -> int:
-        """Return the largest power of two N with speed-up of at least efficiency·N."""
+        """Return the largest power of two N with a speed-up of efficiency·N or more."""
         N = 2
         while N < MAX_RANKS and self._speed_up(N, self._own)[0] >= efficiency * N:
             N *= 2
@@ -140,14 +142,14 @@ def cost_model(
 ) -> CostModel:
     """Fit W and C ≥ 0 to the times of one solve by least squares of relative errors.
 
-    Repeats are averaged in logarithms. Draws resample the repeats of every number of
-    ranks, those of the copies, and the communication of each.
+    Repeats are averaged by geometric means. Draws resample the repeats on every number
+    of ranks, those of the copies, and their communication.
 
     Parameters
     ----------
-    seconds : times of every repeat, by ranks; one rank and others
-    copies : times of as many simultaneous copies of the job on one rank, an upper bound
-        of s; s = 1 where there are none
+    seconds : times of every repeat by number of ranks, which includes one rank
+    copies : times of simultaneous copies of the job on one rank, by number of copies;
+        they give an upper bound of s; without copies, s = 1
     communication : one item per repeat on the largest number of ranks
 
     Raises
@@ -197,7 +199,7 @@ def cost_model(
 
 
 def _geometric(values: ArrayLike, rng: np.random.Generator, count: int) -> Array:
-    """Return (1 + count,) geometric means: of the values, then of `count` resamples."""
+    """Return geometric means (1 + count,) of the values and of `count` resamples."""
     with np.errstate(divide="ignore"):  # zero where nothing was sent
         logs = np.log(np.asarray(values, dtype=float))
     drawn = rng.integers(logs.size, size=(count, logs.size))

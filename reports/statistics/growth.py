@@ -1,9 +1,9 @@
 """Power laws fitted to few sizes: practically relevant growth, and predictions.
 
-Growth is judged by its magnitude: the 95 % interval of the factor 10ᵖ, the change of
-the values when n is multiplied by ten, is compared with 1 ± `PRACTICAL`. A test of
-p ≤ 0 would report 19, 22, 22, 22, 22 as growth, and would report irrelevant growth as
-significant whenever the counts scatter little.
+Growth is judged by its magnitude. The values change by the factor 10ᵖ when n is
+multiplied by ten; the 95 % interval of this factor is compared with 1 ± `PRACTICAL`. A
+test of the hypothesis p ≤ 0 would report 19, 22, 22, 22, 22 as growth, and would report
+irrelevant growth as significant whenever the counts scatter little.
 
 References
 ----------
@@ -32,7 +32,7 @@ _ROUNDING = 1e-12  #: smaller scatter of logarithms counts as rounding
 
 
 class Trend(Enum):
-    """Conclusions that the interval of the change per decade allows."""
+    """Conclusions from the interval of the factor 10ᵖ per decade of n."""
 
     GROWS = "grow"  #: interval above 1 + PRACTICAL
     FLAT = "flat"  #: interval within 1 ± PRACTICAL
@@ -45,8 +45,8 @@ class Growth:
     """The fit v = c·nᵖ of positive values by least squares on logarithms."""
 
     exponent: float  #: p
-    low: float  #: ends of its 95 % interval
-    high: float
+    low: float  #: lower end of the 95 % interval of p
+    high: float  #: upper end of the 95 % interval of p
     log_factor: float  #: log c
     scatter: float  #: standard deviation of log v about the line
     sizes: tuple[float, ...]  #: measured n
@@ -62,7 +62,7 @@ class Growth:
 
     @property
     def trend(self) -> Trend:
-        """Judge the interval of the change per decade against ±`PRACTICAL`."""
+        """Conclusion from comparing the change per decade with ±`PRACTICAL`."""
         _, low, high = self.per_decade
         if low > PRACTICAL:
             return Trend.GROWS
@@ -74,7 +74,7 @@ class Growth:
     def at(self, n: float) -> Interval:
         """Predict v at a size within the measured range, with its 95 % interval.
 
-        The interval is that of a further measurement [1]_.
+        The interval is a prediction interval for one further measurement [1]_.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class Growth:
 
 
 def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
-    """Fit v = c·nᵖ, with Student's interval of p with k − 2 degrees of freedom.
+    """Fit v = c·nᵖ; the interval of p is Student's with k − 2 degrees of freedom.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     Raises
     ------
     ValueError
-        When fewer than four different sizes are given, or a value is not positive.
+        If fewer than four different sizes are given, or a value is not positive.
 
     """
     x, y = np.asarray(n, dtype=float), np.asarray(values, dtype=float)

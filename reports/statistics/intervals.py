@@ -15,13 +15,13 @@ COVERAGE = 0.95  #: nominal; the median of fewer than six samples cannot reach i
 
 
 class Interval(NamedTuple):
-    """An estimate with its interval; for a median, two order statistics."""
+    """An estimate with its confidence interval."""
 
     value: float
     low: float
     high: float
     coverage: float  #: probability that [low, high] contains the true value
-    samples: int
+    samples: int  #: number of samples behind the estimate
 
 
 def student(freedom: float) -> float:
@@ -33,9 +33,10 @@ def median_interval(samples: Sequence[float]) -> Interval:
     """Return the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
 
     The interval misses the true median only if fewer than k of the n independent
-    samples lie on one side of it. So it covers with probability 1 − 2·P(X < k) for
-    X ~ Bin(n, ½), for every distribution [1]_. k is the largest number with at least
-    95 %; below six samples k = 1, from the smallest to the largest, with 1 − 2¹⁻ⁿ.
+    samples lie on one side of it. For every distribution, the coverage is therefore
+    1 − 2·P(X < k) with X ~ Bin(n, ½) [1]_. The largest k with a coverage of at least
+    95 % is used. Fewer than six samples cannot reach 95 %; then k = 1, the interval
+    extends from the smallest to the largest sample, and its coverage is 1 − 2¹⁻ⁿ.
 
     References
     ----------
@@ -60,7 +61,7 @@ def _order(n: int) -> tuple[int, float]:
 
 
 class PowerLaw(NamedTuple):
-    """The fit t = factor·nᵖ, with a 95 % interval [low, high] of the exponent p."""
+    """The fit t = c·nᵖ, with a 95 % interval [low, high] of the exponent p."""
 
     exponent: float
     low: float
@@ -70,17 +71,17 @@ class PowerLaw(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """The factor c of c·nᵖ; infinite if it overflows."""
+        """Factor c of c·nᵖ; infinite if it overflows."""
         with np.errstate(over="ignore"):
             return float(np.exp(self.log_factor))
 
     def at(self, n: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Evaluate the law at sizes n (k,), near those that it was fitted to."""
+        """Evaluate the law at sizes n (k,), which should be near the fitted sizes."""
         return np.asarray(np.exp(self.log_factor + self.exponent * np.log(n)))
 
 
 def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
-    """Fit t = c·nᵖ by least squares on logarithms, one point per size.
+    """Fit t = c·nᵖ by least squares on logarithms.
 
     The interval of p is Student's with points − 2 degrees of freedom. It is exact if
     the logarithms scatter normally about the line, and it is wide if the law does not
@@ -94,7 +95,7 @@ def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
     Raises
     ------
     ValueError
-        When fewer than three different sizes are given, or a value is not positive.
+        If fewer than three different sizes are given, or a value is not positive.
 
     """
     x, y = np.asarray(n, dtype=float), np.asarray(t_of_n, dtype=float)

@@ -1,4 +1,4 @@
-"""Performance and data profiles: the share of cases solved within a factor, or a time.
+"""Performance and data profiles: share of cases solved within a time ratio or a time.
 
 References
 ----------
@@ -23,7 +23,7 @@ from scipy.special import betainccinv, betaincinv
 
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-POINTS = 200  #: maximum number of points of a curve; with more cases it is sampled
+POINTS = 200  #: maximum number of points of a curve; curves with more are sampled
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def performance_ratios(times: Array) -> Array:
     """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
     A case that no solver solved is kept with infinite ratios, so that no profile
-    reaches one. The profile of a solver is the share of cases with r ≤ τ.
+    reaches one. The profile of a solver at τ is the share of cases with r ≤ τ.
 
     Parameters
     ----------
@@ -61,11 +61,10 @@ def performance_ratios(times: Array) -> Array:
 def share(counts: ArrayLike, cases: int) -> Share:
     """Return the share counts/cases with its binomial interval [4]_.
 
-    Unlike a percentile interval, it has a positive width where all or no cases are
-    solved, and at least nominal coverage.
+    Unlike a percentile interval, this interval has a positive width if all or no cases
+    are solved, and at least nominal coverage.
     """
-    # Resampling cases keeps the value of each, so the resampled share at a place is
-    # binomial and needs no draws.
+    # Among resampled cases, the number solved is binomial, so no draws are needed.
     k = np.asarray(counts, dtype=float)
     tail = (1 - COVERAGE) / 2
     return Share(
@@ -78,7 +77,7 @@ def share(counts: ArrayLike, cases: int) -> Share:
 
 
 def solved_within(values: Array, places: ArrayLike) -> Share:
-    """Return the share of the cases with value ≤ place, for each place, all finite.
+    """Return, for each of the finite `places`, the share of cases with value ≤ place.
 
     values : (cases,) ratios for a performance profile, seconds for a data profile [2]_
     """
@@ -87,7 +86,7 @@ def solved_within(values: Array, places: ArrayLike) -> Share:
 
 
 def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
-    """Return the profile between two finite places on the axis."""
+    """Return the profile of `values` between the finite `start` and `stop`."""
     inside = np.unique(values[(values > start) & (values < stop)])
     if inside.size > points:
         inside = np.geomspace(start, stop, points)[1:-1]

@@ -1,8 +1,8 @@
-"""Bootstrap over cases, which estimates the results on other sets of problems.
+"""Bootstrap over cases, which estimates the scatter between sets of problems.
 
 The resampled unit is the case with the times of all solvers on it, so that solvers stay
-paired [1]_. Scatter within a case (such as noise of the clock) is also scatter between
-cases, so the intervals include it.
+paired [1]_. Scatter within a case (timing noise, for example) adds to the scatter
+between cases, so the intervals include it.
 
 References
 ----------
@@ -47,10 +47,13 @@ def weights(cases: Sequence[str]) -> Array:
 def limits(draws: Array, cases: int) -> tuple[Array, Array]:
     """Return the 95 % interval of every column of (draws, …) statistics.
 
-    Percentiles are expanded [2]_: the scatter of a resample of n cases is too small by
-    √((n−1)/n), with normal instead of Student's tails, so the quantile is that of
-    −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. A monotone transform of the statistic
-    transforms the interval in the same way.
+    Percentiles are expanded [2]_, because statistics of resamples of n cases scatter
+    too little by the factor √((n−1)/n), and have normal instead of Student's tails. The
+    lower percentile is Φ(−√(n/(n−1))·t₀.₉₇₅,ₙ₋₁), where Φ is the normal distribution
+    function and t₀.₉₇₅,ₙ₋₁ is a quantile of Student's distribution. A monotone
+    transform of the statistic transforms the interval in the same way.
+
+    cases : number of cases n
     """
     tail = float(ndtr(-np.sqrt(cases / (cases - 1)) * student(cases - 1)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
@@ -61,16 +64,15 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     """Determine the significantly faster solver of every pair, jointly at 95 %.
 
     If two solvers are equal, their times on a case are exchangeable: the sign of the
-    difference d of logarithms is random. The signs of whole cases are flipped, and the
-    statistics of each pair are compared with the maxima over all pairs in every flip
-    [3]_. There are two statistics: Σd/√Σd², which is equivalent to Student's t, and the
-    same expression for signed ranks, which a few failures with a large penalty do not
-    distort. The rank statistic counts only if its sign agrees with that of the mean.
-    The more significant statistic is used, also for the flips. Therefore, among any
-    number of
-    equal solvers, at most one set of cases in twenty has a significant pair. With fewer
-    than six cases no pair is significant: the signs of five cases agree in 2 of 2⁵
-    flips.
+    difference d of their logarithms is random. In each flip, the signs of some cases
+    are reversed for all pairs. The statistic of a pair is compared with the maxima over
+    all pairs in the flips [3]_. There are two statistics: Σd/√Σd², which is equivalent
+    to Student's t, and the same expression for the signed ranks of d, which a few
+    failures with a large penalty do not distort. A statistic is used only if its sign
+    agrees with that of the mean. The more significant of the two is used, for the data
+    and for every flip. Therefore, for any number of equal solvers, at most one set of
+    cases in twenty yields a significant pair. With fewer than six cases no pair is
+    significant: five signs agree in 2 of 2⁵ flips.
 
     Parameters
     ----------
@@ -78,7 +80,7 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
 
     Returns
     -------
-    (solvers, solvers) True where row is significantly faster than column
+    (solvers, solvers) True where the row solver is significantly faster
 
     """
     i, j = np.triu_indices(logs.shape[1], 1)
@@ -102,8 +104,9 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
     """Return the 95 % interval of a mean by inversion of the sign-flip test.
 
     The means of all subsets of the values divide the line into intervals that contain
-    the centre of a symmetric distribution with equal probability [4]_. Above `DRAWS`
-    subsets a random selection is used. For six values the interval is their range.
+    the centre of a symmetric distribution with equal probability [4]_. If there are too
+    many subsets (see `_signs`), a random selection is used. For six values the interval
+    is their range.
 
     values : (cases,) at least six, since fewer have no 95 % interval
     """
@@ -116,9 +119,9 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
 
 
 def _signs(cases: Sequence[str]) -> Array:
-    """Return all patterns of signs up to a common sign, or `DRAWS` random ones.
+    """Return all patterns of signs up to a common sign, or `DRAWS` random patterns.
 
-    The first pattern is that of the data, all ones.
+    The first pattern, with all signs positive, represents the data.
     """
     n = len(cases)
     if 2 ** (n - 1) <= DRAWS:
@@ -130,7 +133,10 @@ def _signs(cases: Sequence[str]) -> Array:
 
 
 def _flipped(scores: Array, signs: Array) -> tuple[Array, Array]:
-    """Return Σs/√Σs² of each pair, and its maximum over the pairs in every flip."""
+    """Return Σs/√Σs² of each pair, and its maximum over the pairs in every flip.
+
+    s are the scores of a pair, one per case.
+    """
     size = np.sqrt((scores**2).sum(axis=0))
     unit = scores / np.where(size > 0, size, 1)
     return unit.sum(axis=0), np.abs(signs @ unit).max(axis=1, initial=0)
@@ -147,13 +153,16 @@ def _ranks(values: Array) -> Array:
 
 
 def _p_values(values: Array, by: Array) -> Array:
-    """Return, for each entry of `by`, the share of `values` ≥ it, up to rounding."""
+    """Return, for each entry of `by`, the share of `values` that are at least as large.
+
+    Values that are equal up to rounding count.
+    """
     below = np.searchsorted(np.sort(values), by - 1e-9)
     return np.asarray(1 - below / values.size)
 
 
 def firsts(draws: Array) -> Array:
-    """Return the share of the draws in which each solver is fastest; ties are divided.
+    """Return the share of draws in which each solver is fastest; ties count in parts.
 
     draws : (draws, solvers)
     """
@@ -163,7 +172,7 @@ def firsts(draws: Array) -> Array:
 
 
 def _rng(cases: Sequence[str]) -> np.random.Generator:
-    """Return a generator seeded by the names, so that equal cases give equal draws."""
+    """Return a generator seeded by the names: equal cases give equal draws."""
     return np.random.default_rng(
         crc32("\n".join(cases).encode(errors="backslashreplace"))
     )

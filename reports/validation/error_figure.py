@@ -43,7 +43,7 @@ _KINDS: tuple[tuple[str, Callable[[Answer], bool], Look], ...] = (
 def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
     """Draw the errors of the answers at one tolerance; None if there are no answers.
 
-    answers : those of the data of `validate`
+    answers : answers in the data returned by `validate`
     """
     known = [a for a in answers if a["tol"] == tol and a["error"] is not None]
     if not known:

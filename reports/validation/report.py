@@ -39,9 +39,9 @@ TEXT = Sentences(__name__)
 def write_validation(
     directory: Path, data: Data, meshes: Sequence[Discretisation] = ()
 ) -> list[Path]:
-    """Write DIR/report/validation.html and .md from the data of `validate`.
+    """Write report/validation.html and .md in `directory` from the data of `validate`.
 
-    meshes : discretisation errors from finer meshes, where these were solved
+    meshes : discretisation errors, for cases solved on finer meshes
     """
     page, target = compose(data, meshes), directory / "report"
     _, drawings = write_figures(page, target)
@@ -52,7 +52,7 @@ def write_validation(
 
 
 def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
-    """Compose the page, verdict first."""
+    """Compose the page, beginning with the verdict."""
     sections = (
         Section.of(*each)
         for each in (
@@ -114,7 +114,7 @@ def _verdict(data: Data) -> Iterator[Part]:
 
 
 def _column(head: str, name: str = "", show: Callable[[Any], str] = str) -> Column:
-    """Return a column of a number."""
+    """Return a column of numbers from one field of the data."""
     return head, lambda d: Cell.number(d[name or head], show)
 
 
@@ -136,7 +136,7 @@ def _worst_case(d: Data) -> Cell:
 
 
 def _disagreements(data: Data) -> Iterator[Part]:
-    """Tabulate refuted claims, and contradicting pairs of which neither is refuted."""
+    """Tabulate refuted claims, and contradicting pairs without a refuted claim."""
     if wrong := data["disagreements"]:
         yield Table.of(
             "Refuted claims, with our verdict and the reason.",
@@ -179,7 +179,7 @@ def _judged(d: Data) -> Cell:
 
 
 def _problems(data: Data) -> Iterator[Part]:
-    """Tabulate the largest distances between the answers to every problem."""
+    """Tabulate the largest distances between the answers to each problem."""
 
     def largest(name: str) -> Callable[[Data], Cell]:
         def cell(p: Data) -> Cell:
@@ -224,7 +224,7 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Tabulate the outliers of each solver, with the worst of them."""
+    """Tabulate the answers of each solver that stand out, with the worst of them."""
     grouped: dict[str, list[Data]] = {}
     for d in data["remarks"]:
         grouped.setdefault(d["solver"], []).append(d)

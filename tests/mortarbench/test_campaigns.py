@@ -128,7 +128,7 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(camp
 
     assert "Measured in different sessions" in said
     assert "again with exact, lax" in said
-    assert "Unpaired: the two were not measured in the same blocks" in said
+    assert "Unpaired: the two solvers were not measured in the same blocks" in said
     row = evidence.outcomes["well/dual", 1e-6]
     assert not row["again"].by_block.keys() & row["exact"].by_block.keys()
     assert row["lax"].by_block.keys() == row["exact"].by_block.keys()

@@ -126,7 +126,7 @@ def test_a_verdict_that_the_residuals_beside_it_refute_is_told(tmp_path, capsys)
     read_evidence(tmp_path)
 
     message = capsys.readouterr().err
-    assert "journal says verified, but residuals exceed 10 times" in message
+    assert "residuals of verified records exceed 10 times" in message
     assert changed.run_id in message
     assert message.count("\n") == 1
 

@@ -45,7 +45,7 @@ function toggle(solver) {
   redraw();
 }
 
-/** Switch between light, dark and system colours; the choice is stored where allowed. */
+/** Switch between light, dark and system colours; store the choice if the browser permits. */
 function themes() {
   const button = byId("theme");
   const names = ["system", "light", "dark"];

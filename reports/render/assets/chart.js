@@ -3,7 +3,7 @@
 const NEAR = 24; // px, largest distance of the pointer from a selected point
 const APART = 70; // px between the marks of a line with sparse marks
 const LETTER = 6.2; // px, approximate width of a letter
-const MARGIN = 66; // px left of the axis, at least
+const MARGIN = 66; // px, smallest width left of the axis
 const MOST = 0.4; // largest share of the width for names left of the axis
 const PER_INCH = 104; // px per inch of the printed figure
 
@@ -29,7 +29,7 @@ function chart(box, content, linked, name) {
   };
   const inside = (axis, v) => v !== null && (!axes[axis].log || v > 0);
 
-  function all(axis) { // visible values
+  function all(axis) { // all visible values along an axis
     const found = [];
     for (const t of content.traces) {
       if (t.kind === "line") t[axis].forEach((v, i) => { if (inside(axis, v) && shows(t, i)) found.push(v); });
@@ -122,8 +122,8 @@ function chart(box, content, linked, name) {
       label(shown, { x: scale.left - 6, y, "text-anchor": "end", "dominant-baseline": "central" });
       if (shown !== text) parts.at(-1).append(svg("title", {}, text));
     };
-    const above = (text, y) => { // the axes, or below: in their middle, but within the drawing
-      const larger = 1.06, room = W / larger; // letters than those that are measured
+    const above = (text, y) => { // above or below the axes: in their middle, but within the drawing
+      const larger = 1.06, room = W / larger; // these letters are larger than the measured ones
       const shown = shortened(text, room, drawing), half = (Math.min(breadth(shown, drawing), room) * larger) / 2;
       label(shown, { x: Math.min(Math.max((scale.left + scale.right) / 2, half), W - half), y, "text-anchor": "middle", class: "axis" });
       if (shown !== text) parts.at(-1).append(svg("title", {}, text));

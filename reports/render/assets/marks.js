@@ -1,7 +1,7 @@
 // Elements of plots: marks, swatches, ticks and numbers.
 
 const RAISED = "⁰¹²³⁴⁵⁶⁷⁸⁹";
-const OUTLINES = { // on the square from −1 to 1
+const OUTLINES = { // path data of marks in the square from −1 to 1
   s: "M-.9-.9H.9V.9H-.9Z", D: "M0-1.2L1.2 0 0 1.2-1.2 0Z", "^": "M0-1.1L1.05 .9H-1.05Z", v: "M0 1.1L1.05-.9H-1.05Z",
   "<": "M-1.1 0L.9-1.05V1.05Z", ">": "M1.1 0L-.9-1.05V1.05Z", x: "M-.9-.9L.9 .9M-.9 .9L.9-.9", "+": "M-1 0H1M0-1V1",
   P: "M-.4-1.1H.4V-.4H1.1V.4H.4V1.1H-.4V.4H-1.1V-.4H-.4Z", _: "M-1 0H1", "|": "M0-1V1",
@@ -53,7 +53,7 @@ function breadth(text, node) {
   return pen.measureText(text).width;
 }
 
-/** Drop the middle of a text that is too wide: names differ at their ends. */
+/** Abbreviate a text that is too wide in its middle, since names differ at their ends. */
 function shortened(text, room, node) {
   let shown = text, letters = [...text];
   while (letters.length > 3 && breadth(shown, node) > room) {
@@ -69,7 +69,7 @@ const raised = (k) => (k < 0 ? "⁻" : "") + [...String(Math.abs(k))].map((d) =>
 const decade = (v) => Math.floor(Math.log10(Math.abs(v)) + 1e-9);
 const plain = (v) => v === 0 || (decade(v) >= -3 && decade(v) <= 4);
 
-/** Format a number, with a power of ten where it is very small or large. */
+/** Format a number, with a power of ten if it is very small or large. */
 function number(v, powered = !plain(v)) {
   if (v === 0) return "0";
   const size = decade(v);
@@ -96,7 +96,7 @@ function ticks([low, high], log, most) {
   return found;
 }
 
-/** Return the ticks in view, given ones or about `most`, with labels in one format. */
+/** Return the visible ticks, either prescribed or about `most`, with labels in one format. */
 function labelled({ view, log, ticks: set }, most) {
   const within = (v) => v >= view[0] && v <= view[1];
   if (set) return set.filter(([v]) => within(v));

@@ -19,7 +19,7 @@ async function line(run) {
   return Object.fromEntries(columns.map(([name, column]) => [name, pick(column)]));
 }
 
-/** Return the quoted path of the result folder, or DIR if the page lies elsewhere. */
+/** Return the quoted path of the result folder, or DIR if the page is not in one. */
 function folder() {
   const parts = decodeURIComponent(location.pathname).split("/");
   if (location.protocol !== "file:" || parts.at(-2) !== "report") return "DIR";

@@ -1,6 +1,6 @@
 // Tables: sorting, filtering, hiding and paging.
 
-const PAGE = 50; // rows, as many as the page was written with
+const PAGE = 50; // rows of a table on one page, equal to FIRST in html_page.py
 const NUMBER = /(\b\d[\d.]*e-\d+\b)/;
 const LEFTWARDS = /([\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+)/;
 const TEXT = 0, VALUE = 1, KIND = 2, SYMBOL = 3, AFTER = 4, TITLE = 5, RUNS = 6;
@@ -8,7 +8,7 @@ const TEXT = 0, VALUE = 1, KIND = 2, SYMBOL = 3, AFTER = 4, TITLE = 5, RUNS = 6;
 const field = (cell, i) => (typeof cell === "string" ? (i === TEXT ? cell : undefined) : cell[i]) ?? null;
 const textOf = (cell) => [SYMBOL, TEXT, AFTER].map((i) => field(cell, i) ?? "").join(" ");
 
-/** Allow line breaks after slashes and none within 1e-8, like html_page.breakable. */
+/** Allow line breaks after slashes and none within numbers, like html_page.breakable. */
 function breakable(text) {
   const split = (parts, pattern, wrap) => parts.flatMap((part) =>
     typeof part === "string" ? part.split(pattern).map((t, i) => (i % 2 ? wrap(t) : t)) : [part]);
@@ -17,7 +17,7 @@ function breakable(text) {
   return split(kept, LEFTWARDS, (t) => make("bdi", {}, t));
 }
 
-/** Build a table cell, like the macro `entry` of the page. */
+/** Build a table cell, like the macro `entry` of page.html.j2. */
 function entry(cell, isName) {
   const text = field(cell, TEXT), kind = field(cell, KIND) ?? "", links = field(cell, RUNS);
   const shown = kind === "void" ? [make("s", {}, text)] : breakable(text);
@@ -32,7 +32,7 @@ function entry(cell, isName) {
   return td;
 }
 
-/** Yield the measurements of a packed list: first, count, first, count … */
+/** Yield the indices in a packed list of measurements: first, count, first, count … */
 function* unpacked(packed) {
   for (let i = 0; i < packed.length; i += 2) {
     for (let k = 0; k < packed[i + 1]; k++) yield packed[i] + k;

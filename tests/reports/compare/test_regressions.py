@@ -181,7 +181,7 @@ def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
     assert why(repeats=1) == "no cell has two verified repeats in both folders"
     assert why(elsewhere) == "no cell was measured on equal machines in both folders"
     assert (
-        why(cases=2) == f"fewer than 3 cases of a solver, and of {CELLS} cells in all"
+        why(cases=2) == f"no solver has 3 cases, and there are fewer than {CELLS} cells"
     )
     assert why(cases=3) == ""
 

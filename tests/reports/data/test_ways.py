@@ -96,7 +96,7 @@ def test_solvers_alone_follow_form_by_form_and_are_marked_so(record, evidence):
     page = compose(evidence(four_ways(record)))
     first, second = page.sections[:2]
     assert [s.subject for s in first.statements] == ["all forms"]
-    assert second.title == "Solver times, form by form"
+    assert second.title == "Solver times for each form"
     assert "dualisation are not included" in second.prose[0]
     dual, primal = second.statements
     assert (dual.subject, primal.subject) == ("dual", "primal")
@@ -287,7 +287,7 @@ def test_the_first_sentence_is_the_same_in_the_report_and_in_plain_text(
     text = (tmp_path / "report/report.md").read_text("utf-8")
     assert told.replace("[", r"\[").replace("]", r"\]") in text
     first = text.index("From the mesh")
-    assert text.index("Solver times, form by form") > first
+    assert text.index("Solver times for each form") > first
     page = (tmp_path / "report/index.html").read_text("utf-8")
     shown = re.sub(r"<[^>]+>|\n", "", page[page.index('<dl class="answer">') :])
     assert shown.startswith(f"all forms{told}")
