@@ -220,7 +220,8 @@ def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
         unit = SerialisableOperator(2, "unit", {}, {"unit": lambda _: slices})
         qp = replace(
             QP_, P=unit, q=slices(QP_.q), A=DistributedColumns(QP_.A, ranks),
-            G=DistributedColumns(QP_.G[:0], ranks), h=QP_.h[:0], lb=slices(QP_.lb), ub=slices([0.25, np.inf]),
+            G=DistributedColumns(QP_.G[:0], ranks), h=QP_.h[:0],
+            lb=slices(QP_.lb), ub=slices([0.25, np.inf]),
         )  # fmt: skip
         return Share(qp, lambda s: s)
 
