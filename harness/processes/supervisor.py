@@ -277,7 +277,8 @@ class WorkerProcess:
                     elapsed_seconds=ended - started,
                     max_seconds=ended - sent,
                 )
-                # The worker waits now, so no file in shared memory can be missed.
+                # The worker is waiting, so it cannot close a file in shared memory
+                # before the file is recorded.
                 self._footprint.notice(self._tree())
                 self._send({"go": True})
             if is_shared:

@@ -137,7 +137,7 @@ class _Preparation:
 
 
 class ReasonError(Exception):
-    """Error of a solver whose `accepts` or result of `declines` has a wrong type."""
+    """Error of a solver: `accepts` or the result of `declines` has the wrong type."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:

@@ -37,7 +37,7 @@ RANK_TOLERANCE = 1e-14
 #: them helps depends on the QP: ECOS breaks down near the optimum, at a residual that
 #: varies by two orders of magnitude between neighbouring units.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
-#: a point is claimed solved if its KKT residuals are at most this times tol
+#: a point is reported as solved if its KKT residuals are at most this times tol
 CLAIM_FACTOR = 10.0
 
 

@@ -34,7 +34,7 @@ class AcceleratedGradient:
 
     The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
     residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
-    claimed solved. The start is the feasible point nearest to zero. Iterations are
+    reported as solved. The start is the feasible point nearest to zero. Iterations are
     steps; all products with P are counted.
     """
 

@@ -28,7 +28,7 @@ from mortarbench.solvers.common.conversion import check_positive, dense
 
 MAX_COMPONENTS = 5_000  #: limit of n, because P is converted to a dense matrix
 CLAIM_FACTOR = (
-    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
 )
 
 
@@ -37,7 +37,7 @@ class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") otherwise.
 
     Both routines end with the exact active set. `tol` bounds the optimality test of
-    bvls, and a point is claimed solved if its KKT residuals are within 5·tol. Fixed
+    bvls, and a point is reported as solved if its KKT residuals are within 5·tol. Fixed
     variables are eliminated, and the objective is scaled, because the test of bvls is
     absolute. scipy reports the iterations of bvls but not those of nnls.
     """

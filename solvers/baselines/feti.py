@@ -49,7 +49,7 @@ Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
 CLAIM_FACTOR = (
-    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
 )
 #: the solve gives up if its stopping bound falls below this times tol
 MIN_TOL_FACTOR = 1e-4
@@ -69,7 +69,8 @@ class FETI:
 
     The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If
     the KKT residuals exceed 5·tol there, this bound is lowered; only a point within
-    5·tol is claimed solved. Iterations are CG steps; all products with P are counted.
+    5·tol is reported as solved. Iterations are CG steps; all products with P are
+    counted.
     """
 
     preconditioner: Kind = (

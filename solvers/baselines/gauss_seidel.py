@@ -43,7 +43,7 @@ class GaussSeidel:
 
     The iteration stops when the norm of the natural map after a sweep is at most
     tol·‖q‖. If the KKT residuals exceed 5·tol there, this bound is lowered; only a
-    point within 5·tol is claimed solved. The start is the feasible point nearest to
+    point within 5·tol is reported as solved. The start is the feasible point nearest to
     zero. Iterations are sweeps; each costs about as much as one product with P.
     """
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 
-#: a point is claimed solved if its KKT residuals are ≤ this times tol
+#: a point is reported as solved if its KKT residuals are ≤ this times tol
 CLAIM_FACTOR = 5.0
 #: the solve gives up if its stopping bound falls below this times tol
 MIN_TOL_FACTOR = 1e-4
@@ -76,7 +76,7 @@ class Problem:
 
         The residuals are evaluated when the norm of the natural map falls below
         tol·‖q‖; if they are too large, this bound is lowered. Only a point within 5·tol
-        is claimed solved.
+        is reported as solved.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x

@@ -74,7 +74,7 @@ MAX_KAPPA = 1e10  #: value of ρ·aD⁻¹aᵀ beyond which ρ no longer grows
 PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
 CLAIM_FACTOR = (
-    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
 )
 
 
@@ -90,11 +90,11 @@ class PDAS:
     """In-house primal-dual active set method with Cholesky factors of the faces.
 
     `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
-    rounding prevents further progress, a point with residuals of up to 5·tol is claimed
-    solved. Iterations are linear solves. The counts are: factorisations (one per face,
-    plus one if unbounded variables are condensed), constraints that entered or left the
-    active set, steps that exchanged a single constraint, proximal centres, and products
-    with P.
+    rounding prevents further progress, a point with residuals of up to 5·tol is
+    reported as solved. Iterations are linear solves. The counts are: factorisations
+    (one per face, plus one if unbounded variables are condensed), constraints that
+    entered or left the active set, steps that exchanged a single constraint, proximal
+    centres, and products with P.
 
     The start is the point of the box nearest to zero, which means no contact in the
     primal and in the dual. (On the duals of contact problems, a start with all

@@ -53,8 +53,9 @@ class ProjectedGradient:
 
     The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
     residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
-    claimed solved. The start is the feasible point nearest to zero, and the first α is
-    that of an exact line search. Iterations are steps; all products with P are counted.
+    reported as solved. The start is the feasible point nearest to zero, and the first α
+    is that of an exact line search. Iterations are steps; all products with P are
+    counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)

@@ -44,7 +44,7 @@ class Direct:
     """In-house SMALBE for small problems, with updated Cholesky factors of faces.
 
     The loop ends when the KKT residuals of the QP are within `tol` or no longer
-    decrease. The point is claimed solved if they are within 5·tol.
+    decrease. The point is reported as solved if they are within 5·tol.
     """
 
     max_solves: int = 10_000  #: limit of all solves with factors of faces

@@ -46,7 +46,7 @@ STEPS = {
     "p": "proportioning",
     "n": "newton",
 }
-#: a point is claimed solved if its KKT residuals are at most this times the tolerance
+#: a point is reported as solved if its KKT residuals are at most this times tol
 CLAIM_FACTOR = 5.0
 #: Additional factors by which the tolerance is tightened if a residual exceeds it,
 #: because the residual decreases more slowly than the projected gradient ‖g^P‖. The

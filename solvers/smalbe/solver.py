@@ -38,7 +38,7 @@ class SMALBE(Options):
     Discs, such as bounds of friction forces in 3D, are accepted too.
 
     `tol` bounds ‖g^P‖/‖b‖, with the projected gradient g^P of the projected problem,
-    and ‖Gx − e‖/‖e‖. A point is claimed solved only if the KKT residuals of the
+    and ‖Gx − e‖/‖e‖. A point is reported as solved only if the KKT residuals of the
     original QP are also within 5·tol.
     """
 
