@@ -1,7 +1,7 @@
-"""Proof of the optimal value of a small QP, for points that residuals cannot decide.
+"""Proof of the optimal value of a small QP, used if residuals do not decide a verdict.
 
 Residuals bound the error of the objective f only through two unknown quantities: the
-distance of the solution, and the size of the true multipliers. A reference solver,
+distance from the solution, and the size of the true multipliers. A reference solver,
 which is not under test, returns a point x̂ with multipliers λ̂ = (ŷ, ẑ, ẑ_box), ẑ ≥ 0.
 This point is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the
 Lagrangian L, convexity implies for the solution x* and the optimal value f* = f(x*)

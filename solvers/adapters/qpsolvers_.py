@@ -117,8 +117,9 @@ class QPSolvers:
             "own code, which claims that strictly convex ones are unbounded "
             "(conformance, shape 'unconstrained'); such QPs are declined.",
             "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
-            "ecos reaches half of the digits (use our adapter `ecos`). pyqpmad, which "
-            "is not installed, returns wrong multipliers for fixed variables.",
+            "ecos attains only half of the requested digits; use our adapter `ecos` "
+            "instead. pyqpmad, which is not installed, returns wrong multipliers for "
+            "fixed variables.",
         ),
     )
 

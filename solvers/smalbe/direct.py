@@ -58,7 +58,7 @@ class Direct:
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
             f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P, `smalbe` "
-            "is faster from 100 to 200 unknowns on",
+            "becomes faster between 100 and 200 unknowns",
         ),
     )
 
