@@ -123,7 +123,7 @@ class Case(plugin.Case):
 
     @TURN
     def quantities(self, solution: Solution) -> dict[str, Any]:
-        """Return physical results of a point in SI units, such as its energy."""
+        """Return physical results of a solution, such as its energy, in SI units."""
         return dict(plain(self.family_case.quantities(solution)))
 
     @TURN

@@ -39,8 +39,9 @@ powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted 
 opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
 verdict nor answer should change.
 
-The units are those of the paper's benchmark, rounded to powers of two. They multiply
-the non-dimensional quantities by these factors:
+A change of units multiplies the non-dimensional quantities by the factors below. They
+follow from the load (10⁸ N/m) and the length (2 m) of the paper's benchmark, expressed
+in the new units and rounded to powers of two:
 
 """
 

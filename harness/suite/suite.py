@@ -377,7 +377,7 @@ def _on_ranks(
     if counts != [1] and sequences:
         raise InputError(
             f"ranks = {shown(counts)}: a sequence runs in one process; expected "
-            "problems without sequence, or no ranks"
+            "problems without a sequence, or no ranks"
         )
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
     if counts != [1] and not any(able.values()):

@@ -129,7 +129,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
 
 
 def _file_error(e: OSError, path: Path) -> str:
-    """Return the one-line message for an error of the operating system on a file."""
+    """Return the one-line message for an operating-system error concerning a file."""
     if isinstance(e, FileExistsError | NotADirectoryError):
         path = next((p for p in (path, *path.parents) if p.is_file()), path)
         return f"{path}: a file exists where a folder is needed; move the file away"

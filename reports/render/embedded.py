@@ -112,9 +112,10 @@ def table(t: Table, rows: Rows) -> Data:
 
 
 def cell(c: Cell, rows: Rows) -> Any:
-    """Return the text of a plain cell, or else all fields up to the last nonempty one.
+    """Return the text if a cell has no other data, otherwise a list of its fields.
 
-    The last field contains the measurements as packed by `spans`.
+    Empty fields at the end of the list are omitted. The seventh field contains the
+    measurements as packed by `spans`.
     """
     value = None if c.value is None else float(f"{c.value:.9g}")
     runs = runs_of(c, rows)

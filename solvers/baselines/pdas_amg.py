@@ -46,9 +46,9 @@ COARSEST = 100
 class PDASAMG(PDAS):
     """`pdas` with conjugate gradients and algebraic multigrid on the faces.
 
-    P must be sparse. If P does not annihilate translations, the near-kernel vector is
-    constant. The counts are those of `pdas`, where factorisations are multigrid
-    set-ups, and the steps of conjugate gradients.
+    P must be sparse. The near-kernel consists of the translations if P annihilates
+    them, otherwise of a constant vector. The counts are those of `pdas`, with multigrid
+    set-ups counted as factorisations, and the number of conjugate-gradient steps.
     """
 
     about: ClassVar[About] = About(
