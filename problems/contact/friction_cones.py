@@ -92,7 +92,7 @@ class FrictionalContact:
             object.__setattr__(self, "A", no_rows(self.q.size))
 
     def check_convex(self) -> None:
-        """Raise InputError if W has a negative eigenvalue that is not rounding."""
+        """Raise InputError if W has a negative eigenvalue not due to rounding."""
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
@@ -115,7 +115,7 @@ class FrictionalContact:
 
     @property
     def rank(self) -> int | None:
-        """Rank of W; None if W is large."""
+        """Rank of W; None if W has more than `MAX_DENSE_ROWS` rows."""
         if self._eigenvalues.size < self.q.size:
             return None
         return int((self._eigenvalues > RANK_TOLERANCE * self.stiffness).sum())
@@ -250,7 +250,9 @@ def coulomb_steps(
 
 
 class _ProximalMethod:
-    """Solver of the convex problems, with proximal steps once a solve has failed."""
+    """Solver of the convex problems; takes proximal steps once `is_proximal` is set.
+
+    A failed solve sets `is_proximal`."""
 
     def __init__(
         self, contact: FrictionalContact, solve: Callable[[QP], Solution]

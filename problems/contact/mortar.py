@@ -31,7 +31,7 @@ The integrals run over the part of the slave that the master covers. They are su
 integrand is smooth, with three Gauss points each.
 
 *Overlap.* A point p lies on the ray of ξ if f(ξ) = (x(ξ) − p) × (N_1 n_1 + N_2 n_2)
-vanishes, a quadratic of ξ. The rays of the two nodes enclose the points with
+vanishes; f is quadratic in ξ. The rays of the two nodes enclose the points with
 f(−1) ≥ 0 ≥ f(1) (on the near side of their intersection). The master segment is clipped
 by these two lines, and its remaining ends are projected by the unique root of f in
 [−1, 1].
@@ -197,7 +197,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
 
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:
-    """Return all integration segments, without limits of angle and distance."""
+    """Return all integration segments, without limits on angle or distance."""
     e, m = facing_segments(slave, master)
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
@@ -252,7 +252,7 @@ def cast_rays(
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
     field += N[..., 1:] * slave.node_normal[k][:, None]
-    n = unit(field, slave.normal[e][:, None])  # opposite end normals: ν may vanish
+    n = unit(field, slave.normal[e][:, None])  # ν may vanish between opposite normals
 
     A, B = master.start[m][:, None], master.end[m][:, None]
     f_A, f_B = cross(x - A, n), cross(x - B, n)  # opposite signs: the ray hits AB

@@ -145,7 +145,7 @@ class Iterate(NamedTuple, Generic[P]):
 
     problem: P
     friction: Friction  #: friction with the bound of this iterate
-    solution: Callable[[], Solution]  #: returns the dual solution, solved once
+    solution: Callable[[], Solution]  #: returns the dual solution, computed only once
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,7 +138,8 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.class_of]
 
 
-MAX_IMBALANCE = 1.1  #: acceptable ratio of largest to mean work, or size, of the ranks
+#: largest accepted ratio of the largest to the mean work (or size) of the ranks
+MAX_IMBALANCE = 1.1
 METIS_SEEDS = 12  #: number of seeds to try
 SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
 

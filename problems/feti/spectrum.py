@@ -48,8 +48,8 @@ class Spectrum(NamedTuple):
 
     smallest: float
     largest: float
-    smallest_error: float  #: bound of the distance from `smallest` to an eigenvalue
-    largest_error: float  #: bound of the distance from `largest` to an eigenvalue
+    smallest_error: float  #: bound on the distance from `smallest` to an eigenvalue
+    largest_error: float  #: bound on the distance from `largest` to an eigenvalue
     steps: int  #: products with F
 
     @property
@@ -59,7 +59,7 @@ class Spectrum(NamedTuple):
 
     @property
     def condition_error(self) -> float:
-        """First-order bound of the error of κ from the errors of both eigenvalues."""
+        """First-order bound on the error of κ, from the errors of both eigenvalues."""
         relative = self.smallest_error / self.smallest
         return self.condition * (relative + self.largest_error / self.largest)
 
@@ -102,7 +102,7 @@ def spectrum(
     # image of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # arbitrary, with a component on each eigenvector
+    v = P(np.sin(1.0 + local**2))  # arbitrary, not orthogonal to any eigenvector
     V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()

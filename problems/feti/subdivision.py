@@ -255,7 +255,7 @@ def half_discs_in_blocks(
 ) -> ListedSubdivision:
     """Return the subdivision of half discs into blocks; perimeter nodes are listed.
 
-    blocks : for each disc, the ranges of rings and sectors of cells of each block
+    blocks : for each disc, the ranges of rings and of angles that form each block
     """
     first = np.cumsum([0, *(disc.nodes for disc in discs)])
     body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])

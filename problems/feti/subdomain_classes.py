@@ -1,8 +1,8 @@
 """Classes of congruent subdomains, and bodies decomposed into subdomains (Total FETI).
 
 In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
-subdomain floats; supports, gluing and contact are rows of one matrix B. So the kernel
-of every stiffness matrix is known in advance: the rigid motions.
+subdomain floats; supports, gluing and contact are rows of one matrix B. The kernel of
+every stiffness matrix is hence known in advance: the rigid motions.
 
 The torn unknowns v (N,) are the displacement components of all copies of all nodes, in
 the frames of their subdomains, numbered by subdomain and then by node. Subdomains that
@@ -311,9 +311,10 @@ class Clusters:
 
     @cached_property
     def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
-        """Unknowns (μ, α) ordered by clusters: (μ_1, α_1, μ_2, α_2, …).
+        """Order of the unknowns (μ, α) by clusters, (μ_1, α_1, μ_2, α_2, …).
 
-        Indices (c + r,) of these unknowns in (μ, α), and their number per cluster.
+        The order is given as indices (c + r,) in (μ, α); the second array is the number
+        of unknowns of each cluster.
         """
         start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
         parts = [
@@ -342,7 +343,7 @@ class Clusters:
             gram += J @ (modes.T @ modes).toarray() @ J.T
             motions.append(J @ (modes.T @ domains.classes[k].R))
         CR = np.concatenate(motions, axis=1)
-        # subdomains joined by faces move as one body: as many motions as one of them
+        # subdomains joined by faces move as one body, with the motions of one subdomain
         last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
         N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
         size, modes = np.linalg.eigh(gram)
