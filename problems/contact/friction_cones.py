@@ -68,7 +68,7 @@ class FrictionalContact:
     Raises
     ------
     InputError
-        If W is not symmetric, so that the problems of the loops are not convex.
+        If W is not symmetric, because the problems of the loops would not be convex.
 
     """
 
@@ -252,7 +252,8 @@ def coulomb_steps(
 class _ProximalMethod:
     """Solver of the convex problems; takes proximal steps once `is_proximal` is set.
 
-    A failed solve sets `is_proximal`."""
+    A failed solve sets `is_proximal`.
+    """
 
     def __init__(
         self, contact: FrictionalContact, solve: Callable[[QP], Solution]

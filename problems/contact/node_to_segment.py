@@ -17,7 +17,7 @@ Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
     T u,    T = [−t at s, +N_a t at a],
 
-so that the friction forces are −Tᵀλ_t, as the contact forces are −Bᵀλ.
+and the friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
 Beyond an end of the master, its last node is the closest point, with the normal of the
 last segment.

@@ -487,7 +487,7 @@ def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of subdomains, and the cells as indices into these nodes."""
+    """Return the nodes of `subdomains`, and their cells as indices into these nodes."""
     torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [

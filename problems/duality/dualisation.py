@@ -197,7 +197,7 @@ def _dual(
     free: Vector,
     sets: tuple[ConvexSet, ...],
 ) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over sets.
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over `sets`.
 
     free : K⁺f
     """

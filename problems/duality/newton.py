@@ -31,7 +31,7 @@ descent direction of the exact penalty function (Nocedal and Wright, (18.27))
 and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A
 full step that halves the smallest residual so far is accepted without this test,
 because curved constraints may increase φ near the solution (Maratos effect). Each such
-step halves the smallest residual, so that only finitely many occur.
+step halves the smallest residual; hence only finitely many occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
 segments. If the iteration does not converge, pressing nodes (those with multipliers
@@ -393,8 +393,8 @@ class NewtonPath:
     def _rounding(self, at: Configuration, lam: Vector, iteration: Iteration) -> float:
         """Return a bound on the rounding error of `residual`.
 
-        Strains are differences of displacements, so that the rounding error of the
-        forces Ku is proportional to |K||u|, however small Ku is.
+        Strains are differences of displacements. The rounding error of the forces Ku is
+        hence proportional to |K||u|, however small Ku is.
         """
         rounded = self._free_norm(abs(iteration.tangent.K) @ np.abs(at.u))
         return FORCE_ROUNDING * rounded / self._forces(at, lam, iteration.load_factor)
@@ -530,7 +530,14 @@ class NewtonPath:
         weight: float,
         best: float,
     ) -> tuple[Configuration, float, float]:
-        """Return the new configuration, the step length and the residual."""
+        """Return the new configuration, the step length and the residual.
+
+        Parameters
+        ----------
+        weight : weight w of the penalty in φ
+        best : smallest residual so far
+
+        """
         load_factor = iteration.load_factor
         d = iteration.answer.x - at.u
         merit = _merit(at, weight)

@@ -22,8 +22,7 @@ from mortarbench.problems.fem.mesh import Nodes
 PARTS = 4
 #: fixing nodes in space count as collinear if their largest distance from the line of
 #: best fit is below this multiple of the largest distance of a node of the last part.
-#: The ratio of the two distances is at least 0.35 for blocks, and may be 0 for bars that
-#: are one cell wide
+#: This ratio is at least 0.35 for blocks, and may be 0 for bars that are one cell wide
 MIN_DISTANCE = 0.25
 
 

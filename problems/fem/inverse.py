@@ -7,7 +7,7 @@ With ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
-so that K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
+hence K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
 factor. K⁺ is not the Moore-Penrose inverse, but if the load is balanced (Rᵀf = 0), the
 solutions K⁺f of the two inverses differ only by a rigid motion. For supported bodies,
 K⁺ is K_ff⁻¹ on the free components f and zero on the prescribed ones.

@@ -410,11 +410,11 @@ def average_free(
 ) -> Composition:
     """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
 
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding errors would let the
-    iterates of preconditioned conjugate gradients drift along these multipliers. The
-    range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 because
-    C = LᵀB for some L. Hence the factors I − Π change the image of the preconditioner
-    only by such multipliers, and remove its component along them.
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ. Rounding errors would therefore let
+    the iterates of preconditioned conjugate gradients drift along these multipliers.
+    The range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0
+    because C = LᵀB for some L. Hence the factors I − Π change the image of the
+    preconditioner only by such multipliers, and remove its component along them.
 
     weights : (M,) diagonal of W, equal for all subdomains of a class
     """

@@ -9,9 +9,9 @@ spectra are those of
     P M P F               in the inner product  xᵀF y,
 
 without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
-of P, so that the same Lanczos process applies (Parlett 1998, Chapter 13). Each vector
-is orthogonalised against its two predecessors, as in the recurrence, then against all
-previous vectors, which excludes spurious copies of eigenvalues. Each vector is also
+of P, and the same Lanczos process applies to both (Parlett 1998, Chapter 13). Each new
+vector is orthogonalised against its two predecessors, as in the recurrence, then
+against all previous vectors, which excludes spurious copies of eigenvalues. It is also
 projected by P, because components in ker P due to rounding would grow.
 
 The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue.
@@ -179,7 +179,7 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
     Parameters
     ----------
     F : operator with rows B, which may be linearly dependent (redundant gluing)
-    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
+    G : RᵀBᵀ (r, m) of full rank r, which may be 0
 
     """
     within = F.onto_rows()

@@ -73,7 +73,7 @@ def grid_positions(
     return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
 
 
-Block = tuple[slice, slice]  #: rows and columns of cells
+Block = tuple[slice, slice]  #: ranges of rows and columns of cells
 #: lengths of cell sides, first along columns, then along rows; each length is the
 #: product of two factors, one for the row and one for the column of the cell
 Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
