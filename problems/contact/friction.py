@@ -113,7 +113,7 @@ def friction_of(
 def coulomb_fixed_point(
     first: Friction, normal: Callable[[Friction], Vector], step: int
 ) -> list[Friction]:
-    """Solve Coulomb's law by fixed-point iteration; return friction per iterate.
+    """Solve Coulomb's law by fixed-point iteration; return a `Friction` per iterate.
 
     In all iterates except the last, `Friction.unsettled` is the residual.
 

@@ -17,14 +17,14 @@ node j
     D_jk = ∫ Φ_j N_k ν,   M_jl = ∫ Φ_j N^m_l ν,   g̃_j = ∫ Φ_j |ν| g.
 
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
-−Φ_j ν on the master at x(ξ) + g n, along the same line. Up to rounding, the
-forces of a row are hence in equilibrium and have no moment, even on curved sides. (With
-n_j outside the integrals, the moments would be O(h²). A body supported by contact alone
-would then rotate until a row far from the contact, at the end of an arc, balances the
-moments of the active rows.) Because ν is not normalised, the gap
-has the weight |ν| = 1 − O(h²). In return, the integrands of D are polynomials, which
-the Gauss rule integrates exactly: D is independent of the position of the master's
-nodes, and a row of the dual basis acts on the slave along n_j.
+−Φ_j ν on the master at x(ξ) + g n, along the same line. Up to rounding, the forces of a
+row are hence in equilibrium and have no moment, even on curved sides. (With n_j outside
+the integrals, the moments would be O(h²). A body supported by contact alone would then
+rotate until a row far from the contact, at the end of an arc, balances the moments of
+the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
+In return, the integrands of D are polynomials, which the Gauss rule integrates exactly:
+D is independent of the position of the master's nodes, and a row of the dual basis acts
+on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the

@@ -177,9 +177,9 @@ def distributed_qp(
     """Return the distributed dual QP; all ranks must call this function together.
 
     If the QP depends on solutions of previous problems, the rounding errors in its data
-    depend on the number of ranks. In this case, the digest of the QP
-    is computed from the first of these problems and their number, so that it is
-    independent of the number of ranks.
+    depend on the number of ranks. In this case, the digest of the QP is computed from
+    the first of these problems and their number, so that it is independent of the
+    number of ranks.
 
     Parameters
     ----------

@@ -26,10 +26,10 @@ Moore-Penrose inverse is used, so that λ stays free of components in ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
 only where contact touches supports. There they would adapt the weights of the equality
-rows to contact rows that are mostly inactive. The final face
-consists of the multipliers that are free at the solution. In
-beam-ring/Nr=8/Nh=5/steps=1/feti=8, the condition number on this face is 58 with these
-entries and 3.7 without them. It is also 3.7 if B contains only the rows of the face.
+rows to contact rows that are mostly inactive. The final face consists of the
+multipliers that are free at the solution. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
+condition number on this face is 58 with these entries and 3.7 without them. It is also
+3.7 if B contains only the rows of the face.
 """
 
 from __future__ import annotations
@@ -555,7 +555,7 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop rounding errors, and couplings of contact with equality rows, in B W Bᵀ."""
+    """Drop rounding errors, and couplings of contact with equality rows, from B W Bᵀ."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])

@@ -102,7 +102,7 @@ def spectrum(
     # image of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # arbitrary, not orthogonal to any eigenvector
+    v = P(np.sin(1.0 + local**2))  # arbitrary; rarely orthogonal to eigenvectors
     V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
