@@ -133,7 +133,7 @@ def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work (S,) of a product for each subdomain: the entries of its block."""
+    """Return the work (S,) of a product: the number of entries of each dense block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 

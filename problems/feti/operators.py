@@ -21,8 +21,8 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
 condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
 or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its diagonal
-block for the equality rows is itself block diagonal, with one block per node; its
-Moore-Penrose inverse is used, so that λ stays free of components in ker Bᵀ.
+block for the equality rows is itself block diagonal, with one block per node. The
+Moore-Penrose inverse of this block keeps λ free of components in ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
 only where contact touches supports. There they would adapt the weights of the equality
@@ -555,7 +555,7 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop rounding errors, and couplings of contact with equality rows, from B W Bᵀ."""
+    """Drop rounding errors and couplings of contact with equality rows in B W Bᵀ."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])

@@ -163,7 +163,7 @@ class Layout:
         return np.asarray(columns * rows, dtype=np.int64)
 
     def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
-        """Return the nodes of some blocks, row by row."""
+        """Return the nodes of given blocks, row by row."""
         left, low, columns, rows = self.corner(subdomains)
         start = np.concatenate([[0], np.cumsum(columns * rows)])
         of = np.repeat(np.arange(subdomains.size), columns * rows)
@@ -214,7 +214,7 @@ class Layout:
         return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
 
     def position(self, node: Nodes) -> Points:
-        """Return the points of some nodes, (k, 2)."""
+        """Return the points of given nodes, (k, 2)."""
         points, body = np.empty((node.size, 2)), self.places(node).body
         for b in np.unique(body):
             of_grid = body == b

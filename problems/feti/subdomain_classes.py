@@ -343,7 +343,8 @@ class Clusters:
             gram += J @ (modes.T @ modes).toarray() @ J.T
             motions.append(J @ (modes.T @ domains.classes[k].R))
         CR = np.concatenate(motions, axis=1)
-        # subdomains joined by faces move as one body, with as many motions as one of them
+        # subdomains joined by faces move as one body, with as many motions as one
+        # subdomain
         last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
         N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
         size, modes = np.linalg.eigh(gram)

@@ -255,7 +255,7 @@ class LocalSubdomains:
         return self._of_nodes(self._distinct[1])[self.free]
 
     def _of_nodes(self, node: Nodes) -> Nodes:
-        """Return the components of some nodes, node by node."""
+        """Return the components of given nodes, node by node."""
         d = self.problem.components
         return np.asarray((d * node[:, None] + np.arange(d)).ravel())
 
@@ -720,7 +720,7 @@ def _support_rows(local: LocalSubdomains) -> Entries:
 
 
 class _Copies(NamedTuple):
-    """Copies of some nodes on all ranks, in the order of the nodes."""
+    """Copies of given nodes on all ranks, in the order of the nodes."""
 
     node: NDArray[np.int64]  #: (k,) index in the list of nodes
     copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
@@ -730,7 +730,7 @@ class _Copies(NamedTuple):
 
 
 def _local_copies(local: LocalSubdomains, node: Nodes) -> _Copies:
-    """Return the copies of some nodes on all ranks."""
+    """Return the copies of given nodes on all ranks."""
     of = local.problem.layout
     multiplicity = of.multiplicity(node)
     place = np.repeat(np.arange(multiplicity.size), multiplicity)
