@@ -103,7 +103,7 @@ class FrictionalContact:
 
     @cached_property
     def _eigenvalues(self) -> Vector:
-        """All eigenvalues of W, ascending; only the largest if W is large."""
+        """Eigenvalues of W, ascending; only the largest above `MAX_DENSE_ROWS`."""
         if self.q.size <= MAX_DENSE_ROWS:
             return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
         return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
@@ -276,7 +276,7 @@ class _ProximalMethod:
 
 
 def _successor(contact: FrictionalContact, loop: str, s: Solution) -> QP:
-    """Return the next problem of the sequence from the solution of the last one."""
+    """Return the next problem, given the solution s of its predecessor."""
     if loop == "tresca":
         normal = np.maximum(s.x[contact.cones.index[:, 0]], 0.0)
         return contact.tresca_step(contact.mu * normal)

@@ -41,7 +41,7 @@ class RigidBody(Protocol):
 
 @dataclass(frozen=True)
 class RigidPlane:
-    """The half space below a plane."""
+    """A half space, bounded by a plane."""
 
     point: tuple[float, ...]  #: a point on the plane, m
     normal: tuple[float, ...]  #: outward unit normal

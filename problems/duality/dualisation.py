@@ -33,7 +33,7 @@ from mortarbench.problems.fem.inverse import GeneralisedInverse
 
 
 class Transformed(NamedTuple):
-    """A transformed QP with its inverse map and the relation of the objectives."""
+    """A transformed QP with its inverse map and the relation between the objectives."""
 
     qp: QP
     recover: Callable[[Solution], Solution]

@@ -343,7 +343,7 @@ class ContactSolution(Protocol):
 
 
 def no_further_results(solution: ContactSolution) -> dict[str, Any]:
-    """Return no quantities beyond those common to all elastic bodies."""
+    """Return {}: no quantities beyond those common to all elastic bodies."""
     return {}
 
 

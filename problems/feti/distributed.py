@@ -133,7 +133,7 @@ def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work (S,) of a product: the number of entries of each dense block."""
+    """Return the work (S,) of a product: the entries of each subdomain's block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 
@@ -719,7 +719,7 @@ def _exchange_blocks(
     out: Sequence[tuple[int, Dense]],
     coming: Sequence[tuple[int, tuple[int, ...]]],
 ) -> list[Dense]:
-    """Send the arrays `out` to ranks; receive arrays of the shapes in `coming`."""
+    """Send each array of `out` to its rank; receive arrays with shapes `coming`."""
     arrays = [np.empty(shape) for _, shape in coming]
     requests = [
         ranks.comm.Irecv(array, source=rank)

@@ -468,7 +468,7 @@ def _column_places(
 
 
 def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
-    """Compute the joints of clusters from the blocks (K⁺)_bb of the groups."""
+    """Compute the term −V M⁺Vᵀ of clusters from the blocks (K⁺)_bb of the groups."""
     columns, compliance, end = list[Dense](), list[Dense](), 0
     modes = clusters.domains.modes
     first_motion = np.cumsum(modes) - modes

@@ -202,14 +202,14 @@ class Layout:
         return cells_of_block(int(columns[0]), int(rows[0]))
 
     def places(self, node: Nodes) -> Places:
-        """Return the positions of nodes by their numbers (k,)."""
+        """Return the grid positions of the nodes with given numbers (k,)."""
         body = np.searchsorted(self.node_start, node, side="right") - 1
         wide = np.array([grid.columns.size for grid in self.grids])
         row, column = np.divmod(node - self.node_start[body], wide[body])
         return Places(body, column, row)
 
     def _number(self, at: Places) -> Nodes:
-        """Return the numbers (k,) of nodes by their positions."""
+        """Return the numbers (k,) of the nodes at given positions."""
         wide = np.array([grid.columns.size for grid in self.grids])
         return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
 

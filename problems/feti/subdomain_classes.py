@@ -153,7 +153,7 @@ class SubdomainClass:
 
     @property
     def _fixed(self) -> csc_array:
-        """K_ρ, (n_k, n_k)."""
+        """K_ρ (n_k, n_k), the regularised stiffness matrix."""
         p = self.fixing.size
         where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
         added = csc_array((self._fixing_term.ravel(), where), shape=self.K.shape)
@@ -168,7 +168,7 @@ class Condensed(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
+    """The Schur complement S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
 
     K_hh: csr_array
     K_ih: csr_array
@@ -210,7 +210,7 @@ class Subdomains:
 
     @cached_property
     def kernel(self) -> csr_array:
-        """R = diag(R_1 … R_S), (N, Σr)."""
+        """R = diag(R_1 … R_S) (N, Σr), the rigid motions of all subdomains."""
         modes, sizes = self.modes, np.diff(self.start)
         entries = np.concatenate([self.classes[k].R.ravel() for k in self.class_of])
         per_row = np.repeat(modes, sizes)
@@ -290,7 +290,7 @@ class Clusters:
 
     @cached_property
     def averages(self) -> csr_array:
-        """C, (c, N)."""
+        """C (c, N), which maps torn unknowns to differences of averages."""
         faces = block_diag([self.faces[k] for k in self.domains.class_of], format="csc")
         return csr_array(self.joints @ faces.T)
 
@@ -367,7 +367,7 @@ class Clusters:
 
     @cached_property
     def kernel(self) -> csr_array:
-        """RN, (N, r̃)."""
+        """RN (N, r̃), a basis of the rigid motions of all clusters."""
         return csr_array(self.domains.kernel @ self.motions)
 
     def saddle_inverses(self, compliance: Sequence[Dense]) -> list[Vector]:

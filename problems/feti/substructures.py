@@ -27,7 +27,7 @@ class LocalProblems:
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n) from global components to torn unknowns."""
+        """T (N, n), which maps global components to torn unknowns."""
         return self.torn.spread
 
     @property
