@@ -158,7 +158,7 @@ def check_friction(
 def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
     """Return the rows of polygons around discs, as arguments of `linprog`.
 
-    The result is empty in the plane, where bounds of the unknowns suffice.
+    The result is empty in the plane, where bounds on the unknowns suffice.
 
     before, after : numbers of other unknowns before and after those of friction
     """

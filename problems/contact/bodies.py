@@ -32,7 +32,7 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """A pair of sides that may touch; each is a chain of nodes, or faces in space."""
+    """A pair of sides that may touch: chains of nodes in the plane, faces in space."""
 
     slave: Nodes
     master: Nodes  #: empty for a rigid master
@@ -62,7 +62,7 @@ class ContactPair(NamedTuple):
 
     @property
     def nodes(self) -> Nodes:
-        """Nodes of both sides; some are repeated."""
+        """Nodes of both sides, possibly with repetitions."""
         return np.concatenate([self.slave.ravel(), self.master.ravel()])
 
 
@@ -245,7 +245,7 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
 
     """
     prescribed = bodies.B_D.indices
-    # a factorisation may not detect a singular K, because rounding can make it regular
+    # a factorisation can fail to detect a singular K, which rounding may make regular
     if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
             "the supports allow a rigid motion of some body, so dual-bounds does not "

@@ -5,10 +5,10 @@ attains its bound; where |q| is smaller, the sides stick:
 
     |q| ≤ bound + mu·p
 
-with a constant `bound` (Tresca) or a multiple of the pressure p (Coulomb). The force
-λ_t of a discrete row satisfies  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is the
-length of the slave side assigned to the node of the row and λ_n the multiplier of its
-contact row.
+with the pressure p, where mu = 0 under Tresca's law and bound = 0 under Coulomb's. The
+force λ_t of a discrete row satisfies  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is
+the length of the slave side assigned to the node of the row, and λ_n is the multiplier
+of the contact row of this node.
 
 Coulomb's law does not derive from a potential. It is solved by fixed-point iteration
 over problems with Tresca's law, each with the bound g = mu·λ_n from the solution of its
@@ -113,7 +113,7 @@ def friction_of(
 def coulomb_fixed_point(
     first: Friction, normal: Callable[[Friction], Vector], step: int
 ) -> list[Friction]:
-    """Solve Coulomb's law by fixed-point iteration; return friction for each iterate.
+    """Solve Coulomb's law by fixed-point iteration; return a `Friction` per iterate.
 
     In all iterates except the last, `Friction.unsettled` is the residual.
 

@@ -68,7 +68,7 @@ class FrictionalContact:
     Raises
     ------
     InputError
-        If W is not symmetric, so that the problems of the loops are not convex.
+        If W is not symmetric, because the problems of the loops would not be convex.
 
     """
 
@@ -92,7 +92,7 @@ class FrictionalContact:
             object.__setattr__(self, "A", no_rows(self.q.size))
 
     def check_convex(self) -> None:
-        """Raise InputError if W has a negative eigenvalue that is not rounding."""
+        """Raise InputError if W has a negative eigenvalue not due to rounding."""
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
@@ -103,7 +103,7 @@ class FrictionalContact:
 
     @cached_property
     def _eigenvalues(self) -> Vector:
-        """All eigenvalues of W, ascending; only the largest if W is large."""
+        """Eigenvalues of W, ascending; only the largest above `MAX_DENSE_ROWS`."""
         if self.q.size <= MAX_DENSE_ROWS:
             return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
         return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
@@ -115,7 +115,7 @@ class FrictionalContact:
 
     @property
     def rank(self) -> int | None:
-        """Rank of W; None if W is large."""
+        """Rank of W; None if W has more than `MAX_DENSE_ROWS` rows."""
         if self._eigenvalues.size < self.q.size:
             return None
         return int((self._eigenvalues > RANK_TOLERANCE * self.stiffness).sum())
@@ -250,7 +250,10 @@ def coulomb_steps(
 
 
 class _ProximalMethod:
-    """Solver of the convex problems, with proximal steps once a solve has failed."""
+    """Solver of the convex problems; takes proximal steps once `is_proximal` is set.
+
+    A failed solve sets `is_proximal`.
+    """
 
     def __init__(
         self, contact: FrictionalContact, solve: Callable[[QP], Solution]
@@ -273,7 +276,7 @@ class _ProximalMethod:
 
 
 def _successor(contact: FrictionalContact, loop: str, s: Solution) -> QP:
-    """Return the next problem of the sequence from the solution of the last one."""
+    """Return the next problem, given the solution s of its predecessor."""
     if loop == "tresca":
         normal = np.maximum(s.x[contact.cones.index[:, 0]], 0.0)
         return contact.tresca_step(contact.mu * normal)

@@ -42,7 +42,7 @@ def linearisation(
 ) -> Callable[[Vector], ContactRows]:
     """Return a function that maps a displacement (n,) in m to the rows of all pairs.
 
-    This function raises InputError if the displacement is zero and no pair has a row.
+    The returned function raises InputError at zero displacement if no pair has a row.
 
     contact : "nts" (node to segment, or node to face in space) or "mortar"; pairs with
         a rigid master have nodal rows

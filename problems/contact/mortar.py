@@ -17,8 +17,8 @@ node j
     D_jk = ∫ Φ_j N_k ν,   M_jl = ∫ Φ_j N^m_l ν,   g̃_j = ∫ Φ_j |ν| g.
 
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
-−Φ_j ν on the master at x(ξ) + g n, along the same line. So the forces of a row are in
-equilibrium and have no moment, up to rounding, even on curved sides. (With n_j outside
+−Φ_j ν on the master at x(ξ) + g n, along the same line. Up to rounding, the forces of a
+row are hence in equilibrium and have no moment, even on curved sides. (With n_j outside
 the integrals, the moments would be O(h²). A body supported by contact alone would then
 rotate until a row far from the contact, at the end of an arc, balances the moments of
 the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
@@ -31,13 +31,13 @@ The integrals run over the part of the slave that the master covers. They are su
 integrand is smooth, with three Gauss points each.
 
 *Overlap.* A point p lies on the ray of ξ if f(ξ) = (x(ξ) − p) × (N_1 n_1 + N_2 n_2)
-vanishes, a quadratic of ξ. The rays of the two nodes enclose the points with
+vanishes; f is quadratic in ξ. The rays of the two nodes enclose the points with
 f(−1) ≥ 0 ≥ f(1) (on the near side of their intersection). The master segment is clipped
 by these two lines, and its remaining ends are projected by the unique root of f in
 [−1, 1].
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is biorthogonal on the covered part of each
-segment, ∫ Φ_j N_k = δ_jk ∫ N_k, so that D is diagonal on straight sides, and diagonal
+segment, ∫ Φ_j N_k = δ_jk ∫ N_k. D is then diagonal on straight sides, and diagonal
 up to O(h) on curved ones. With the mean ξ̄ and the variance v of ξ over the covered
 part, and N̄_j = N_j(ξ̄), the only linear solution is
 
@@ -197,7 +197,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
 
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:
-    """Return all integration segments, without limits of angle and distance."""
+    """Return all integration segments, without limits on angle or distance."""
     e, m = facing_segments(slave, master)
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
@@ -252,7 +252,7 @@ def cast_rays(
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
     field += N[..., 1:] * slave.node_normal[k][:, None]
-    n = unit(field, slave.normal[e][:, None])  # opposite end normals: ν may vanish
+    n = unit(field, slave.normal[e][:, None])  # ν may vanish between opposite normals
 
     A, B = master.start[m][:, None], master.end[m][:, None]
     f_A, f_B = cross(x - A, n), cross(x - B, n)  # opposite signs: the ray hits AB

@@ -15,9 +15,9 @@ segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
 
 Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
-    T u,    T = [−t at s, +N_a t at a],
+    T u,    T = [−t at s, +N_a t at a].
 
-so that the friction forces are −Tᵀλ_t, as the contact forces are −Bᵀλ.
+The friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
 Beyond an end of the master, its last node is the closest point, with the normal of the
 last segment.

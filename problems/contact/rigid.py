@@ -6,7 +6,7 @@ x = X + u^k and n fixed there,
 
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
-which is exact for planes. The nonzero entries of a row belong to a single node, so that
+which is exact for planes. The nonzero entries of a row belong to a single node; hence
 the contact rows are orthonormal. Friction rows are T = −t at the node, with the
 tangents t.
 """
@@ -41,7 +41,7 @@ class RigidBody(Protocol):
 
 @dataclass(frozen=True)
 class RigidPlane:
-    """The half space below a plane."""
+    """A half space, bounded by a plane."""
 
     point: tuple[float, ...]  #: a point on the plane, m
     normal: tuple[float, ...]  #: outward unit normal

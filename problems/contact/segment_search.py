@@ -32,14 +32,14 @@ from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
 ROOTS = 16  #: largest number of sub-chains on the top level; smaller values are slower
-#: relative rounding of distances; without it, equally close segments could rule each
-#: other out
+#: relative tolerance for rounding of distances; without it, equally close segments
+#: could rule each other out
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Limits of angle and distance within which points of two sides may touch."""
+    """Limits on the angle and distance between points of two sides that may touch."""
 
     #: largest n_s·n_m of the normals of slave and master; −½ admits normals that are at
     #: most 60° from opposite

@@ -2,9 +2,9 @@
 
 The rows of the primal QP are ordered pair by pair, and along the slave side within a
 pair. A pair with a rigid master has one row per slave node that is not clamped. Any
-other row is assigned to the first pair, starting at the pair of the preceding row,
-whose two sides contain all nodes of the row. If two pairs share nodes on both sides,
-rows on these nodes are therefore assigned to the first pair.
+other row is assigned to the first pair whose two sides contain all nodes of the row;
+the search starts at the pair of the preceding row. If two pairs share nodes on both
+sides, rows on these nodes are therefore assigned to the first of these pairs.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
             end = first + pair.slave_nodes.size - pair.clamped.size
         else:
             # the rows of the pair end before the first row with a node outside both
-            # sides, or the first row against a rigid master, with slave nodes only
+            # sides, or the first row against a rigid master, which has slave nodes only
             other, opposite = np.ones(N), np.zeros(N)
             other[pair.nodes] = 0.0
             opposite[pair.master if pair.master.size else pair.slave] = 1.0

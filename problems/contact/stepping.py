@@ -32,7 +32,7 @@ from mortarbench.problems.fem.mesh import Nodes
 
 
 class Forces(NamedTuple):
-    """Non-dimensional nodal forces at some components; zero at all others."""
+    """Non-dimensional nodal forces at listed components; zero at all others."""
 
     component: Nodes  #: (k,) distinct components
     value: Vector  #: (k,) force at each component
@@ -145,7 +145,7 @@ class Iterate(NamedTuple, Generic[P]):
 
     problem: P
     friction: Friction  #: friction with the bound of this iterate
-    solution: Callable[[], Solution]  #: returns the dual solution, solved once
+    solution: Callable[[], Solution]  #: returns the dual solution, computed only once
 
 
 @dataclass(frozen=True, eq=False)

@@ -147,7 +147,7 @@ def contact_case(
     friction: Friction = NO_FRICTION,
     parts: DecomposedProblem | None = None,
 ) -> Case:
-    """Return the case of a contact problem, given by its primal QP, in one of FORMS.
+    """Return the case, in one of FORMS, of a contact problem with a given primal QP.
 
     Parameters
     ----------

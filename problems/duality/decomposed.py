@@ -69,7 +69,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 
 @dataclass(frozen=True, eq=False)
 class DecomposedLinearisation:
-    """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
+    """Linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
     All ranks must call its methods together; the results are equal on all ranks.
     """
@@ -107,7 +107,7 @@ class DecomposedLinearisation:
         """
         dual, sides = self.dual, self.sides
         solution = local_solution(dual.subdomains, dual.halo, s)
-        vars(self).pop("_qp", None)  # free the explicit blocks, which are large
+        vars(self).pop("_qp", None)  # release the large explicit blocks
         forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
         return solution.at(sides.component), forces
 
@@ -188,7 +188,7 @@ def decompose(
     contact: Contact,
     cluster: int = 0,
 ) -> DecomposedProblem:
-    """Return the decomposed problem of elastic bodies under the load of a stage."""
+    """Return the decomposed problem of elastic bodies under the load of a `Stage`."""
     unit = bodies.length / bodies.force
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
@@ -211,7 +211,7 @@ def decompose(
 
 
 def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
-    """Return a function that maps components (k,) to their nodal forces (k,).
+    """Return a function that maps displacement components (k,) to forces (k,).
 
     Components that are not listed in `forces` are unloaded.
     """
@@ -487,7 +487,7 @@ def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of subdomains, and the cells as indices into these nodes."""
+    """Return the nodes of `subdomains`, and their cells as indices into these nodes."""
     torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [

@@ -33,7 +33,7 @@ from mortarbench.problems.fem.inverse import GeneralisedInverse
 
 
 class Transformed(NamedTuple):
-    """A transformed QP with its inverse map and the relation of the objectives."""
+    """A transformed QP with its inverse map and the relation between the objectives."""
 
     qp: QP
     recover: Callable[[Solution], Solution]
@@ -120,10 +120,10 @@ def dual_bounds(
         min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,  RᵀB_Iᵀλ = Rᵀf
         F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The equations balance the forces on the rigid motions R that the supports allow; if
-    the supports exclude all rigid motions, there are no equations. The inverse map is
-    u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The multipliers of the supports (reactions)
-    follow from stationarity.
+    The equations state equilibrium with respect to the rigid motions R that the
+    supports allow; if the supports exclude all rigid motions, there are no equations.
+    The inverse map is  u = K⁺(f − B_Iᵀλ) − Rα  as in `dualise`. The multipliers of the
+    supports (reactions) follow from stationarity.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def multiplier_sets(
 
 
 def _without_motion(u: Vector, inverse: GeneralisedInverse, s: Solution) -> Vector:
-    """Return u − Rα, with α the multipliers y of the equations RᵀBᵀλ = Rᵀf."""
+    """Return u − Rα, where α are the multipliers y of the equations RᵀBᵀλ = Rᵀf."""
     R = inverse.kernel
     return u - R @ s.y if R.shape[1] else u
 
@@ -197,7 +197,7 @@ def _dual(
     free: Vector,
     sets: tuple[ConvexSet, ...],
 ) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over sets.
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  over `sets`.
 
     free : K⁺f
     """

@@ -45,8 +45,8 @@ from mortarbench.problems.fem.mesh import Nodes
 
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
-#: largest admissible KKT residual of a reference solution; contact in the next step is
-#: linearised at this solution
+#: largest admissible KKT residual of a reference solution; it must be small, because
+#: contact in the next step is linearised at this solution
 MAX_REFERENCE_RESIDUAL = 1e-6
 
 
@@ -201,7 +201,7 @@ def _path(
     transform: Transform,
     initial_force: float,
 ) -> MonolithicPath:
-    # several stages have the same load and supports: K⁺f of the full load is stored
+    # K⁺f of the full load is stored, since several stages have equal loads and supports
     bodies_by_stage = dict[tuple[int, int], Bodies]()
     inverses = dict[int, GeneralisedInverse]()
     free = dict[tuple[int, int], Vector]()

@@ -19,7 +19,7 @@ the tangents of single cells are raised (`problems.fem.finite_strain.convex_tang
 The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
 previous iteration ("geometric" contact stiffness), may be added to the tangent. Without
 these derivatives, convergence is linear if both sides deform. The term ρB_DᵀB_D is
-added to K. This term vanishes where u = 0 on the supports and makes K definite on
+added to K. This term vanishes if u = 0 on the supports, and makes K definite on
 rotations, on which the tangent of a compressed body is indefinite rather than singular.
 The remaining kernel of K consists of the translations that the supports allow.
 
@@ -31,15 +31,15 @@ descent direction of the exact penalty function (Nocedal and Wright, (18.27))
 and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A
 full step that halves the smallest residual so far is accepted without this test,
 because curved constraints may increase φ near the solution (Maratos effect). Each such
-step halves the smallest residual, so that only finitely many occur.
+step halves the smallest residual; hence only finitely many occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
-segments. If the iteration does not converge, pressing nodes, those with multipliers
-λ_i > 0, are assigned to their closest segments. They keep these segments and may slide
-slightly beyond their ends, along the straight lines through the segments.
+segments. If the iteration does not converge, pressing nodes (those with multipliers
+λ_i > 0) are assigned to their closest segments. In further iterations, a node keeps its
+segment and may slide slightly beyond its ends, on the straight line through it.
 
 *Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new
-iterate with the multipliers of the QP, is at most TOLERANCE plus a bound of its
+iterate with the multipliers of the QP, is at most TOLERANCE plus a bound on its
 rounding error.
 
 *Load*: if the iteration fails, the load increment is halved, down to the fraction
@@ -92,14 +92,16 @@ from mortarbench.problems.fem.inverse import (
 from mortarbench.problems.fem.mesh import dofs_of
 
 TOLERANCE = 1e-9  #: largest `NewtonPath.residual` at the end of a load step
-#: rounding of nodal forces relative to |K||u|: strains are differences of displacements
+#: rounding error of nodal forces relative to |K||u|, which exceeds |Ku| because strains
+#: are differences of displacements
 FORCE_ROUNDING = 2 * float(np.finfo(float).eps)
 MAX_ITERATIONS = 60  #: largest number of Newton iterations at one load
 KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
 MAX_HALVINGS = 8  #: largest number of halvings of a load increment
 MIN_STEP = 2.0**-16  #: smallest step length of the line search
-#: rounding of the merit function relative to the energies; without it, steps near the
-#: solution, whose decrease is below rounding, are rejected
+#: rounding error of the merit function relative to the energies; without this
+#: allowance, steps near the solution would be rejected, because their decrease is below
+#: rounding
 MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
 ARMIJO_FRACTION = 1e-4  #: required share of the decrease predicted by the slope
 #: weight of the penalty relative to the largest multiplier; above 1 it is exact
@@ -255,7 +257,7 @@ class NewtonPath:
         """Return advice for a load at which the iteration did not converge.
 
         The entries of F = I + ∂u/∂X have rounding errors of about eps. In cells of size
-        h, these errors cause forces of about eps·h|K|·1 at any load, where 1 is the
+        h, these errors cause forces of about eps·h|K|e at any load, where e is the
         vector of ones. Relative to a tiny load, such forces exceed TOLERANCE.
         """
         h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
@@ -389,10 +391,10 @@ class NewtonPath:
         return float(np.linalg.norm(force[free]))
 
     def _rounding(self, at: Configuration, lam: Vector, iteration: Iteration) -> float:
-        """Return a bound of the rounding error of `residual`.
+        """Return a bound on the rounding error of `residual`.
 
-        Strains are differences of displacements, so that the rounding error of the
-        forces Ku is proportional to |K||u|, however small Ku is.
+        Strains are differences of displacements. The rounding error of the forces Ku is
+        hence proportional to |K||u|, however small Ku is.
         """
         rounded = self._free_norm(abs(iteration.tangent.K) @ np.abs(at.u))
         return FORCE_ROUNDING * rounded / self._forces(at, lam, iteration.load_factor)
@@ -528,7 +530,14 @@ class NewtonPath:
         weight: float,
         best: float,
     ) -> tuple[Configuration, float, float]:
-        """Return the new configuration, the step length and the residual."""
+        """Return the new configuration, the step length and the residual.
+
+        Parameters
+        ----------
+        weight : weight w of the penalty in φ
+        best : smallest residual so far
+
+        """
         load_factor = iteration.load_factor
         d = iteration.answer.x - at.u
         merit = _merit(at, weight)

@@ -303,7 +303,8 @@ class InterfaceState(NamedTuple):
     """Data and solution of contact, at all nodes or at those of the contact sides."""
 
     bodies: Bodies | ContactSides
-    #: QP at the nodes of `bodies`; of P, only the diagonal is used, only with friction
+    #: QP at the nodes of `bodies`; P is used only with friction, and then only its
+    #: diagonal
     primal: QP
     solution: Solution
     friction: Friction
@@ -342,7 +343,7 @@ class ContactSolution(Protocol):
 
 
 def no_further_results(solution: ContactSolution) -> dict[str, Any]:
-    """Return no quantities beyond those common to all elastic bodies."""
+    """Return {}: no quantities beyond those common to all elastic bodies."""
     return {}
 
 
@@ -407,7 +408,7 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
 def cached_problem(
     state: Callable[[Mapping[str, Any]], ContactProblem],
 ) -> Callable[[Mapping[str, Value]], ContactProblem]:
-    """Cache the last four problems, ignoring the keys `CHOICES` of a case."""
+    """Cache the last four problems of `state`, irrespective of the keys `CHOICES`."""
     cached = lru_cache(maxsize=4)(lambda items: state(dict(items)))
 
     @wraps(state)

@@ -147,7 +147,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     F = deformation_gradients(cells, u)
     J = determinant(F).min(axis=1)
     worst = int(np.argmin(J))
-    if not J[worst] > 0:  # also NaN
+    if not J[worst] > 0:  # also true for NaN
         raise InvertedCellError(worst, float(J[worst]))
     energy, forces = 0.0, np.zeros(u.size)
     tangents = np.empty((len(J), 8, 8))  # plane strain: four nodes, two components

@@ -1,9 +1,9 @@
 """Fixing nodes of a floating body: if they are fixed, no rigid motion is possible.
 
 The farther apart the fixing nodes are, the better K is conditioned without their rows
-and columns: fixing two neighbouring corners costs three digits of accuracy, and fixing
-the central nodes of four parts of the body hardly any. In space the fixing nodes must
-not be collinear, because the body could rotate about their line.
+and columns: fixing two neighbouring corners costs three digits of accuracy, whereas
+fixing the central nodes of four parts of the body costs hardly any. In space the fixing
+nodes must not be collinear, because the body could rotate about their line.
 """
 
 from __future__ import annotations
@@ -20,10 +20,9 @@ from mortarbench.problems.fem.mesh import Nodes
 #: number of fixing nodes per body; fewer nodes worsen the conditioning, more nodes
 #: increase the fill-in
 PARTS = 4
-#: fixing nodes in space count as collinear if their distances from the line of best fit
-#: are smaller than this multiple of the largest distance of a node of the last part
-#: from the line. The ratio of these distances is at least 0.35 for blocks, and may be 0
-#: for bars that are one cell wide
+#: fixing nodes in space count as collinear if their largest distance from the line of
+#: best fit is below this multiple of the largest distance of a node of the last part.
+#: This ratio is at least 0.35 for blocks, and may be 0 for bars that are one cell wide
 MIN_DISTANCE = 0.25
 
 

@@ -7,12 +7,12 @@ With ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
-so that K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
+hence K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
 factor. K⁺ is not the Moore-Penrose inverse, but if the load is balanced (Rᵀf = 0), the
 solutions K⁺f of the two inverses differ only by a rigid motion. For supported bodies,
 K⁺ is K_ff⁻¹ on the free components f and zero on the prescribed ones.
 
-Only the columns c of B, the components of contact sides and supports, have entries. If
+B has entries only in its columns c, the components of contact sides and supports. If
 these components are eliminated last, the trailing block L_cc of the factor yields
 (K⁺)_cc = (L_cc L_ccᵀ)⁻¹, and  F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  (eq. (3) of the paper)
 requires one small product in every load step. The fixing nodes are eliminated together
@@ -200,7 +200,7 @@ def supported_inverse(
     kernel = rigid @ null_space(rigid[fixed]) if fixed.size else rigid
     if not kernel.shape[1]:
         return _inverse(csc_array(K), free, kernel, interface)
-    kernel[fixed] = 0  # null_space is zero up to rounding only
+    kernel[fixed] = 0  # null_space returns zeros only up to rounding
     kernel = np.linalg.qr(kernel)[0]
     # pivoting selects components on which the motions are well conditioned
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]

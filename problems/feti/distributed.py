@@ -133,12 +133,13 @@ def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work (S,) per subdomain of a product: the size of its dense block."""
+    """Return the work (S,) of a product: the entries of each subdomain's block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 
 
-MAX_IMBALANCE = 1.1  #: acceptable ratio of largest to mean work, or size, of the ranks
+#: largest accepted ratio of the largest to the mean work (or size) of the ranks
+MAX_IMBALANCE = 1.1
 METIS_SEEDS = 12  #: number of seeds to try
 SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
 
@@ -718,7 +719,7 @@ def _exchange_blocks(
     out: Sequence[tuple[int, Dense]],
     coming: Sequence[tuple[int, tuple[int, ...]]],
 ) -> list[Dense]:
-    """Send the arrays `out` to ranks; receive arrays of the shapes in `coming`."""
+    """Send each array of `out` to its rank; receive arrays with shapes `coming`."""
     arrays = [np.empty(shape) for _, shape in coming]
     requests = [
         ranks.comm.Irecv(array, source=rank)

@@ -7,8 +7,9 @@ The ranks exchange
 
 * the points of one subdomain of each class that may occur on several ranks, so that
   all ranks use the same frame for congruent subdomains,
-* contributions to entries of q and columns of RᵀBᵀ for rows of B owned by other ranks,
-* contributions to Rᵀf.
+* contributions to the entries of q, and to the columns of the equality matrix RᵀBᵀ,
+  that belong to rows of B owned by other ranks,
+* contributions to the right-hand side Rᵀf of the equalities.
 """
 
 from __future__ import annotations
@@ -175,10 +176,10 @@ def distributed_qp(
 ) -> DistributedQP:
     """Return the distributed dual QP; all ranks must call this function together.
 
-    If the QP depends on solutions of previous problems, runs with different numbers of
-    ranks have different rounding errors in its data. In this case, the digest of the QP
-    is computed from the first of these problems and their number, so that it is
-    independent of the number of ranks.
+    If the QP depends on solutions of previous problems, the rounding errors in its data
+    depend on the number of ranks. In this case, the digest of the QP is computed from
+    the first of these problems and their number, so that it is independent of the
+    number of ranks.
 
     Parameters
     ----------
@@ -241,8 +242,8 @@ def _decomposition(
 def _digest(local: LocalSubdomains) -> str:
     """Return a digest of the QP that does not depend on the distribution over ranks.
 
-    It is computed from the digests of the class, load and columns of B of every
-    subdomain, in the order of the subdomains, and from the contact data and clusters,
+    It is computed from three digests for every subdomain, in the order of the
+    subdomains (class, load and columns of B), and from the contact data and clusters,
     which are equal on all ranks.
     """
     domains, rows, contact = local.domains, local.rows, local.problem.contact

@@ -34,7 +34,7 @@ class StoredOperator(DualOperator):
         return int(self.domains.class_of.size)
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Return the part of a dual QP with this F that the rank stores."""
+        """Return the part of a dual QP with this F that this rank stores."""
         return local_share(qp, self, ranks)
 
 

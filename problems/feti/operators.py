@@ -21,15 +21,15 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
 condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
 or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its diagonal
-block for the equality rows is itself block diagonal, with one block per node; its
-Moore-Penrose inverse is used, so that λ stays free of components in ker Bᵀ.
+block for the equality rows is itself block diagonal, with one block per node. The
+Moore-Penrose inverse of this block keeps λ free of components in ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
-only where contact touches supports. There they would weight the equality rows for
-contact rows that are mostly inactive. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
-condition number on the final face, the multipliers that are free at the solution, is 58
-with these entries and 3.7 without them. It is also 3.7 if B contains only the rows of
-that face.
+only where contact touches supports. There they would adapt the weights of the equality
+rows to contact rows that are mostly inactive. The final face consists of the
+multipliers that are free at the solution. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
+condition number on this face is 58 with these entries and 3.7 without them. It is also
+3.7 if B contains only the rows of the face.
 """
 
 from __future__ import annotations
@@ -81,11 +81,11 @@ STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
 CONTACT_SHIFT = 1e-8
 #: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
-#: smallest diagonal entry of B K̃⁺Bᵀ relative to that of B K⁺Bᵀ. Residuals are scaled
-#: by 1/√diagonal, so that rounding errors 2⁻⁵³ of the terms amount to at most 1e5·2⁻⁵³,
-#: far below any tolerance
+#: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
+#: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
+#: amplified to at most 1e5·2⁻⁵³, far below any tolerance
 LEAST_DIAGONAL = 1e-10
-#: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding
+#: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding errors
 COUPLING_ROUNDING = 1e-12
 
 
@@ -236,7 +236,7 @@ class DualOperator:
         Raises
         ------
         ValueError
-            If `kind` or `scaling` is none of these names.
+            If `kind` or `scaling` is not one of these names.
 
         """
         if (kind, scaling) not in self._preconditioners:
@@ -324,7 +324,7 @@ class DualOperator:
         if joints is None:
             return diagonal
         # if Cv = 0 implies that a row of Bv is zero, the diagonal entry of F for this
-        # row is rounding of its terms; residuals scaled by it would be of order one
+        # row is a mere rounding error, and residuals scaled by it would be of order one
         joined = diagonal + joints.diagonal(self.packed.B)
         return np.maximum(joined, LEAST_DIAGONAL * diagonal)
 
@@ -410,11 +410,11 @@ def average_free(
 ) -> Composition:
     """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
 
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding errors would let the
-    iterates of preconditioned conjugate gradients drift along these multipliers. The
-    range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 because
-    C = LᵀB for some L. Hence the factors I − Π change the image of the preconditioner
-    only by such multipliers, and remove its component along them.
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ. Rounding errors would therefore let
+    the iterates of preconditioned conjugate gradients drift along these multipliers.
+    The range of B_DΠ consists of such multipliers, and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0
+    because C = LᵀB for some L. Hence the factors I − Π change the image of the
+    preconditioner only by such multipliers, and remove its component along them.
 
     weights : (M,) diagonal of W, equal for all subdomains of a class
     """
@@ -455,7 +455,7 @@ def _column_places(
 ) -> NDArray[np.int64]:
     """Return the indices (Σq,) of the coordinates of `Clusters`, packed by groups.
 
-    sizes : number of columns of each group, of which the coordinates come first
+    sizes : number of columns of each group; those of the coordinates come first
     """
     first = clusters.coordinates
     place, end = np.empty(first[-1], dtype=np.int64), 0
@@ -468,7 +468,7 @@ def _column_places(
 
 
 def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
-    """Compute the joints of clusters from the blocks (K⁺)_bb of the groups."""
+    """Compute the term −V M⁺Vᵀ of clusters from the blocks (K⁺)_bb of the groups."""
     columns, compliance, end = list[Dense](), list[Dense](), 0
     modes = clusters.domains.modes
     first_motion = np.cumsum(modes) - modes
@@ -555,7 +555,7 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop entries of B W Bᵀ that are rounding, or couple contact and equality rows."""
+    """Drop rounding errors and couplings of contact with equality rows in B W Bᵀ."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])

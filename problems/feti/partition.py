@@ -124,10 +124,11 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    from pymetis import CSRAdjacency, Options, part_graph  # here: few cases need it
+    from pymetis import CSRAdjacency, Options, part_graph  # rarely needed
 
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
-    # k-way partitions are better, but may contain empty parts if parts have few cells
+    # k-way partitions are better, but may have empty parts if there are few cells per
+    # part; recursive bisection is the fallback
     for recursive in (False, True):
         options = Options(ufactor=MAX_IMBALANCE, contig=int(not recursive))
         _, found = part_graph(

@@ -9,9 +9,9 @@ spectra are those of
     P M P F               in the inner product  xᵀF y,
 
 without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
-of P, so that the same Lanczos process applies (Parlett 1998, Chapter 13). Each vector
-is orthogonalised against its two predecessors, as in the recurrence, then against all
-previous vectors, which excludes spurious copies of eigenvalues. Each vector is also
+of P, and the same Lanczos process applies to both (Parlett 1998, Chapter 13). Each new
+vector is orthogonalised against its two predecessors, as in the recurrence, then
+against all previous vectors, which excludes spurious copies of eigenvalues. It is also
 projected by P, because components in ker P due to rounding would grow.
 
 The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue.
@@ -48,8 +48,8 @@ class Spectrum(NamedTuple):
 
     smallest: float
     largest: float
-    smallest_error: float  #: bound of the distance from `smallest` to an eigenvalue
-    largest_error: float  #: bound of the distance from `largest` to an eigenvalue
+    smallest_error: float  #: bound on the distance from `smallest` to an eigenvalue
+    largest_error: float  #: bound on the distance from `largest` to an eigenvalue
     steps: int  #: products with F
 
     @property
@@ -59,7 +59,7 @@ class Spectrum(NamedTuple):
 
     @property
     def condition_error(self) -> float:
-        """First-order bound of the error of κ from the errors of both eigenvalues."""
+        """First-order bound on the error of κ, from the errors of both eigenvalues."""
         relative = self.smallest_error / self.smallest
         return self.condition * (relative + self.largest_error / self.largest)
 
@@ -102,7 +102,7 @@ def spectrum(
     # image of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # arbitrary, with a component on each eigenvector
+    v = P(np.sin(1.0 + local**2))  # arbitrary; rarely orthogonal to eigenvectors
     V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
@@ -179,7 +179,7 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
     Parameters
     ----------
     F : operator with rows B, which may be linearly dependent (redundant gluing)
-    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
+    G : RᵀBᵀ (r, m) of full rank r, which may be 0
 
     """
     within = F.onto_rows()

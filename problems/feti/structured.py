@@ -12,9 +12,10 @@ planes of cells with sides hₜ along the interface and hₙ across it, this sti
     s(r) = √((C₆₆ + C₁₁r²) / (C₆₆ + C₁₁)),    r = hₙ/hₜ
 
 relative to square cells, with the entries C₁₁ and C₆₆ of the elasticity matrix.
-Derivation: the energy of a saw tooth along a row of cells is a quadratic form across
-the row, with 4C₁₁/hₜ times the mass matrix plus hₜC₆₆/3 times the stiffness matrix of
-linear elements; s is its Schur complement on a half line. If rows of B are scaled by
+Derivation: the energy of a saw tooth along rows of cells is a quadratic form in its
+amplitudes on successive rows of nodes. The matrix of this form is 4C₁₁/hₜ times the
+mass matrix plus hₜC₆₆/3 times the stiffness matrix of linear elements on a half line;
+s is its Schur complement on the interface. If rows of B are scaled by
 √s, the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
 """
 
@@ -56,7 +57,7 @@ class Layout:
     ) -> Layout:
         """Cut grids into blocks of at most `most` cells per side.
 
-        most : limit for both directions, or a pair of limits
+        most : one limit for both directions, or a pair of limits
         """
         sides = np.broadcast_to(most, 2)
 
@@ -111,7 +112,7 @@ class Layout:
 
     @cached_property
     def block(self) -> Places:
-        """Grid, column and row of each block; columns and rows count blocks, (S,)."""
+        """Grid, column and row (S,) of each block, counted in blocks."""
         body = np.repeat(np.arange(len(self.grids)), np.diff(self.block_start))
         row, column = np.divmod(
             np.arange(self.count) - self.block_start[body], self._blocks_per_row[body]
@@ -137,9 +138,9 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return the first column, first row, number of columns and number of rows.
+        """Return first column, first row, and numbers of columns and rows, of blocks.
 
-        Columns and rows are those of the nodes of each block; each result is (k,).
+        Columns and rows are those of nodes; each result is (k,).
 
         block : (k,) numbers of blocks
         """
@@ -162,7 +163,7 @@ class Layout:
         return np.asarray(columns * rows, dtype=np.int64)
 
     def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
-        """Return the nodes of some blocks, row by row."""
+        """Return the nodes of given blocks, row by row."""
         left, low, columns, rows = self.corner(subdomains)
         start = np.concatenate([[0], np.cumsum(columns * rows)])
         of = np.repeat(np.arange(subdomains.size), columns * rows)
@@ -201,19 +202,19 @@ class Layout:
         return cells_of_block(int(columns[0]), int(rows[0]))
 
     def places(self, node: Nodes) -> Places:
-        """Return the positions of nodes by their numbers (k,)."""
+        """Return the grid positions of the nodes with given numbers (k,)."""
         body = np.searchsorted(self.node_start, node, side="right") - 1
         wide = np.array([grid.columns.size for grid in self.grids])
         row, column = np.divmod(node - self.node_start[body], wide[body])
         return Places(body, column, row)
 
     def _number(self, at: Places) -> Nodes:
-        """Return the numbers (k,) of nodes by their positions."""
+        """Return the numbers (k,) of the nodes at given positions."""
         wide = np.array([grid.columns.size for grid in self.grids])
         return np.asarray(self.node_start[at.body] + at.row * wide[at.body] + at.column)
 
     def position(self, node: Nodes) -> Points:
-        """Return the points of some nodes, (k, 2)."""
+        """Return the points of given nodes, (k, 2)."""
         points, body = np.empty((node.size, 2)), self.places(node).body
         for b in np.unique(body):
             of_grid = body == b
@@ -247,7 +248,7 @@ class Layout:
         )
 
     def lines(self, at: Places, *, ends: bool) -> NDArray[np.bool_]:
-        """Return masks (k, 2) of nodes whose row, and whose column, separates blocks.
+        """Return masks (k, 2) of the nodes whose row, or column, separates blocks.
 
         ends : also mark the sides of the grid, as required for rows of supports
         """
@@ -312,7 +313,7 @@ class Layout:
 
     @cached_property
     def _counts(self) -> dict[int, tuple[NDArray[np.int64], int]]:
-        """Numbers of nodes with m copies, by m: before each row, and in total."""
+        """Numbers of nodes with m copies before each row, and in total, for each m."""
         columns, rows = self._columns, self._rows
         body = np.repeat(np.arange(len(self.grids)), np.diff(rows.start))
         of_columns = [
@@ -405,7 +406,7 @@ class _Lines(NamedTuple):
 
     start: NDArray[
         np.int64
-    ]  #: (grids + 1,) first line of each grid, then their number k
+    ]  #: (grids + 1,) first line of each grid, then the number k of lines
     multiplicity: NDArray[np.int64]  #: (k,) number of blocks that meet there, 1 or 2
     first: NDArray[np.int64]  #: (k,) first block that contains the line
     #: (2, k) numbers of preceding lines of multiplicity 1 and 2 in the same grid

@@ -27,7 +27,7 @@ Points = NDArray[np.float64]
 
 
 class SubdomainNodes(NamedTuple):
-    """Nodes of some subdomains, sorted by subdomain and then by number."""
+    """Nodes of given subdomains, sorted by subdomain and then by number."""
 
     subdomain: Integers  #: (M,) index in the list of subdomains
     number: Nodes  #: (M,) global numbers
@@ -68,7 +68,7 @@ class Subdivision(Protocol):
         """Number of nodes of each subdomain, (S,)."""
 
     def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
-        """Return the nodes of some subdomains."""
+        """Return the nodes of given subdomains."""
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
         """Return a key per subdomain; subdomains with the same cells have equal keys.
@@ -96,7 +96,7 @@ class Subdivision(Protocol):
         """
 
     def position(self, node: Nodes) -> Points:
-        """Return the points of some nodes, (k, dim)."""
+        """Return the points of given nodes, (k, dim)."""
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
         """Count, for each node, the preceding nodes of equal multiplicity, (k,)."""
@@ -144,7 +144,7 @@ class ListedSubdivision:
         return self.body.size
 
     def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
-        """Return the nodes of some subdomains."""
+        """Return the nodes of given subdomains."""
         parts = [self.part(int(s))[0] for s in subdomains]
         sizes = np.array([part.size for part in parts])
         number = np.concatenate(parts)
@@ -255,7 +255,7 @@ def half_discs_in_blocks(
 ) -> ListedSubdivision:
     """Return the subdivision of half discs into blocks; perimeter nodes are listed.
 
-    blocks : for each disc, the ranges of rings and sectors of cells of each block
+    blocks : for each disc, the ranges of rings and of angles that form each block
     """
     first = np.cumsum([0, *(disc.nodes for disc in discs)])
     body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])

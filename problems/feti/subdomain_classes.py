@@ -1,8 +1,8 @@
 """Classes of congruent subdomains, and bodies decomposed into subdomains (Total FETI).
 
 In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
-subdomain floats; supports, gluing and contact are rows of one matrix B. So the kernel
-of every stiffness matrix is known in advance: the rigid motions.
+subdomain floats; supports, gluing and contact are rows of one matrix B. The kernel of
+every stiffness matrix is hence known in advance: the rigid motions.
 
 The torn unknowns v (N,) are the displacement components of all copies of all nodes, in
 the frames of their subdomains, numbered by subdomain and then by node. Subdomains that
@@ -153,7 +153,7 @@ class SubdomainClass:
 
     @property
     def _fixed(self) -> csc_array:
-        """K_ρ, (n_k, n_k)."""
+        """K_ρ (n_k, n_k), the regularised stiffness matrix."""
         p = self.fixing.size
         where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
         added = csc_array((self._fixing_term.ravel(), where), shape=self.K.shape)
@@ -168,7 +168,7 @@ class Condensed(NamedTuple):
 
 
 class Elimination(NamedTuple):
-    """S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
+    """The Schur complement S = K_hh − K_hi K_ii⁻¹K_ih, applied to columns."""
 
     K_hh: csr_array
     K_ih: csr_array
@@ -210,7 +210,7 @@ class Subdomains:
 
     @cached_property
     def kernel(self) -> csr_array:
-        """R = diag(R_1 … R_S), (N, Σr)."""
+        """R = diag(R_1 … R_S) (N, Σr), the rigid motions of all subdomains."""
         modes, sizes = self.modes, np.diff(self.start)
         entries = np.concatenate([self.classes[k].R.ravel() for k in self.class_of])
         per_row = np.repeat(modes, sizes)
@@ -290,7 +290,7 @@ class Clusters:
 
     @cached_property
     def averages(self) -> csr_array:
-        """C, (c, N)."""
+        """C (c, N), which maps torn unknowns to differences of averages."""
         faces = block_diag([self.faces[k] for k in self.domains.class_of], format="csc")
         return csr_array(self.joints @ faces.T)
 
@@ -311,9 +311,10 @@ class Clusters:
 
     @cached_property
     def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
-        """Unknowns (μ, α) ordered by clusters: (μ_1, α_1, μ_2, α_2, …).
+        """Order of the unknowns (μ, α) by clusters, (μ_1, α_1, μ_2, α_2, …).
 
-        Indices (c + r,) of these unknowns in (μ, α), and their number per cluster.
+        The order is given as indices (c + r,) in (μ, α); the second array is the number
+        of unknowns of each cluster.
         """
         start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
         parts = [
@@ -342,7 +343,8 @@ class Clusters:
             gram += J @ (modes.T @ modes).toarray() @ J.T
             motions.append(J @ (modes.T @ domains.classes[k].R))
         CR = np.concatenate(motions, axis=1)
-        # subdomains joined by faces move as one body: as many motions as one of them
+        # subdomains joined by faces move as one body, with as many motions as one
+        # subdomain
         last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
         N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
         size, modes = np.linalg.eigh(gram)
@@ -365,7 +367,7 @@ class Clusters:
 
     @cached_property
     def kernel(self) -> csr_array:
-        """RN, (N, r̃)."""
+        """RN (N, r̃), a basis of the rigid motions of all clusters."""
         return csr_array(self.domains.kernel @ self.motions)
 
     def saddle_inverses(self, compliance: Sequence[Dense]) -> list[Vector]:

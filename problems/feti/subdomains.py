@@ -215,7 +215,7 @@ class LocalSubdomains:
         return self.problem.layout.subdomain_nodes(self.number)
 
     def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Return the index in `nodes` (k,) of the copy of each node in a subdomain.
+        """Return the indices (k,) in `nodes` of copies of nodes in given subdomains.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ class LocalSubdomains:
         return self._of_nodes(self._distinct[1])[self.free]
 
     def _of_nodes(self, node: Nodes) -> Nodes:
-        """Return the components of some nodes, node by node."""
+        """Return the components of given nodes, node by node."""
         d = self.problem.components
         return np.asarray((d * node[:, None] + np.arange(d)).ravel())
 
@@ -343,8 +343,8 @@ class LocalSubdomains:
     ) -> dict[int, tuple[int, Points]]:
         """Return the first subdomain of each class on all ranks, with its points.
 
-        Ranks exchange the points of one subdomain per class, unless its key and its
-        spread show that the class does not occur on other ranks.
+        Ranks exchange the points of one subdomain per class, unless its key and
+        its spread (see `spread_of`) show that the class does not occur on other ranks.
 
         own : number, key and points of the first local subdomain of each class
 
@@ -363,7 +363,7 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # more than in `classify`
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # looser than in `classify`
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         candidates = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -550,7 +550,7 @@ class _Rows(NamedTuple):
 
 
 def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
-    """Return a rank for each subdomain (S,) so that work and memory are balanced.
+    """Return the rank (S,) of each subdomain, balancing work and memory.
 
     Raises
     ------
@@ -720,7 +720,7 @@ def _support_rows(local: LocalSubdomains) -> Entries:
 
 
 class _Copies(NamedTuple):
-    """Copies of some nodes on all ranks, in the order of the nodes."""
+    """Copies of given nodes on all ranks, in the order of the nodes."""
 
     node: NDArray[np.int64]  #: (k,) index in the list of nodes
     copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
@@ -730,7 +730,7 @@ class _Copies(NamedTuple):
 
 
 def _local_copies(local: LocalSubdomains, node: Nodes) -> _Copies:
-    """Return the copies of some nodes on all ranks."""
+    """Return the copies of given nodes on all ranks."""
     of = local.problem.layout
     multiplicity = of.multiplicity(node)
     place = np.repeat(np.arange(multiplicity.size), multiplicity)
@@ -793,7 +793,7 @@ def _contact_rows(local: LocalSubdomains) -> Entries:
     copies = _local_copies(local, node)
     E, group = _equality_count(problem), problem.contact.groups
     row = E + entries.row.astype(np.int64)
-    # a disc has one owner, so a rank that one of its rows touches stores all its rows
+    # all rows of a disc have one owner: a rank that one of them touches stores them all
     pairs = np.stack([group[entries.row][copies.node], copies.rank], axis=1)
     pairs = np.unique(pairs, axis=0)
     members = np.bincount(group, minlength=1)[pairs[:, 0]]
@@ -815,7 +815,7 @@ def _rotated(
     k: NDArray[np.int64],
     value: Vector,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
-    """Rotate entries at global components k of torn nodes (j,) to subdomain axes.
+    """Rotate entries along global axes k (j,) at torn nodes (j,) to subdomain axes.
 
     Returns
     -------

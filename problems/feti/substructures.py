@@ -27,7 +27,7 @@ class LocalProblems:
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n) from global components to torn unknowns."""
+        """T (N, n), which maps global components to torn unknowns."""
         return self.torn.spread
 
     @property
@@ -93,7 +93,7 @@ class LocalProblems:
         for (template, place), members in zip(
             self._classes(), domains.members, strict=True
         ):
-            place = place[:, acting[members]]  # where b = 0, the solution is zero
+            place = place[:, acting[members]]  # if b = 0, so is the solution
             columns, R = b[place], template.R
             columns -= R @ (R.T @ columns)
             image = template.inverse(columns)

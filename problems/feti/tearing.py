@@ -69,11 +69,11 @@ def grid_positions(
     starts = np.unravel_index(first, divisions[::-1])
     along = [np.unique(start, return_inverse=True)[1] for start in starts[::-1]]
     positions = np.stack(along, axis=1)
-    # if rows of blocks are cut at different places, the grid of all cuts has gaps
+    # if rows of blocks are cut at different places, some places in the grid are empty
     return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
 
 
-Block = tuple[slice, slice]  #: rows and columns of cells
+Block = tuple[slice, slice]  #: ranges of rows and columns of cells
 #: lengths of cell sides, first along columns, then along rows; each length is the
 #: product of two factors, one for the row and one for the column of the cell
 Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
@@ -122,11 +122,13 @@ def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
 
     Let hₐ be the mean edge length of a block along direction a. The block may have
     most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
-    across its longest side: the limit requires several equal parts, and half of them
-    (rounded down) precede the cut. Boxes of cubic cells are cut as in `blocks`. With
-    equal numbers of cells along all directions, slender cells would result in slender
-    subdomains: the condition number of PFP (see `problems.feti.spectrum`) is 439 with
-    4 × 4 × 4 cells of 1 : 1 : 4 in beam-ring/Nr=4/Nh=2/depth=4.
+    in two across the longest of the sides that exceed their limits. Let p be the least
+    number of equal parts within the limit of this side; the cut is placed after ⌊p/2⌋
+    of these parts, rounded up to a whole cell. Boxes of cubic cells are cut as in
+    `blocks`. With equal numbers of cells along all directions, slender cells would
+    result in slender subdomains: the condition number of PFP (see
+    `problems.feti.spectrum`) is 439 with 4 × 4 × 4 cells of 1 : 1 : 4 in
+    beam-ring/Nr=4/Nh=2/depth=4.
 
     Parameters
     ----------
@@ -153,7 +155,8 @@ def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
                 for a, edge in enumerate(edges)
             ]
         )
-        # ratios just below ½ by rounding count as ½, to cut congruent blocks equally
+        # fractions that rounding moved just below ½ count as ½, so that congruent
+        # blocks are cut equally
         side = np.floor(most * h.min() / h + 0.5 + CONGRUENCE_TOL).clip(1, most)
         parts = np.ceil(count / side).astype(int)
         if (parts == 1).all():

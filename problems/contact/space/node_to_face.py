@@ -88,7 +88,8 @@ def node_to_face(
 def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     """Return the closest points of x (s, 3) on faces, with outward normals."""
     tree = KDTree(faces.centre)
-    # a face contains its centre, and lies within its radius of the centre
+    # faces contain their centres, so the closest point is at most `nearest` away, and
+    # the centre of its face is at most the radius of this face farther away
     nearest, _ = tree.query(x)
     found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
     candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])

@@ -115,7 +115,7 @@ def _parse(path: Path) -> Any:
     """Parse a file with meshio, admitting entities without a physical group.
 
     With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2
-    they have tag 0. In format 4.1 they have no tag, so that meshio fails; tag 0 is then
+    they have tag 0. In format 4.1 they have no tag, and meshio fails; tag 0 is then
     inserted into a copy of the text.
     """
     import meshio  # imported here: workers and other families do not need it

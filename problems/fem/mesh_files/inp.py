@@ -113,7 +113,7 @@ class _Sets:
         self._members: dict[str, tuple[str, Nodes]] = {}
 
     def extend(self, name: str, members: Nodes) -> None:
-        """Add members to the set `name`, which need not exist."""
+        """Add members to the set `name`; create the set if it does not exist."""
         name, before = self._members.get(name.upper(), (name, _NONE))
         members = np.unique(np.append(before, members))
         self._limit -= members.size

@@ -20,8 +20,7 @@ from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
 FLATNESS_TOLERANCE = 1e-9
 #: dimension of each supported kind of cell
 DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
-#: coordinates must be smaller in magnitude, because products of larger ones could
-#: overflow
+#: bound on the magnitude of coordinates; products of larger ones could overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items()}
 #: order of the corners that mirrors a cell, by kind
@@ -219,7 +218,7 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
 def refine(mesh: NamedMesh) -> NamedMesh:
     """Refine a plane mesh: bisect every edge, and divide each cell into four.
 
-    New nodes on edges are midpoints, so that the shape of bodies is unchanged. A
+    The shape of bodies is unchanged, because new nodes on edges are midpoints. A
     triangle is divided into four similar triangles, and a quadrilateral into four
     quadrilaterals that meet at the mean of its corners. Nodes remain numbered body by
     body.

@@ -18,7 +18,7 @@ _READERS = {".inp": read_inp, ".med": read_med}
 
 
 def read_mesh_file(path: Path) -> FileMesh:
-    """Read the cells and sets of an .inp, .med or (with any other suffix) .msh file.
+    """Read the cells and sets of an .inp, .med or (for any other suffix) .msh file.
 
     Raises
     ------
