@@ -256,7 +256,10 @@ def _iterate(
     accuracy: float,
     max_iter: int,
 ) -> tuple[_State, str]:
-    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; return the state and why it failed, or ""."""
+    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; return the state and the reason for a failure.
+
+    The reason is empty if the iteration did not fail.
+    """
     least, stalled = norms[-1], 0
     while norms[-1] > accuracy * norms[0]:
         if directions.count >= max_iter:

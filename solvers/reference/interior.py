@@ -91,7 +91,7 @@ class _Problem:
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs (at x) and G, and what discs add to diag P."""
+        """Return the rows of discs (at x) and G, and the terms of discs in diag P."""
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:

@@ -4,8 +4,8 @@ For a fixed active set the KKT conditions are linear. They are solved by iterati
 refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) with
 residuals evaluated in `numpy.longdouble` and a factorisation of
 
-    [P_FF + δ  B_Fᵀ]     F: variables not at a bound, [B_F       −δ  ]     B: A and the
-    active rows of G.
+    [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
+    [B_F       −δ  ]     B: A and the active rows of G.
 
 δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
 are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1).

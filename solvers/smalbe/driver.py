@@ -166,7 +166,7 @@ def _on_discs(qp: QP, options: Options) -> Options:
 def _eliminated(
     qp: QP, options: Options, kind: Preconditioner, carry: Carry | None
 ) -> Eliminated | None:
-    """Eliminate the free variables as long as one factor serves the whole sequence.
+    """Eliminate the free variables if one factor serves the whole sequence.
 
     If the free block changes between problems, as in Newton's method, a new factor for
     each problem would cost more than it saves.

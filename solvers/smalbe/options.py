@@ -14,10 +14,11 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 
 #: Rule of the expansion step; the number of products with F is in brackets.
 #: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2) mixed: projcg; std if
-#: the cost would rise (ESPRESO; 2 or 3) model: the CG point, projected in the metric of
-#: the model (new; 2, or 1 if the step to the boundary is the whole step; plus 1 per CG
-#: step beyond the box, plus 1 if the decrease is below that of gradient projection)
+#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2)
+#: mixed: projcg, or std if projcg would increase the cost (ESPRESO; 2 or 3)
+#: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
+#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
+#: decrease is below that of gradient projection)
 #: spectral: a step to the boundary and, unless it is most of the CG step, a projected
 #: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
 #: replace every proportioning, and CG if its first step would leave the set (1). With

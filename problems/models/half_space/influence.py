@@ -166,8 +166,8 @@ class Influence:
 class NormalInfluence(Influence):
     """The product for normal forces, with a preconditioner M.
 
-    The product for shear has no preconditioner: on discs, solvers take few CG steps, so
-    that preconditioning saves no products.
+    The product for shear has no preconditioner: on discs, solvers take so few CG steps
+    that preconditioning would save no products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
