@@ -115,7 +115,7 @@ class Pair:
 
     @property
     def other_answer(self) -> bool:
-        """True if both answers are verified but differ more than their gaps allow."""
+        """True if verified answers differ by more than their gaps allow."""
         return self.answers is not None and self.answers[2] > self.may_differ
 
 

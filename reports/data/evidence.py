@@ -296,7 +296,7 @@ def read_evidence(
 
 
 def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Replace environments whose times are comparable by the first of them."""
+    """Replace each environment by the first one whose times are comparable with it."""
     representatives: dict[str, Mapping[str, Any]] = {}
     united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):

@@ -48,7 +48,7 @@ Leaves = dict[tuple[str, ...], Leaf]  #: scalars by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Return whether the bodies are elastic, so that quantities are in SI units."""
+    """Return True if the bodies are elastic; all quantities are then in SI units."""
     return _STRESS in outcome.quantities
 
 

@@ -1,7 +1,7 @@
 """Measured strong and weak scaling of one solve over the number of ranks.
 
 Strong scaling solves one case on an increasing number of ranks. Weak scaling enlarges
-the case with the number of ranks, so that the work per rank stays constant. Both are
+the case with the number of ranks, which keeps the work per rank constant. Both are
 reported separately for preparation and solve. They are compared with copies: as many
 simultaneous independent solves as ranks, which share the machine's memory as ranks do.
 """

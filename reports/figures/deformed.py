@@ -403,7 +403,7 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
         if size is not None:
             centres = points[cells].mean(axis=1)
             middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
-            place = _pair(centres[middle])  # of a cell: the centroid may lie outside
+            place = _pair(centres[middle])  # the centroid may be outside the subdomain
             marks.append(
                 Label(
                     text=f"{number}",

@@ -46,8 +46,8 @@ class Curve(NamedTuple):
 def performance_ratios(times: Array) -> Array:
     """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
-    A case that no solver solved is kept with infinite ratios, so that no profile
-    reaches one. The profile of a solver at τ is the share of cases with r ≤ τ.
+    A case that no solver solved is kept with infinite ratios; no profile then reaches
+    one. The profile of a solver at τ is the share of cases with r ≤ τ.
 
     Parameters
     ----------

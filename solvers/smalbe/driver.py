@@ -58,12 +58,11 @@ EPS = float(np.finfo(float).eps)
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
 MIN_LANCZOS_STEPS = 5  #: smallest limit of Lanczos steps, used for few unknowns
-#: default penalty ρ. The models contain ρQ exactly, so that a large ρ costs no
-#: products; with 1e4 two or three outer iterations suffice
+#: default penalty ρ. The models contain ρQ exactly; hence a large ρ costs no products.
+#: With 1e4, two or three outer iterations suffice
 RHO = 1e4
-#: default penalty ρ if P provides a preconditioner. With the thousands of rows of
-#: decomposed bodies each multiplier step restarts CG, so that fewer outer iterations
-#: save time
+#: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG;
+#: with the thousands of rows of decomposed bodies, fewer outer iterations save time
 PRECONDITIONED_RHO = 1e6
 #: default penalty ρ with discs. Spectral steps do not use the model, and a larger ρ
 #: would worsen the conditioning of H

@@ -10,7 +10,7 @@ tractions of Hertz's pressure is O((a/ρ)²). A whole sphere is not suitable, be
 overall compression, which the theory neglects, is of order a/R relative to the
 approach, 6 % for a/R = 0.08.
 
-The upper body is supported by contact alone, so that the form ``dual-bounds`` does not
+The upper body is supported by contact alone; hence the form ``dual-bounds`` does not
 exist. A support of the lower body along z has no reaction. The displacement far from
 the contact is that of the half-space minus the approach of distant points to the plane
 z = 0. The approach is evaluated at the side opposite the contact and summed over the
