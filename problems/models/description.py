@@ -138,8 +138,8 @@ LENGTH_UNITS = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-#: smallest modulus without a remark, Pa. A smaller modulus is that of a material softer
-#: than rubber, or was meant to be in MPa
+#: smallest modulus without a remark, Pa. A smaller modulus belongs to a material softer
+#: than rubber, or was mistakenly entered in MPa
 MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
     "mesh",

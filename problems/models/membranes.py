@@ -130,7 +130,7 @@ class Membranes:
 
     @property
     def body(self) -> Nodes:
-        """Membrane of each cell, (E,)."""
+        """Index of the membrane of each cell, (E,)."""
         return self._joined[1]
 
     @cached_property

@@ -78,8 +78,8 @@ class _Change(NamedTuple):
 def regressions(c: Comparison) -> Regressions:
     """Find the solvers and cells that became slower from one folder to the other.
 
-    If several folders are compared with one, the intervals of all comparisons hold
-    jointly.
+    If several folders are compared with the same earlier folder, the confidence level
+    applies jointly to the intervals of all comparisons.
     """
     changes = _changes(c)
     by_solver = grouped(changes, lambda change: change.outcome.solver)

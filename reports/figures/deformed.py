@@ -522,7 +522,7 @@ def _axes(span: float) -> dict[str, Any]:
 
 
 def _loaded(fields: Fields) -> list[_Loaded]:
-    """List the contacts under load; a single one if the fields do not name pairs."""
+    """List the contacts under load; a single item if the fields do not name pairs."""
     sides = [
         (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
     ]

@@ -95,7 +95,7 @@ def answer(a: Analysis) -> Iterator[Part]:
 
 @section(2, "forms", "Solver times for each form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare solvers within each form; empty if the first section already does so."""
+    """Compare solvers within each form, unless the first section already does."""
     if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED

@@ -276,8 +276,8 @@ def _iterate(
 
 def _state(task: _Task, x: Vector) -> _State:
     """Return the state at x with the residual recomputed."""
-    # project twice: the second projection removes the rounding errors of a large y in
-    # the first
+    # project twice: the second projection removes the rounding errors that a large y
+    # causes in the first
     once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
     return _project(task, *once)
 

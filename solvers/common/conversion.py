@@ -70,7 +70,7 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`; for "auto", return how P is stored, "dense" or "sparse"."""
+    """Return `backend`, or for "auto" the storage of P, "dense" or "sparse"."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"

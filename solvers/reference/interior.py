@@ -239,7 +239,7 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    # from far outside a disc, its slack would shrink before x is near it
+    # if x started far outside a disc, the slack of the disc would shrink too early
     for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)

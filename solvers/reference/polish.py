@@ -34,7 +34,9 @@ MAX_REFINEMENTS = 40  #: limit of refinement steps per active set
 #: refinement ends if a step is longer than this times the previous step
 MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
-FULL_CHANGES = 10  #: updates of the active set before only the worst constraint changes
+#: number of updates of the whole active set, after which only the worst constraint
+#: changes
+FULL_CHANGES = 10
 #: Multipliers of the wrong sign and violations count as rounding below this value,
 #: relative to the largest component.
 SIGN_ROUNDING = 4 * float(np.finfo(float).eps)

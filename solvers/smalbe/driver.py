@@ -192,7 +192,7 @@ def _projected(
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and not qp.b.size and qp.q.any():
         # no step depends on the norm, and q is closer to the first eigenvector than a
-        # random vector
+        # random vector is
         find = partial(by_lanczos, steps=1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())

@@ -58,7 +58,8 @@ RANK = 1e-13  #: smaller squared pivots of normalised rows count as rounding
 FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
 #: limit of rows with entries in bounded components, whose block is dense
 MAX_BORDER = 2000
-MAX_DENSE_ENTRIES = 2000  #: sparse G with more than this many entries m·n stay sparse
+#: a sparse G stays sparse if m·n exceeds this value
+MAX_DENSE_ENTRIES = 2000
 
 
 class Transposed(Protocol):

@@ -206,7 +206,7 @@ def _kernels(
     if nu is None:
         return [_extended(I_0, period)]
     # an odd function jumps at half a period; any value is admissible there, because no
-    # two cells are so far apart
+    # two cells are that far apart
     for axis, M in enumerate(period):
         if M % 2 == 0:
             np.moveaxis(I_xy, axis, 0)[M // 2] = 0
