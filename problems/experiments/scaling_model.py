@@ -224,8 +224,8 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
         ),
         joints=_joints(s, machine, distinct) if s.cluster > 1 else 0.0,
         # in elasticity, each component of a node moves in 3 of the 6 rigid modes (a
-        # translation, two rotations), in heat transfer in the only mode: for each entry
-        # of B, G has 3 entries or 1 entry
+        # translation, two rotations); heat transfer has a single mode. For each entry
+        # of B, G therefore has 3 entries or 1 entry
         rows=2 * ENTRY * (1 + (s.modes + 1) // 2) * s.entries / s.cores
         / machine.bandwidth,
         messages=2 * s.neighbours * machine.latency + sent * machine.seconds_per_byte,

@@ -134,7 +134,8 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of a QPS text.
 
-    Rows e1 … are Ax = b, rows i1 … are Gx ≤ h, and columns are x1 ….
+    Rows e1, e2, … represent Ax = b, rows i1, i2, … represent Gx ≤ h, and columns x1,
+    x2, … represent the variables.
     """
     rows = [f"e{i + 1}" for i in range(qp.b.size)]
     rows += [f"i{i + 1}" for i in range(qp.h.size)]

@@ -260,7 +260,7 @@ def read_evidence(
 ) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
 
-    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
     warn : function that receives warnings about damaged lines and records whose
         residuals contradict their verdict
 

@@ -36,7 +36,7 @@ from mortarbench.solvers.reference.projection import projection_iterates, refine
 
 #: largest KKT residual of a reliable start for refinement. From a start with a larger
 #: residual, refinement of a QP with many solutions ended at a solution of size 1e10,
-#: whose rounding hid errors of the optimal value; therefore other starts are tried too
+#: whose rounding hid errors of the optimal value; in this case, other starts are tried
 MAX_START_RESIDUAL = 1e-3
 #: number of rounds of `projection` without a smaller residual after which it may end
 MAX_IDLE_ROUNDS = 1

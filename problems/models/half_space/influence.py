@@ -118,8 +118,8 @@ class Influence:
         for c in range(components):
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
-        # transform along y in strips that stay in cache, because half of each row is
-        # zero on input and half of the output is not required
+        # transform along y in strips that stay in the cache. The padded rows are never
+        # stored as a whole: half of their input is zero, half of their output is unused
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
