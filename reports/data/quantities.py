@@ -59,7 +59,7 @@ def unit(outcome: Outcome, name: str) -> str:
 
 
 def known_digits(doubt: float, most: int) -> int:
-    """Return the number of digits on which answers agree, plus one; from 1 to `most`.
+    """Return the number of digits on which answers agree, plus one; at most `most`.
 
     doubt : relative difference of the answers
     """

@@ -78,7 +78,10 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return end of colour scale and largest stress, Pa; None without a stress."""
+    """Return the end of the colour scale and the largest stress, Pa.
+
+    Return None if the fields contain no stress.
+    """
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -605,7 +608,7 @@ def _enlarged(
 
 
 def _states(friction: NDArray[np.str_]) -> str:
-    """Count the nodes in each friction state, with the colour of their arrows."""
+    """Count the nodes in each friction state; name the colour of their arrows."""
     counts = {state: int((friction == state).sum()) for state in _STATES}
     return ", ".join(
         f"{state}: {_STATES[state][1]} ({count})"

@@ -193,7 +193,7 @@ def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
 
 
 def weak_figure(series: Sequence[WeakSeries]) -> Figure:
-    """Plot time against ranks at a constant size per rank, a panel for each phase."""
+    """Plot time against ranks at constant size per rank, with a panel for each phase."""
     shown = sorted({m.ranks for s in series for m in s.members})
     panels = []
     for phase in PHASES:

@@ -152,7 +152,7 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
-    """Yield points refined from a start for which outliers in the data are ignored."""
+    """Yield points refined from a start that is computed without outlying data."""
     scaled = equilibrate(qp)
     near = scaled.qp.h < _outlier_size(scaled.qp)
     tame = equilibrate(_without_outliers(scaled.qp, near))
@@ -165,7 +165,7 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 
 
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points with a smaller δ, for weak curvature or nearly parallel rows."""
+    """Yield points for a smaller δ: weak curvature or nearly parallel rows need it."""
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     for delta in (1e-13, 1e-16):

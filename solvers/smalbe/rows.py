@@ -176,7 +176,7 @@ class GramFactor(Protocol):
         """Return L⁻ᵀa."""
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ, F: free components."""
+        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ, where F is `free`."""
 
 
 @dataclass(frozen=True, eq=False)
