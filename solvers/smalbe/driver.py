@@ -248,9 +248,9 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     where CG takes about ten products, the steps beyond seven or eight save no more
     products than they cost. Seven steps for all sizes would save up to a fifth of the
     products on dense duals with bounds alone, but would require up to 1.9 times as many
-    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum, so
-    that more steps are worthwhile: with n/10 steps, the 24 problems of
-    greco/n=32/dual-bounds take 170 products instead of 152.
+    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
+    which makes more steps worthwhile: with n/10 instead of n/6 steps, the 24 problems
+    of greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0

@@ -184,8 +184,8 @@ class WholeGram:
     """Cholesky factor of GGᵀ for all rows, replicated on every rank.
 
     Active bounds of a face change only the block of GGᵀ for the rows with entries in
-    bounded components. These rows are the border of the factor, of which only the Schur
-    complement is factorised again.
+    bounded components. These rows are the border of the factor; on each face, only
+    the Schur complement of the border is factorised again.
     """
 
     unit: LocalRows | DistributedColumns  #: normalised rows G (r, n)
