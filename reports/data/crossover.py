@@ -96,7 +96,8 @@ class Crossover(NamedTuple):
     """Comparison of two routes on the sizes that both reached."""
 
     #: smallest number of dofs such that the dual route is significantly faster at this
-    #: and every larger size with repeats; None if it is not so at the largest
+    #: and every larger size with repeats; None if the dual route is not significantly
+    #: faster at the largest of these sizes
     pays: int | None
     smallest: int  #: smallest number of dofs that both routes reached
     largest: int  #: largest number of dofs that both routes reached

@@ -1,7 +1,7 @@
 """Equilibration: scaling of variables and rows that is independent of units.
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
-largest entries until all largest entries are about one (Ruiz 2001, RAL-TR-2001-034).
+largest entries until every largest entry is about one (Ruiz 2001, RAL-TR-2001-034).
 The scale of x relative to that of y and z remains free; it is chosen such that the
 largest entry of P is about one, whatever the unit of the objective. All factors are
 powers of two; hence scaling and scaling back cause no rounding errors.

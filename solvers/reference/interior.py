@@ -239,7 +239,8 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    # if x started far outside a disc, the slack of the disc would shrink too early
+    # if x started far outside a disc, the slack of the disc would shrink before x came
+    # near the disc
     for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)
