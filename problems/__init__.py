@@ -38,8 +38,8 @@ PROBLEMS: Registry[Family] = Registry(
     }
 )
 
-#: functions that restore the Hessian P of a stored QP of these families if P is an
-#: operator, see `harness.operators`
+#: functions that restore the Hessian P of a stored QP if P is an operator, by the name
+#: of the operator; see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
     {
         "tfeti": entry(

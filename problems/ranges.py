@@ -134,7 +134,7 @@ LINEAR_ONLY: Mapping[str, Value] = {
     "plane": "strain",
     "relin": 1,
 }
-#: keys of a case of bodies whose defaults a TOML file may set
+#: keys of the family `bodies` that its TOML file may also set
 SETTINGS = schema(
     **METHODS,
     **PLANES,
@@ -309,7 +309,10 @@ def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> No
 
 
 def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for friction on arcs, as refinement changes their polygons."""
+    """Raise InputError if a mesh with friction on arcs is to be refined.
+
+    Refinement changes the polygons that approximate the arcs.
+    """
     if params["friction"] != "none":
         raise InputError(
             f"{family}: friction={params['friction']} on curved sides, whose slip "
@@ -320,8 +323,8 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
 def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError if the discretisation error is requested at finite strain.
 
-    The QP of the next finer mesh is linearised at a different state, so that the
-    distance between the two solutions is not the discretisation error of either mesh.
+    The QP of the next finer mesh is linearised at a different state. The distance
+    between the two solutions is therefore not the discretisation error of either mesh.
     """
     if params["kinematics"] == "finite":
         raise InputError(
@@ -348,7 +351,8 @@ def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
 def check_tangential(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak.
 
-    Both tangential forces are relative to μP, the limit of friction.
+    Q is the final tangential force and `peak` is the largest one before unloading, both
+    relative to the limit of friction, μP.
     """
     Q, peak = float(params["Q"]), float(params["peak"])
     if not 0 < peak < 1:

@@ -33,12 +33,12 @@ def write_report(
 
     The format html gives index.html and md gives report.md; tex and csv give tables in
     tables/, and parquet gives the journal as records.parquet. With html, md or tex, all
-    figures are written to figures/ as PDF, SVG and PNG. Equal journals give files with
-    equal bytes.
+    figures are written to figures/ as PDF, SVG and PNG. Equal journals yield files with
+    identical bytes.
 
     Parameters
     ----------
-    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
     pool_forms : compute means, ranks and profiles over the cases of all forms
 
     Returns
@@ -75,7 +75,7 @@ def figures(
 ) -> dict[str, Figure | FieldFigure]:
     """Return the figures of the report on a result folder by their file stems.
 
-    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 
     Raises
     ------
@@ -95,7 +95,7 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
     the mesh to a verified answer. The others compare the solvers of each form and name
     failures.
 
-    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 
     Raises
     ------

@@ -4,7 +4,8 @@ An analysis computes the displacement at every load step from the mesh. Two vari
 compared, both with all Dirichlet conditions as rows of B. The variant ``per-row`` of
 the paper solves with the factor of K for each row of B in each step, and uses the
 textbook SMALBE for the dual QPs. The variant ``condensed`` computes K⁺ on the interface
-once, so that each step requires one small product, and uses the SMALBE of this project.
+once, after which each step requires one small product, and uses the SMALBE of this
+project.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ Contestant = Callable[[], Laps]  #: method that runs once and returns its times
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """Number of rounds: `most`, or at least `least` if rounds take too long."""
+    """Number of rounds: `most`, or fewer (at least `least`) if rounds take too long."""
 
     most: int
     least: int = 5

@@ -100,8 +100,8 @@ def inverse(plan: Plan) -> Rows:
         rows = race(contestants, plan.inverse_rounds)
         if mesh.dofs <= plan.dense:
             pinv = {"pinv": partial(_pinv, K, v)}
-            # timed separately, because its dense matrices would evict the data of the
-            # other methods from the caches
+            # the pseudoinverse is timed separately, because its dense matrices would
+            # evict the data of the other methods from the caches
             rows += race(pinv, plan.inverse_rounds, warm=False)
         for row in rows:
             yield {"Nr": Nr, "n": mesh.dofs} | row

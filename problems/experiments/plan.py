@@ -18,12 +18,12 @@ class Plan:
     inverse: tuple[int, ...]  #: Nr of Figure 5
     inverse_rounds: Rounds
     dense: int  #: largest number of dofs for which a dense pseudoinverse is computed
-    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last also of Table 1
+    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; Table 1 uses the last
     scaling_rounds: Rounds
     Nh: int = 15  #: Nh of Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
     steps: int = 10  #: load steps
-    stepped: tuple[int, int]  #: Nr, Nh of the study of the load stepping
+    stepped: tuple[int, int]  #: Nr, Nh of the study of load stepping
     stepping: tuple[int, ...]  #: numbers of load steps in this study
     relin: tuple[int, ...] = (1, 2, 3)  #: linearisations per step in this study
     patch: tuple[int, ...]  #: elements along the upper block of the patch test

@@ -7,8 +7,9 @@ subsequent projection take
     t = local products + joints + rows + messages + reductions + coarse problem.
 
 - *Local products.* One triangle of the block (K⁺)_bb of every subdomain is read from
-  memory once; b are the components on the surface of the subdomain. Congruent
-  subdomains share a block, so that the time is that of the floating-point operations.
+  memory once; b are the components on the surface of the subdomain. If all
+  subdomains of a core are congruent, they share one block, and the floating-point
+  operations determine the time.
 - *Joints* of clusters: the product with V M⁺Vᵀ (see docs/feti-space.md). The columns V
   of every subdomain are applied twice, and one triangle of the dense matrix M⁺ of every
   cluster is read once.
@@ -17,7 +18,7 @@ subsequent projection take
   entries on k cores is owned by one of them, which sends the multiplier to the other
   k − 1 cores and receives their contributions: 2(k − 1) numbers in two rounds of
   messages.
-- *Reductions* take one latency for each level of a binary tree of cores.
+- *Reductions* cost one latency for each level of a binary tree of cores.
 - *Coarse problem.* Its unknowns are the rigid modes of every subdomain, or of every
   cluster of m × m × m subdomains. With at most `REPLICATED` unknowns, the rows of the
   explicit inverse are distributed over all cores, or each core solves with a sparse
@@ -139,7 +140,7 @@ class Distribution:
 
     @property
     def dofs(self) -> float:
-        """Degrees of freedom of the undivided cube, without one layer of nodes."""
+        """Degrees of freedom of the undivided cube, counting n³ nodes per subdomain."""
         return self.components * self.cells**3 * self.cores * self.per_core
 
     @property
@@ -222,8 +223,9 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
             2.0 * s.block**2 * s.per_core / machine.rate,
         ),
         joints=_joints(s, machine, distinct) if s.cluster > 1 else 0.0,
-        # each component of a node moves in 3 of the 6 rigid modes (a translation, two
-        # rotations), or in the only mode: G has 3 entries or 1 for each entry of B
+        # in elasticity, each component of a node moves in 3 of the 6 rigid modes (a
+        # translation, two rotations); heat transfer has a single mode. For each entry
+        # of B, G therefore has 3 entries or 1 entry
         rows=2 * ENTRY * (1 + (s.modes + 1) // 2) * s.entries / s.cores
         / machine.bandwidth,
         messages=2 * s.neighbours * machine.latency + sent * machine.seconds_per_byte,

@@ -85,7 +85,7 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; raise InputError with friction.
+        """Return the keys with half the mesh size; raise InputError if friction is set.
 
         The load steps of the refined case are solved on the refined mesh. Friction is
         not supported, because refinement changes the polygons of the arcs.

@@ -46,7 +46,7 @@ class Cantilever(DeclaredFamily):
     model = "cantilever.newton_step"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Return all keys; by default, nx = 2·ny·slenderness, and step is steps."""
+        """Return all keys; by default, nx = 2·ny·slenderness and step = steps."""
         params: dict[str, Any] = {**self.defaults, **given}
         # the number is limited before it is rounded: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)

@@ -15,7 +15,7 @@ A matrix is a group with the members nzmax, m, n, nz, p, i and x. It is stored b
 columns if nz = −1, by rows if nz = −2, and as nz triplets otherwise. According to the
 documentation of FCLIB, p contains the row indices of triplets, but files written by
 Siconos follow CSparse, where p contains the column indices. Both conventions are read;
-if the indices fit the shape of the matrix in both, the second is used.
+if the indices fit the shape of the matrix under both, the second is used.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.

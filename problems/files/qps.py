@@ -1,17 +1,17 @@
 """QPS: the MPS format of linear programs with a section for the quadratic term.
 
-Fields are separated by white space, so that names cannot contain any. Files in fixed
-columns can be read if their names contain no spaces. Sections follow Maros and Mészáros
-(1999), "A repository of convex quadratic programming problems", Optim. Methods Softw.
-11/12:
+Fields are separated by white space, which names therefore cannot contain. Files in
+fixed columns can be read if their names contain no spaces. Sections follow Maros and
+Mészáros (1999), "A repository of convex quadratic programming problems", Optim. Methods
+Softw. 11/12:
 
 * N rows after the first are ignored; the RHS of the objective is minus its constant.
 * A number R in RANGES changes  ≤ b  to [b − |R|, b],  ≥ b  to [b, b + |R|],  and  = b
   to [b, b + R] or, if R < 0, to [b + R, b].
 * BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in
   commercial readers.
-* QUADOBJ and QSECTION contain one triangle of P, and QMATRIX both. The objective is
-  ½xᵀPx + qᵀx, so that diagonal entries are those of P, not halved.
+* QUADOBJ and QSECTION contain one triangle of P, and QMATRIX contains both. The
+  objective is ½xᵀPx + qᵀx; the diagonal entries are those of P, not half of them.
 
 Undefined names and malformed numbers raise an error that states their line. (The reader
 of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
@@ -134,7 +134,8 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of a QPS text.
 
-    Rows e1 … are Ax = b, rows i1 … are Gx ≤ h, and columns are x1 ….
+    Rows e1, e2, … represent Ax = b, rows i1, i2, … represent Gx ≤ h, and columns x1,
+    x2, … represent the variables.
     """
     rows = [f"e{i + 1}" for i in range(qp.b.size)]
     rows += [f"i{i + 1}" for i in range(qp.h.size)]

@@ -23,8 +23,8 @@ class TwoSidedQP(NamedTuple):
     A: Any  #: (m, n) sparse
     l: Vector  #: (m,) lower limits; ≤ −1e20: no limit
     u: Vector  #: (m,) upper limits; ≥ 1e20: no limit
-    lb: Vector  #: (n,) like l
-    ub: Vector  #: (n,) like u
+    lb: Vector  #: (n,) lower bounds; ≤ −1e20: no bound
+    ub: Vector  #: (n,) upper bounds; ≥ 1e20: no bound
 
 
 def one_sided(qp: TwoSidedQP) -> QP:

@@ -123,7 +123,7 @@ def bodies(
             tuple(solids), tuple((*grid.divisions, depth) for grid in grids)
         )
     by_name = shape.sides
-    # in the plane m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
+    # in the plane, these are m_E = 2(Nr + 1) + 4(radial + 1) components
     clamped = [
         dofs_of(nodes_of_side(by_name[b]), shape.dim)
         for b in ("left", "left_foot", "right_foot")

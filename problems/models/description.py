@@ -138,8 +138,8 @@ LENGTH_UNITS = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-#: smallest modulus without a remark, Pa. A smaller modulus is that of a material softer
-#: than rubber, or was meant to be in MPa
+#: smallest modulus without a remark, Pa. A smaller modulus belongs to a material softer
+#: than rubber, or was mistakenly entered in MPa
 MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
     "mesh",
@@ -344,7 +344,7 @@ def _check_loads_act(
     loads: Sequence[NDArray[np.float64]],
     fixed: Nodes,
 ) -> None:
-    """Raise InputError if a component of a load acts on fixed components only."""
+    """Raise InputError if a load acts along an axis in which its nodes are fixed."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
         without_effect, dim = [], load.shape[1]
         for axis, name in enumerate(_AXES[:dim]):

@@ -146,7 +146,8 @@ def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None
 def overlap_remark(params: Mapping[str, Value]) -> tuple[str, ...]:
     """Return a remark if a slave node is inside its master before any load acts.
 
-    Overlaps of up to `MAX_OVERLAP` times the extent of the smallest body cause none.
+    Overlaps of up to `MAX_OVERLAP` times the extent of the smallest body are accepted
+    without a remark.
     """
     p: Any = params
     whole = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]).whole

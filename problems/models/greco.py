@@ -12,7 +12,7 @@ normal force at x = 38.75 mm for 32 cells per side (GRECO working group on frict
 document V6.04.128 of Code_Aster).
 
 In space (dim=3) the square is extruded along z into layers of cubes. The end faces have
-u_z = 0, so that the solution is that of plane strain in every layer of nodes.
+u_z = 0; the solution in every layer of nodes is therefore that of plane strain.
 """
 
 from __future__ import annotations

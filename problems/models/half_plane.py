@@ -14,9 +14,11 @@ positive definite on intervals shorter than 4a. Since the total force is prescri
 constant is free: it is the multiplier of the single equation Σλ = force. This is the
 form ``dual`` of bodies with one rigid motion.
 
-* law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R; |x| ≤ 3a/2
+* law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R. The elements
+  cover |x| ≤ 3a/2
 * law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
-  exact p and, in unloading, the exact tractions λ* at the peak, otherwise 0; |x| ≤ a
+  exact pressure p. In unloading, λ* are the exact tangential forces at the peak;
+  otherwise λ* = 0. The elements cover |x| ≤ a
 
 Forces are in units of F₀, which is P for normal and μP for tangential forces, and
 displacements in units of l = 2F₀/(πE*). Then F is a matrix of logarithms, and Hertz's

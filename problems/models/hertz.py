@@ -8,7 +8,7 @@ with the pressure
 
 Bodies are half discs under a uniform pressure on the flat side. The force is
 prescribed, since the theory does not determine the approach. Contact alone supports the
-upper body vertically, so that the form ``dual-bounds`` does not exist.
+upper body vertically; hence the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
 Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. Each of the

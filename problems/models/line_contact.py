@@ -76,7 +76,7 @@ class TangentialContact:
 
         The pairs of the loading come before those of the unloading.
         """
-        stuck = 1 - self.peak  # (c/a)² = 1 − Q*/μP, and the force of its semicircle
+        stuck = 1 - self.peak  # (c/a)², equal to the force of its semicircle
         loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
         if self.Q == self.peak:
             return loading

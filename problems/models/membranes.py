@@ -8,7 +8,7 @@ use as a benchmark. Under unit tension,
 
 on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 for y > ¾,
 f_2 = −1 for y < ¼, and both are zero elsewhere. The second membrane floats and is
-supported by the first one alone, so that the sum of the contact forces is its load, ¼.
+supported by the first one alone; hence the sum of the contact forces is its load, ¼.
 
 Elements are bilinear. Each membrane is decomposed into S × S congruent squares of n × n
 cells.
@@ -130,7 +130,7 @@ class Membranes:
 
     @property
     def body(self) -> Nodes:
-        """Membrane of each cell, (E,)."""
+        """Index of the membrane of each cell, (E,)."""
         return self._joined[1]
 
     @cached_property

@@ -190,7 +190,7 @@ def _rank_quantities(
 ) -> Mapping[str, Any]:
     """Return `obstacle_quantities` from the solutions of all ranks; collective.
 
-    The constant of the energy is that of `Problem.energy`: qᵀw − ½wᵀKw with the lift w.
+    The energy includes the constant qᵀw − ½wᵀKw of `Problem.energy`, with the lift w.
     """
     boundary = np.unique(np.concatenate([*grid.sides.values()]))
     n = grid.divisions[0]

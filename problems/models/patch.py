@@ -2,8 +2,8 @@
 
 Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both have
 rollers on their left sides, and the lower one also on its bottom; the pressure p acts
-on the top of the upper one. The exact displacement is linear in each block, so that
-bilinear elements represent it exactly:
+on the top of the upper one. The exact displacement is linear in each block;
+bilinear elements therefore represent it exactly:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
@@ -11,7 +11,7 @@ A contact discretisation passes the test if it reproduces this solution, that is
 transfers constant pressures exactly (Taylor and Papadopoulos 1991). Mortar methods
 pass. One-pass node-to-segment contact fails: its error in σ_y is of order one and does
 not vanish with the mesh size. Friction has no effect if the blocks are of the same
-material. The upper block is supported by contact alone, so that the form
+material. The upper block is supported by contact alone; hence the form
 ``dual-bounds`` does not exist.
 
 In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =

@@ -4,7 +4,7 @@ A plate of `width` × `height` is clamped at its left edge and pulled down by 1 
 of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some
 subdomains, the modulus is multiplied by `jump`: in every other subdomain
 (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
-contact, so that the dual has equality constraints only. Condition numbers of the dual
+contact; hence the dual has equality constraints only. Condition numbers of the dual
 measure the scalability of the method independently of load, stopping test and units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right

@@ -115,7 +115,7 @@ class Pair:
 
     @property
     def other_answer(self) -> bool:
-        """True if both answers are verified but differ more than their gaps allow."""
+        """True if verified answers differ by more than their gaps allow."""
         return self.answers is not None and self.answers[2] > self.may_differ
 
 
@@ -237,10 +237,11 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     """Average logarithms of ratios over cells, with a bootstrap interval over cells.
 
     A cell is resampled as a whole, with its times before and after. Percentile
-    intervals of n values are too narrow, by the factor √((n−1)/n) and because their
-    tails are normal instead of Student's. The distances of their ends from the mean are
-    therefore increased to correct both effects [1]_. The names of the cells seed the
-    generator. For fewer than three cells the interval is unbounded.
+    intervals of n values are too narrow for two reasons: resamples scatter too little,
+    by the factor √((n−1)/n), and their tails are normal instead of Student's. The
+    distances of the ends from the mean are increased to correct both effects [1]_. The
+    names of the cells seed the generator. For fewer than three cells the interval is
+    unbounded.
 
     References
     ----------

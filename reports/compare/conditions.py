@@ -11,8 +11,8 @@ from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import flatten
 from mortarbench.reports.data.evidence import Evidence
 
-#: parts of an environment that must be equal for times to be comparable; a comparison
-#: is usually about the others (versions, source, plugins)
+#: parts of an environment that must be equal for times to be comparable; differences in
+#: the other parts (versions, source, plugins) are usually the subject of a comparison
 HARDWARE = ("machine", "threads", "cholmod")
 
 Difference = tuple[str, Any, Any]  #: dotted key, value before, value after

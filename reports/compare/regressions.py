@@ -8,8 +8,8 @@ Both intervals are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases, at least three, with Student's interval
   over them. Their scatter includes the differences between runs on one case.
-- Single cell: its error is the larger of two: Welch's error over the repeats, and the
-  scatter of the cells about the means of their solvers (1.4826 times the median
+- Single cell: its standard error is the larger of Welch's error over the repeats and
+  the scatter of the cells about the means of their solvers (1.4826 times the median
   distance, which is the standard deviation of a normal law). At least `CELLS` cells are
   needed to estimate the scatter.
 
@@ -78,8 +78,8 @@ class _Change(NamedTuple):
 def regressions(c: Comparison) -> Regressions:
     """Find the solvers and cells that became slower from one folder to the other.
 
-    If several folders are compared with one, the intervals of all comparisons hold
-    jointly.
+    If several folders are compared with the same earlier folder, the confidence level
+    applies jointly to the intervals of all comparisons.
     """
     changes = _changes(c)
     by_solver = grouped(changes, lambda change: change.outcome.solver)

@@ -26,7 +26,7 @@ def write_comparison(
 
     The files are index.html for the format html, report.md for md, tables/ for tex, and
     tables/changes with a row per cell for csv and parquet. Equal journals give files
-    with equal bytes.
+    with identical bytes.
 
     factor : residuals may be up to factor·tol, in both folders
 

@@ -11,7 +11,7 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
 from mortarbench.reports.document.layout import Cell, Column, Table, sources
 
-#: mark after a verdict that a proven optimum decided against the residuals
+#: mark after a verdict that is based on a proven optimum and contradicts the residuals
 BY_OPTIMUM = "⋆"
 
 
@@ -21,7 +21,7 @@ def source(*outcomes: Outcome) -> str:
 
 
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
-    """Return a cell with a verdict, and how many repeats share it if not all do.
+    """Return a cell with a verdict; if repeats differ, add how many share it.
 
     message : message of the solver, shown on hovering
     """
@@ -78,7 +78,7 @@ def answer_columns(
 def solver_columns(
     solvers: Iterable[str], cell: Callable[[str, Any], Cell]
 ) -> Iterator[Column]:
-    """Yield a column per solver; `cell` returns its entry from solver and item."""
+    """Yield a column per solver; `cell` maps solver and item to the entry."""
     return ((clean(s, 40), partial(cell, s)) for s in solvers)
 
 

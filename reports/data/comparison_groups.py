@@ -261,7 +261,7 @@ def time_of(outcome: Outcome) -> float | None:
 
 
 def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
-    """Mark pairs of solvers without common blocks on some case."""
+    """Mark pairs of solvers that have no common block on at least one case."""
     n = len(group.solvers)
     apart, faster = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):

@@ -2,7 +2,7 @@
 
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
 fastest of the solvers that were measured on it; the primal form with multigrid is a
-separate route. Cases of a growing series are built anew for each repeat, so that the
+separate route. Cases of a growing series are built anew for each repeat; hence the
 time includes all work between the mesh and the recovered displacements:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
@@ -95,8 +95,9 @@ class Map:
 class Crossover(NamedTuple):
     """Comparison of two routes on the sizes that both reached."""
 
-    #: number of dofs from which on the dual route is significantly faster; None if it
-    #: is not
+    #: smallest number of dofs such that the dual route is significantly faster at this
+    #: and every larger size with repeats; None if the dual route is not significantly
+    #: faster at the largest of these sizes
     pays: int | None
     smallest: int  #: smallest number of dofs that both routes reached
     largest: int  #: largest number of dofs that both routes reached
@@ -173,7 +174,10 @@ def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:
 
 
 def _inapplicable(answers: Mapping[int, Iterable[Outcome]]) -> bool:
-    """Return whether all solvers declined, as they do undivided bodies on two ranks."""
+    """Return True if all solvers declined every case.
+
+    This happens, for example, for undivided bodies on two ranks.
+    """
     every = [o for of in answers.values() for o in of]
     return all(o.verdict is Verdict.DECLINED for o in every)
 

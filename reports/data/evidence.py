@@ -260,7 +260,7 @@ def read_evidence(
 ) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
 
-    factor : residuals may be up to factor·tol; verdicts in the journal allow 10·tol
+    factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
     warn : function that receives warnings about damaged lines and records whose
         residuals contradict their verdict
 
@@ -296,7 +296,7 @@ def read_evidence(
 
 
 def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Replace environments whose times are comparable by the first of them."""
+    """Replace each environment by the first one whose times are comparable with it."""
     representatives: dict[str, Mapping[str, Any]] = {}
     united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):

@@ -48,7 +48,7 @@ Leaves = dict[tuple[str, ...], Leaf]  #: scalars by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Return whether the bodies are elastic, so that quantities are in SI units."""
+    """Return True if the bodies are elastic; all quantities are then in SI units."""
     return _STRESS in outcome.quantities
 
 
@@ -59,7 +59,7 @@ def unit(outcome: Outcome, name: str) -> str:
 
 
 def known_digits(doubt: float, most: int) -> int:
-    """Return the number of digits on which answers agree, plus one; from 1 to `most`.
+    """Return the number of digits on which answers agree, plus one; at most `most`.
 
     doubt : relative difference of the answers
     """

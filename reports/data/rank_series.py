@@ -1,9 +1,10 @@
 """Measured strong and weak scaling of one solve over the number of ranks.
 
 Strong scaling solves one case on an increasing number of ranks. Weak scaling enlarges
-the case with the number of ranks, so that the work per rank stays constant. Both are
-reported separately for preparation and solve. They are compared with copies: as many
-simultaneous independent solves as ranks, which share the machine's memory as ranks do.
+the case with the number of ranks, which keeps the work per rank constant. Both are
+reported separately for preparation and solve. They are compared with copies, that is,
+simultaneous independent solves, one per rank, which share the machine's memory as ranks
+do.
 """
 
 from __future__ import annotations
@@ -132,7 +133,7 @@ class Member(NamedTuple):
 class WeakSeries(_Scaling):
     """Verified answers of one solver to cases with equally many dofs per rank.
 
-    The copies solve the first case.
+    The copies are simultaneous solves of the first case.
     """
 
     title: str  #: family, fixed parameters, solver, tolerance

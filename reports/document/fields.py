@@ -28,7 +28,7 @@ class ColourScale:
     label: str = ""
     unit: float = 1.0  #: value that the bar labels as 1
     beyond: Literal["neither", "max", "both"] = "neither"  #: ends that clip values
-    names: tuple[str, ...] = ()  #: names of the classes, shown at the colour bar
+    names: tuple[str, ...] = ()  #: names of the classes, shown beside the colour bar
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

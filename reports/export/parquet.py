@@ -24,7 +24,7 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     A column has the type of its field, not a type inferred from its values, so that
     tables of several result folders can be concatenated. Nested values (params,
     options, counts, quantities, …) are JSON text, since they differ between families
-    and solvers. Equal records give equal bytes.
+    and solvers. Equal records yield identical bytes.
     """
     table = pa.table(
         {

@@ -78,7 +78,10 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return end of colour scale and largest stress, Pa; None without a stress."""
+    """Return the end of the colour scale and the largest stress, Pa.
+
+    Return None if the fields contain no stress.
+    """
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -403,7 +406,7 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
         if size is not None:
             centres = points[cells].mean(axis=1)
             middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
-            place = _pair(centres[middle])  # of a cell: the centroid may lie outside
+            place = _pair(centres[middle])  # the centroid may be outside the subdomain
             marks.append(
                 Label(
                     text=f"{number}",
@@ -522,7 +525,7 @@ def _axes(span: float) -> dict[str, Any]:
 
 
 def _loaded(fields: Fields) -> list[_Loaded]:
-    """List the contacts under load; a single one if the fields do not name pairs."""
+    """List the contacts under load; a single item if the fields do not name pairs."""
     sides = [
         (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
     ]
@@ -605,7 +608,7 @@ def _enlarged(
 
 
 def _states(friction: NDArray[np.str_]) -> str:
-    """Count the nodes in each friction state, with the colour of their arrows."""
+    """Count the nodes in each friction state; name the colour of their arrows."""
     counts = {state: int((friction == state).sum()) for state in _STATES}
     return ", ".join(
         f"{state}: {_STATES[state][1]} ({count})"

@@ -73,7 +73,7 @@ def traction_maps(fields: Fields) -> FieldFigure | None:
 
 
 class _Grid:
-    """Cells of a regular grid of which some are in contact."""
+    """Regular grid of cells, some of which are in contact."""
 
     def __init__(
         self, centres: NDArray[np.float64], h: float, closed: NDArray[np.bool_]

@@ -47,7 +47,7 @@ _PALE = "#a9cde6"  #: colour of a band in the legend: the first colour with this
 _LONG = 72  #: largest number of characters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the values
-_REST = "#9aa2ad"  #: time outside the listed parts
+_REST = "#9aa2ad"  #: colour of the time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 _MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
 #: boundary of measured and modelled speed-ups
@@ -193,7 +193,7 @@ def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
 
 
 def weak_figure(series: Sequence[WeakSeries]) -> Figure:
-    """Plot time against ranks at a constant size per rank, a panel for each phase."""
+    """Plot time against ranks at constant size per rank, with one panel per phase."""
     shown = sorted({m.ranks for s in series for m in s.members})
     panels = []
     for phase in PHASES:

@@ -54,7 +54,7 @@ def legible(label: str, limit: int = 32) -> str:
 
 
 def look(index: int) -> Look:
-    """Return colour, marker and dashes of a solver, which differ in greyscale as well.
+    """Return colour, marker and dashes of a solver, distinguishable in greyscale.
 
     Beyond the length of `COLOURS`, colours recur with other markers.
     """

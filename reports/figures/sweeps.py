@@ -90,7 +90,7 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
 
 
 def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> Figure:
-    """Plot the largest residual against time, a panel for each (case, sweep).
+    """Plot the largest residual against time, with a panel for each (case, sweep).
 
     solvers : all solvers of the report, whose order determines colours and markers
     """
@@ -137,7 +137,7 @@ def certified_figure(
     solvers: Sequence[str],
     meshes: Mapping[str, float],
 ) -> Figure:
-    """Plot the certified error against time, a panel for each (case, sweep).
+    """Plot the certified error against time, with a panel for each (case, sweep).
 
     solvers : all solvers of the report, whose order determines colours and markers
     meshes : physical case → its discretisation error, if available

@@ -5,7 +5,7 @@ from __future__ import annotations
 PAPER = "Pospíšil, Světlík, Varga, Čermák, CST 2024, doi:10.4203/ccc.9.10.5"
 MACHINE = "AMD Ryzen 5 3600, MATLAB R2020a"
 
-#: Section 5, seconds: Nr = 30, Nh = 15, ten steps
+#: times in Section 5 for Nr = 30, Nh = 15 and ten load steps, s
 SECONDS = {
     "assembly": 0.087,
     "factor": 0.078,

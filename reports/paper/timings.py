@@ -125,7 +125,7 @@ def fit(points: Sequence[Point], power: int) -> Fit:
 
 
 def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
-    """Fit c·n³ to building the dense pseudoinverse or c·n² to multiplying by it."""
+    """Fit the time to build the dense pseudoinverse (c·n³) or to apply it (c·n²)."""
     points = times(rows, "n", method="pinv", part=part)
     return fit(points, 3 if part == "build" else 2)
 

@@ -26,7 +26,7 @@ def rows_of(records: Sequence[Record]) -> Rows:
 
 
 def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
-    """Serialise solvers, tables, plots and filter keys; `details` are separate."""
+    """Serialise solvers, tables, plots and filter keys; for records, see `details`."""
     looks = [(name, look(i)) for i, name in enumerate(page.solvers)]
     return script(
         {

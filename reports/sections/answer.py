@@ -43,11 +43,11 @@ from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps
 from mortarbench.reports.statistics.growth import Trend
 
 ACCURACIES = (
-    3  #: most sentences per form, for the tightest, a middle and the loosest accuracy
+    3  #: maximum number of accuracies per form: the tightest, a middle and the loosest
 )
 FAILURES = 3  #: largest number of failures per form that are described individually
 FIRST_ROWS = (
-    8  #: most rows of the first figure: it fits on a phone, below the first sentence
+    8  #: maximum number of rows for which the first figure fits on a phone screen
 )
 REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
 MOST_SERIES = 4  #: largest number of size series that are described by a sentence each
@@ -95,7 +95,7 @@ def answer(a: Analysis) -> Iterator[Part]:
 
 @section(2, "forms", "Solver times for each form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare solvers within each form; empty if the first section already does so."""
+    """Compare solvers within each form, unless the first section already does."""
     if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED

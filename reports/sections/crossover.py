@@ -1,4 +1,4 @@
-"""Sizes from which on dualisation pays, and all routes from the mesh to the answer."""
+"""Sizes above which dualisation pays, and all routes from the mesh to the answer."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
 
 
 def _answer(one: Map) -> list[tuple[str, int | None, str]]:
-    """Return each primal route with the least size from which on a dual route pays.
+    """Return each primal route with the size above which a dual route pays.
 
     Only dual routes that reach all sizes of the primal route are considered. The size
     is None if none of these dual routes pays.

@@ -46,8 +46,8 @@ class Curve(NamedTuple):
 def performance_ratios(times: Array) -> Array:
     """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
-    A case that no solver solved is kept with infinite ratios, so that no profile
-    reaches one. The profile of a solver at τ is the share of cases with r ≤ τ.
+    A case that no solver solved is kept with infinite ratios; no profile then reaches
+    one. The profile of a solver at τ is the share of cases with r ≤ τ.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ def performance_ratios(times: Array) -> Array:
 def share(counts: ArrayLike, cases: int) -> Share:
     """Return the share counts/cases with its binomial interval [4]_.
 
-    Unlike a percentile interval, this interval has a positive width if all or no cases
-    are solved, and at least nominal coverage.
+    Unlike a percentile interval, this interval has at least nominal coverage, and its
+    width is positive even if all or no cases are solved.
     """
     # Among resampled cases, the number solved is binomial, so no draws are needed.
     k = np.asarray(counts, dtype=float)

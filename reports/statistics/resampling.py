@@ -26,7 +26,7 @@ from scipy.special import ndtr
 
 from mortarbench.reports.statistics.intervals import COVERAGE, student
 
-#: resamples, or flips of signs; a share of 5 % then has a standard error of 0.5 %
+#: number of resamples or sign flips; a share of 5 % then has a standard error of 0.5 %
 DRAWS = 2000
 
 Array = NDArray[np.float64]
@@ -162,7 +162,7 @@ def _p_values(values: Array, by: Array) -> Array:
 
 
 def firsts(draws: Array) -> Array:
-    """Return the share of draws in which each solver is fastest; ties count in parts.
+    """Return the share of draws in which each solver is fastest; ties are split evenly.
 
     draws : (draws, solvers)
     """

@@ -78,8 +78,8 @@ def penalise(
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If P is not positive semidefinite and this factorisation breaks down. (Otherwise
-        a factorisation of a face may.)
+        If this factorisation breaks down because P is not positive semidefinite. For
+        such a P, a later factorisation of a face may raise the same errors.
 
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc
@@ -161,8 +161,8 @@ def _newton(
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
     """Drop active constraints with multipliers of the wrong sign; add violated ones.
 
-    Errors of variables are measured in √D·x, whose unit is √energy, so that the result
-    does not depend on the units of the variables.
+    Errors of variables are measured in √D·x, whose unit is √energy. The result
+    therefore does not depend on the units of the variables.
 
     at : x (n,); in the field y, the gradient without the multipliers of bounds; in the
         field z, the trial multipliers of all inequality rows

@@ -2,14 +2,14 @@
 
 With the projection Π on the product of sets and a curvature L,
 
-    x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x)
+    x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x).
 
-with Nesterov's weights β, which restart from 0 when the objective would rise. L grows
+Nesterov's weights β restart from 0 when the objective would rise. L grows
 until it bounds the curvature along the step, and shrinks after each step (Mazhar, Heyn,
 Negrut and Tasora, Using Nesterov's method to accelerate multibody dynamics with
 friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a linear
-combination of the last two products Px, so that a step takes one product, plus one each
-time L grows.
+combination of the last two products Px. A step therefore takes one product, plus one
+each time L grows.
 """
 
 from __future__ import annotations

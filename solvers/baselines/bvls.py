@@ -1,8 +1,8 @@
 """Bounded-variable least squares of scipy, on a Cholesky factor.
 
-With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖²,  so that a strictly convex QP
-with bounds is a least-squares problem. Problems with lower bounds only are solved by
-the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974,
+With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖².  A strictly convex QP with
+bounds is therefore a least-squares problem. Problems with lower bounds only are solved
+by the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974,
 Chapter 23), others by the extension due to Stark and Parker (Comput. Stat. 10, 1995).
 """
 

@@ -256,7 +256,10 @@ def _iterate(
     accuracy: float,
     max_iter: int,
 ) -> tuple[_State, str]:
-    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; return the state and why it failed, or ""."""
+    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; return the state and the reason for a failure.
+
+    The reason is empty if the iteration did not fail.
+    """
     least, stalled = norms[-1], 0
     while norms[-1] > accuracy * norms[0]:
         if directions.count >= max_iter:
@@ -273,8 +276,8 @@ def _iterate(
 
 def _state(task: _Task, x: Vector) -> _State:
     """Return the state at x with the residual recomputed."""
-    # project twice: the second projection removes the rounding errors of a large y in
-    # the first
+    # project twice: the second projection removes the rounding errors that a large y
+    # causes in the first
     once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
     return _project(task, *once)
 

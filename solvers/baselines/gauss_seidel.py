@@ -8,7 +8,7 @@ block is solved by projected gradient steps of length 1/λ until they become sho
 λ is the largest eigenvalue of the diagonal block of P.
 
 After each change of a block, the gradient is updated with the columns of P of this
-block, so that a sweep over all blocks costs as much as a product with P.
+block. A sweep over all blocks therefore costs as much as a product with P.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Certificates that a QP has no solution, checked on the data of the QP.
 
 If a QP has such a certificate, the differences of successive proximal iterates converge
-to one. (Banjac et al., Infeasibility detection in the alternating direction method of
-multipliers for convex optimization, JOTA 183, 2019, prove this for ADMM, a related
-method.)
+to a certificate. (Banjac et al., Infeasibility detection in the alternating direction
+method of multipliers for convex optimization, JOTA 183, 2019, prove this for ADMM, a
+related method.)
 """
 
 from __future__ import annotations

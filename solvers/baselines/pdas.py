@@ -3,20 +3,17 @@
 The standard method of the mortar literature (Hintermüller, Ito and Kunisch 2003, SIAM
 J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an active set of
 bounds and inequality rows, a linear system determines x and the multipliers. The next
-active set consists of the
-
-    active constraints whose multipliers have the right sign, and violated constraints,
-
-and the iteration ends when the active set no longer changes. Three extensions handle
-QPs on which this fails:
+active set consists of the active constraints whose multipliers have the right sign, and
+of the violated constraints. The iteration ends when the active set no longer changes.
+Three extensions handle QPs on which this fails:
 
 1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
 
-       ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h) on
-       active rows,
+       ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h),
 
-   so that every face has a solution even if P is singular, rows are repeated, or more
-   rows are active than components are free. Once the active set no longer changes, the
+   where the equation of z applies to active rows. Every face then has a solution even
+   if P is singular, rows are repeated, or more rows are active than components are
+   free. Once the active set no longer changes, the
    centre (x_k, y_k, z_k) moves to the solution, and the factor of that face is reused.
    δᵢ = 1e-9·Pᵢᵢ is small, and ρ = 1e4/(a D⁻¹aᵀ) for a row a, with D = diag P, is large;
    so the active set of the first centre is usually the final one. If the residuals fall
@@ -225,7 +222,7 @@ def _proximal(
 
 
 def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Return why no solution exists if the change (x, y, z) proves it, or None."""
+    """Return why no solution exists; None unless the change (x, y, z) proves it."""
     if proves_infeasible(qp, y, z):
         return "no point meets all constraints"
     return "the objective is unbounded below" if proves_unbounded(qp, x) else None

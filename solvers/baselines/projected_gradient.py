@@ -4,12 +4,12 @@ With the projection Π on the product of sets,
 
     d = Π(x − αg) − x,   x ← x + td
 
-with the gradient g = Px + q and the step length α = sᵀs/sᵀPs of Barzilai and Borwein
-(1988) for the previous step s. The line search for t is nonmonotone: the objective may
-exceed its last value but not the largest of its last M values (Birgin, Martínez and
-Raydan, Nonmonotone spectral projected gradient methods on convex sets, SIAM J. Optim.
-10, 2000, Algorithm 2.2). The objective is quadratic along d, so one product Pd per
-iteration suffices for line search and α.
+where g = Px + q is the gradient, and α = sᵀs/sᵀPs is the step length of Barzilai and
+Borwein (1988) for the previous step s. The line search for t is nonmonotone: the
+objective may exceed its last value but not the largest of its last M values (Birgin,
+Martínez and Raydan, Nonmonotone spectral projected gradient methods on convex sets,
+SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective is quadratic along d, so one
+product Pd per iteration suffices for line search and α.
 
 If α alternates with sᵀPs/‖Ps‖² (ABBmin), the number of steps is halved for a string on
 an obstacle, but multiplied by five to twenty on the duals of contact problems.

@@ -2,7 +2,7 @@
 
 Importing either library imports every installed backend, which takes a second. The
 backends are therefore listed from the adapter files inside the library, and the
-packages that a backend needs from the import statements in its adapter file.
+packages that a backend needs are read from the import statements in its adapter file.
 """
 
 from __future__ import annotations

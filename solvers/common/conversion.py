@@ -70,7 +70,7 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`; for "auto", return how P is stored, "dense" or "sparse"."""
+    """Return `backend`, or for "auto" the storage of P, "dense" or "sparse"."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
@@ -155,8 +155,8 @@ class ConicForm:
     def point(self, s: Solution) -> tuple[Vector, Vector, Vector]:
         """Return x, the multipliers v of the rows, and a slack in the cones."""
         qp, first, last = self.qp, self.equalities, self.linear
-        # A row of a set has a single entry, ±1 or −slope, so this is the multiplier
-        # times the square of the entry. The head row of a disc is empty.
+        # A row of a set has a single entry, ±1 or −slope. The product is therefore
+        # the multiplier times the square of the entry. The head row of a disc is empty.
         v = self.rows @ s.z_box
         squares = np.ravel(self.rows.multiply(self.rows).sum(axis=1))[self.heads]
         apex = np.divide(v[self.heads], squares, where=squares > 0, out=0 * squares)

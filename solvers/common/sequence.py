@@ -102,8 +102,8 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
     """Return True if the point `s` of the QP `earlier` can be a start for `qp`."""
-    # bounds on other variables would shift the rows of the conic form, and with them
-    # the multipliers
+    # if the QPs bound different variables, the rows of their conic forms, and thus the
+    # multipliers, do not correspond
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))

@@ -1,10 +1,10 @@
 """Equilibration: scaling of variables and rows that is independent of units.
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
-largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). This leaves the
-scale of x relative to that of y and z free; it is chosen so that the largest entry of P
-is about one, whatever the unit of the objective. All factors are powers of two, so that
-neither the data nor the points that are scaled back are rounded.
+largest entries until every largest entry is about one (Ruiz 2001, RAL-TR-2001-034).
+The scale of x relative to that of y and z remains free; it is chosen such that the
+largest entry of P is about one, whatever the unit of the objective. All factors are
+powers of two; hence scaling and scaling back cause no rounding errors.
 """
 
 from __future__ import annotations

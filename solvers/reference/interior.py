@@ -91,7 +91,7 @@ class _Problem:
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs (at x) and G, and what discs add to diag P."""
+        """Return the rows of discs (at x) and G, and the terms of discs in diag P."""
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:
@@ -239,7 +239,8 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    # from far outside a disc, its slack would shrink before x is near it
+    # if x started far outside a disc, the slack of the disc would shrink before x came
+    # near the disc
     for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)

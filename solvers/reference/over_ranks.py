@@ -72,7 +72,7 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
     ------
     ArithmeticError
         If no active set is confirmed within 300 faces, if the point of the confirmed
-        one has a KKT residual above 1e-9, or if the equality rows are linearly
+        active set has a KKT residual above 1e-9, or if the equality rows are linearly
         dependent on a face.
 
     """
@@ -184,7 +184,7 @@ class _Task:
         return float(self.G.ranks.total(np.array([part]))[0])
 
     def only_last(self, which: Mask) -> Mask:
-        """Keep only the globally last True: the last one on the last rank with any."""
+        """Keep only the last True over all ranks, in ascending order of ranks."""
         ranks = self.G.ranks
         local = np.flatnonzero(which)
         last_rank = ranks.extreme(float(ranks.rank if local.size else -1), np.max)

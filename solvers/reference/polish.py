@@ -4,8 +4,8 @@ For a fixed active set the KKT conditions are linear. They are solved by iterati
 refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) with
 residuals evaluated in `numpy.longdouble` and a factorisation of
 
-    [P_FF + δ  B_Fᵀ]     F: variables not at a bound, [B_F       −δ  ]     B: A and the
-    active rows of G.
+    [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
+    [B_F       −δ  ]     B: A and the active rows of G.
 
 δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
 are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1).
@@ -34,7 +34,9 @@ MAX_REFINEMENTS = 40  #: limit of refinement steps per active set
 #: refinement ends if a step is longer than this times the previous step
 MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
-FULL_CHANGES = 10  #: updates of the active set before only the worst constraint changes
+#: number of updates of the whole active set, after which only the worst constraint
+#: changes
+FULL_CHANGES = 10
 #: Multipliers of the wrong sign and violations count as rounding below this value,
 #: relative to the largest component.
 SIGN_ROUNDING = 4 * float(np.finfo(float).eps)

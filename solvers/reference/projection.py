@@ -8,10 +8,10 @@ zero (Robinson 1992, Math. Oper. Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches such a
-   zero from any start. Anderson acceleration with a safeguard (Zhang, O'Donoghue and
+1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches a zero
+   of (1) from any start. Anderson acceleration with a safeguard (Zhang, O'Donoghue and
    Boyd 2020, SIAM J. Optim. 30) is needed for a singular P.
-2. Newton's method converges to the zero, with Π' from difference quotients and
+2. Newton's method converges to this zero, with Π' from difference quotients and
    residuals in extended precision. The error √ε of the quotients limits only the rate
    of convergence: each step reduces the residual by about this factor.
 """

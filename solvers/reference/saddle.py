@@ -32,7 +32,7 @@ Factorise = Callable[[Vector, Vector], Solve]
 def saddle(P: Matrix, B: Matrix) -> Factorise:
     """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    The function returns the solution operator (r, t) ↦ (u, v). It raises
+    That function returns the solution operator (r, t) ↦ (u, v), and raises
     ArithmeticError if an entry of D or W is not finite or a pivot is zero.
 
     P, B : (n, n) and (r, n) matrices, both dense or both sparse

@@ -36,7 +36,7 @@ from mortarbench.solvers.reference.projection import projection_iterates, refine
 
 #: largest KKT residual of a reliable start for refinement. From a start with a larger
 #: residual, refinement of a QP with many solutions ended at a solution of size 1e10,
-#: whose rounding hid errors of the optimal value; therefore other starts are tried too
+#: whose rounding hid errors of the optimal value; in this case, other starts are tried
 MAX_START_RESIDUAL = 1e-3
 #: number of rounds of `projection` without a smaller residual after which it may end
 MAX_IDLE_ROUNDS = 1
@@ -152,7 +152,7 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
-    """Yield points refined from a start for which outliers in the data are ignored."""
+    """Yield points refined from a start that is computed without outlying data."""
     scaled = equilibrate(qp)
     near = scaled.qp.h < _outlier_size(scaled.qp)
     tame = equilibrate(_without_outliers(scaled.qp, near))
@@ -165,7 +165,7 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 
 
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points with a smaller δ, for weak curvature or nearly parallel rows."""
+    """Yield points for a smaller δ: weak curvature or nearly parallel rows need it."""
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     for delta in (1e-13, 1e-16):

@@ -32,7 +32,8 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: largest number of unknowns; a face costs O(n³), and `smalbe` is faster for fewer
+#: largest number of unknowns; a face costs O(n³), and `smalbe` is faster even
+#: for fewer unknowns
 MAX_UNKNOWNS = 2000
 INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
 MAX_RHO = 1e9  #: limit of ρ/‖P‖; ρ grows if ‖C(x − x̃)‖ decreases slowly

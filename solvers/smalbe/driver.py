@@ -58,12 +58,11 @@ EPS = float(np.finfo(float).eps)
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
 MIN_LANCZOS_STEPS = 5  #: smallest limit of Lanczos steps, used for few unknowns
-#: default penalty ρ. The models contain ρQ exactly, so that a large ρ costs no
-#: products; with 1e4 two or three outer iterations suffice
+#: default penalty ρ. The models contain ρQ exactly; hence a large ρ costs no products.
+#: With 1e4, two or three outer iterations suffice
 RHO = 1e4
-#: default penalty ρ if P provides a preconditioner. With the thousands of rows of
-#: decomposed bodies each multiplier step restarts CG, so that fewer outer iterations
-#: save time
+#: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG;
+#: with the thousands of rows of decomposed bodies, fewer outer iterations save time
 PRECONDITIONED_RHO = 1e6
 #: default penalty ρ with discs. Spectral steps do not use the model, and a larger ρ
 #: would worsen the conditioning of H
@@ -166,7 +165,7 @@ def _on_discs(qp: QP, options: Options) -> Options:
 def _eliminated(
     qp: QP, options: Options, kind: Preconditioner, carry: Carry | None
 ) -> Eliminated | None:
-    """Eliminate the free variables as long as one factor serves the whole sequence.
+    """Eliminate the free variables if one factor serves the whole sequence.
 
     If the free block changes between problems, as in Newton's method, a new factor for
     each problem would cost more than it saves.
@@ -193,7 +192,7 @@ def _projected(
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and not qp.b.size and qp.q.any():
         # no step depends on the norm, and q is closer to the first eigenvector than a
-        # random vector
+        # random vector is
         find = partial(by_lanczos, steps=1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
@@ -249,9 +248,9 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     where CG takes about ten products, the steps beyond seven or eight save no more
     products than they cost. Seven steps for all sizes would save up to a fifth of the
     products on dense duals with bounds alone, but would require up to 1.9 times as many
-    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum, so
-    that more steps are worthwhile: with n/10 steps, the 24 problems of
-    greco/n=32/dual-bounds take 170 products instead of 152.
+    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
+    which makes more steps worthwhile: with n/10 instead of n/6 steps, the 24 problems
+    of greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0

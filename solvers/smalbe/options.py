@@ -14,20 +14,22 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 
 #: Rule of the expansion step; the number of products with F is in brackets.
 #: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
-#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2) mixed: projcg; std if
-#: the cost would rise (ESPRESO; 2 or 3) model: the CG point, projected in the metric of
-#: the model (new; 2, or 1 if the step to the boundary is the whole step; plus 1 per CG
-#: step beyond the box, plus 1 if the decrease is below that of gradient projection)
+#: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2)
+#: mixed: projcg, or std if projcg would increase the cost (ESPRESO; 2 or 3)
+#: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
+#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
+#: decrease is below that of gradient projection)
 #: spectral: a step to the boundary and, unless it is most of the CG step, a projected
 #: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
-#: replace every proportioning, and CG if its first step would leave the set (1). With
-#: discs, the value model selects spectral, since model steps require bounds
+#: replace every proportioning step, and CG if its first step would leave the set (1).
+#: With discs, the value model selects spectral, since model steps require bounds
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
-#: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
-#: feasible, model
+#: cg: minimise along −β, as far as feasible (textbook). With discs, where −β is not a
+#: feasible direction, the rule model is used instead
 #: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
 #: gradient step. After two such steps that did not halve ‖β‖², a step of the rule cg
+#: follows
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 Norm = Literal["lanczos", "power"]
@@ -103,7 +105,7 @@ class Options:
             )
 
     def preconditioner_for(self, qp: QP) -> Operator | None:
-        """Return v ↦ Mv for this QP, or None for the option `preconditioner`.
+        """Return v ↦ Mv for this QP, or None to use the option `preconditioner`.
 
         Subclasses may override this method (`solvers.smalbe.extension`). M approximates
         P⁻¹ and must be symmetric positive definite; SMALBE restricts it to the face.
@@ -111,7 +113,7 @@ class Options:
         return None
 
     def step_rule_for(self, qp: QP) -> StepRule | None:
-        """Return a rule for this QP, or None for the option `expansion`.
+        """Return a rule for this QP, or None to use the option `expansion`.
 
         Subclasses may override this method (`solvers.smalbe.extension`). The rule is
         called for a trial point whenever a CG step would leave the box.

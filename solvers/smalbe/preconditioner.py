@@ -50,8 +50,8 @@ STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Largest number of pairs of entries in the columns of an incomplete factor, per entry
 #: of P; the pairs determine the cost of elimination. Meshes of more than 24³ trilinear
 #: elements have more than two pairs per entry, and their factors cost twice the time
-#: that they save. With a limit of 1.5, two of 1800 runs on random AᵀA fail at tol 1e-12
-#: that are solved with 2.
+#: that they save. With a limit of 1.5 instead of 2, two of 1800 runs on random AᵀA
+#: failed at tol 1e-12.
 MAX_PAIRS = 2.0
 #: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. On thirty
 #: string, obstacle, journal bearing and torsion problems of 20 to 20 000 unknowns:

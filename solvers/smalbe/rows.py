@@ -58,7 +58,8 @@ RANK = 1e-13  #: smaller squared pivots of normalised rows count as rounding
 FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
 #: limit of rows with entries in bounded components, whose block is dense
 MAX_BORDER = 2000
-MAX_DENSE_ENTRIES = 2000  #: sparse G with more than this many entries m·n stay sparse
+#: a sparse G stays sparse if m·n exceeds this value
+MAX_DENSE_ENTRIES = 2000
 
 
 class Transposed(Protocol):
@@ -175,7 +176,7 @@ class GramFactor(Protocol):
         """Return L⁻ᵀa."""
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ, F: free components."""
+        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ, where F is `free`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +184,8 @@ class WholeGram:
     """Cholesky factor of GGᵀ for all rows, replicated on every rank.
 
     Active bounds of a face change only the block of GGᵀ for the rows with entries in
-    bounded components. These rows are the border of the factor, of which only the Schur
-    complement is factorised again.
+    bounded components. These rows are the border of the factor; on each face, only
+    the Schur complement of the border is factorised again.
     """
 
     unit: LocalRows | DistributedColumns  #: normalised rows G (r, n)

@@ -1,9 +1,9 @@
 """Scaling of the variables of a sparse QP by √diag P, and the inverse transformation.
 
-With D = diag(P) and y = D¹ᐟ²x the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ², whose diagonal is
-one (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all diagonal
-scalings it has nearly the least condition number). Bounds of x become bounds of y. The
-stopping test uses KKT residuals of the original QP (`compiled.Judge`).
+With D = diag(P) and y = D¹ᐟ²x, the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ² with unit
+diagonal (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all
+diagonal scalings it has nearly the least condition number). Bounds of x become bounds
+of y. The stopping test uses KKT residuals of the original QP (`compiled.Judge`).
 """
 
 from __future__ import annotations

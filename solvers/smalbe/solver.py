@@ -6,7 +6,7 @@ discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's referenc
 Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps
 (mprgp.pxi).
 
-1. Compute orthonormal rows C with the same span as the rows of G; transform e likewise.
+1. Compute orthonormal rows C with the same span as the rows of G; transform e to match.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
@@ -14,8 +14,8 @@ Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral
    consists of one run of MPRGP.
 
 New in this implementation: the Lanczos process that estimates the norm also yields the
-upper Ritz pairs. These pairs and C define a model of H (model.pxi) with three uses: for
-steps that change the face, as a preconditioner on the face, and to permit a large ρ
+upper Ritz pairs. These pairs and C define a model of H (model.pxi), which determines
+the steps that change the face, preconditions CG on the face, and permits a large ρ
 without loss of conditioning. The presets reproduce the methods of other codes.
 """
 

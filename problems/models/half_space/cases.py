@@ -10,8 +10,8 @@ on cells, and F is the matrix of displacements that they cause (`influence`).
 * law=rough: the same problem, with the heights of a rough surface subtracted from g
 * law=mindlin: min ½λᵀFλ − δᵀλ over ‖λ_i‖ ≤ μp_i h² with Hertz's exact pressure p_i at
   the centres of the cells in contact, r < a, and the displacement δ along x of
-  Cattaneo and Mindlin's solution. The normal and tangential problems are decoupled, so
-  that one fixed-point step solves Coulomb's law
+  Cattaneo and Mindlin's solution. The normal and tangential problems are decoupled;
+  therefore one fixed-point step solves the problem with Coulomb's law
 * law=hertz with friction=coulomb: the objective of law=mindlin over ‖λ_i‖ ≤ μλ_n,i with
   the solution λ_n of the normal problem; with friction=tresca, over ‖λ_i‖ ≤ bound·h²
   for r < a

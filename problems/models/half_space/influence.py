@@ -118,8 +118,8 @@ class Influence:
         for c in range(components):
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
-        # transform along y in strips that stay in cache, because half of each row is
-        # zero on input and half of the output is not required
+        # transform along y in strips that stay in the cache. The padded rows are never
+        # stored as a whole: half of their input is zero, half of their output is unused
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
@@ -166,8 +166,8 @@ class Influence:
 class NormalInfluence(Influence):
     """The product for normal forces, with a preconditioner M.
 
-    The product for shear has no preconditioner: on discs, solvers take few CG steps, so
-    that preconditioning saves no products.
+    The product for shear has no preconditioner: on discs, solvers take so few CG steps
+    that preconditioning would save no products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
@@ -206,7 +206,7 @@ def _kernels(
     if nu is None:
         return [_extended(I_0, period)]
     # an odd function jumps at half a period; any value is admissible there, because no
-    # two cells are so far apart
+    # two cells are that far apart
     for axis, M in enumerate(period):
         if M % 2 == 0:
             np.moveaxis(I_xy, axis, 0)[M // 2] = 0

@@ -1,15 +1,16 @@
 """Elastic spheres in contact, and Hertz's exact solution.
 
 A sphere is pressed onto a rigid plane, or onto an equal sphere. Each body is the part
-of a sphere near the contact: a quarter of a block of half width and height EXTENT·a,
-one side of which, the contact side, is part of the sphere. The planes x = 0 and y = 0
-are planes of symmetry. The tractions on the other sides are those of a point force P at
-the origin of a half-space (Boussinesq; Johnson 1985, Section 3.2). At the distance ρ
-from the origin, their relative difference from the tractions of Hertz's pressure is
-O((a/ρ)²). A whole sphere is not suitable, because its overall compression, which the
-theory neglects, is of order a/R relative to the approach, 6 % for a/R = 0.08.
+of a sphere near the contact: a block whose half width and height are EXTENT·a, and
+whose contact side is part of the surface of the sphere. Since x = 0 and y = 0 are
+planes of symmetry, a quarter of the block is meshed. The tractions on the other sides
+are those of a point force P at the origin of a half-space (Boussinesq; Johnson 1985,
+Section 3.2). At the distance ρ from the origin, their relative difference from the
+tractions of Hertz's pressure is O((a/ρ)²). A whole sphere is not suitable, because its
+overall compression, which the theory neglects, is of order a/R relative to the
+approach, 6 % for a/R = 0.08.
 
-The upper body is supported by contact alone, so that the form ``dual-bounds`` does not
+The upper body is supported by contact alone; hence the form ``dual-bounds`` does not
 exist. A support of the lower body along z has no reaction. The displacement far from
 the contact is that of the half-space minus the approach of distant points to the plane
 z = 0. The approach is evaluated at the side opposite the contact and summed over the
@@ -273,7 +274,7 @@ def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
 
 
 def _near(block: _Block, half_width: float) -> Nodes:
-    """Return the contact faces of which all nodes have |x|, |y| ≤ half_width.
+    """Return the contact faces all of whose nodes have |x|, |y| ≤ half_width.
 
     On the lower body, faces with only some of their nodes in this region are included.
     """
