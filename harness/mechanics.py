@@ -403,7 +403,7 @@ class RigidMotions(NamedTuple):
     free: Any  #: (n, q) sparse; motions that change gaps and slip by rounding only
     G: Extended  #: (m, p)  B·constrained
     largest: (
-        Any  #: (n, p) `constrained` with each nonzero replaced by its column's largest
+        Any  #: (n, p) `constrained`; each nonzero becomes the largest of its column
     )
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
@@ -488,7 +488,7 @@ def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
 
 
 def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
-    """Return the facets (k, m) of all cells, their keys (k, dim), cell numbers (k,).
+    """Return facets (k, m) of all cells, their keys (k, dim) and cell numbers (k,).
 
     The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
     cells have the same key for their common facet. Degenerate facets between repeated
@@ -498,7 +498,7 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # sorted to the end
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # to be sorted last
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
@@ -547,7 +547,7 @@ class Mechanics:
     names: tuple[
         str, ...
     ] = ()  #: names of the bodies, in the order of the columns of `rigid`
-    scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
+    scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
     #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`
     grid: Grid | None = None

@@ -228,7 +228,7 @@ def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _path_key(family: Family) -> str:
-    """Return "path" if the family reads files, which makes it a key, else ""."""
+    """Return "path", a key of families that read files, or "" for other families."""
     return "" if family.path_suffix is None else "path"
 
 

@@ -335,8 +335,8 @@ def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
     A solver that reads entries of P should call this function in `declines`. If a
-    solver declines for this reason and P is small, the matrix is assembled on the
-    clock, and `declines` is called again.
+    solver declines for this reason and P is small, the matrix is assembled while the
+    clock runs, and `declines` is called again.
 
     Examples
     --------

@@ -363,7 +363,7 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
     Raises
     ------
     InputError
-        If both contain the same name, since its results would be ambiguous.
+        If both contain the same name: results under this name would be ambiguous.
 
     """
     if both := sorted(known.keys() & new.keys()):
@@ -493,7 +493,7 @@ def _forget(package: str) -> None:
 
 
 class _PluginLoader(SourceFileLoader):
-    """Loader of the modules of a plug-in, which redirects imports to its neighbours."""
+    """Loader of the modules of a plug-in; redirects their imports to neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
         # bypass __pycache__, since rewritten imports depend on the files in the folder
@@ -681,7 +681,7 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
 
 
 def is_solver(thing: object) -> bool:
-    """Return True if `thing` has the methods of a solver, also as a class."""
+    """Return True if `thing`, an object or a class, has the methods of a solver."""
     return _has(_SOLVER_PARTS, thing)
 
 

@@ -328,7 +328,7 @@ def _is_open(case: Case, record: Record, solution: Solution) -> bool:
 
 
 def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
-    """Yield a remark if kinematics is linear but a body moves by more than its size."""
+    """Yield a remark if, in linear kinematics, a body moves by more than its size."""
     if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
         return
     mechanics = case.family_case.mechanics

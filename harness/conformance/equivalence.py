@@ -49,7 +49,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Error if verdict or answer change under an equivalent formulation."""
+    """Error if an equivalent formulation changes the verdict or the answer."""
 
 
 class DeclinedError(Exception):

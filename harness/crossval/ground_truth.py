@@ -108,7 +108,7 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return the reference point, its origin, and the reason if an answer replaces it.
+    """Return the reference point, its origin, and the reason if it is an answer.
 
     If there is no reference point, a message with the reason is returned instead.
     """

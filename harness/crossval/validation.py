@@ -255,7 +255,7 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims of success, equal points of a solver once.
+    """Read the stored points of claims of success; equal points of a solver only once.
 
     Points that cannot be read are returned as a list with the reasons.
     """

@@ -48,7 +48,7 @@ def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
         If `work` failed on some ranks only, or with different messages.
 
     """
-    # Dup is collective: its first access must be at a place that all ranks reach
+    # The first access is collective, and must be at a place that all ranks reach.
     comm = ranks.private_comm
     failure: Exception | None = None
     try:

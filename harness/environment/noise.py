@@ -39,7 +39,7 @@ class NoiseFloor:
 def noise_floor(
     seconds: float = 2.0, clock: Callable[[], float] = time.perf_counter
 ) -> NoiseFloor:
-    """Compare the times of a kernel with each other, on the CPU of a run's workers.
+    """Compare repeated times of one kernel, on the CPU to which workers are bound.
 
     Pairs are measured in the order AB, BA, AB, …, and the log ratios of two successive
     pairs are averaged, so that a linear drift of the machine cancels. The bootstrap

@@ -180,7 +180,7 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-    ):  # rank 0 measures only its own memory, the parent that of all ranks
+    ):  # rank 0 measures only its own memory; the parent measures all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)

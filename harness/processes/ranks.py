@@ -204,7 +204,7 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks; bind this rank to a CPU of its own if there are enough.
+    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs.
 
     The speed of communication is measured at this point, before any solve is timed.
     """

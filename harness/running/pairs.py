@@ -90,7 +90,7 @@ def unpaired_ratio(
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Return the paired ratio of two solvers' times if possible, or else the unpaired.
+    """Return the paired ratio of two solvers' times if possible, else the unpaired one.
 
     If there are too few times for either ratio, return None.
 

@@ -104,7 +104,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Exclude all cases of a block as unbuilt; return False if all were already."""
+        """Exclude all cases of a block as unbuilt; return False if none is new."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)

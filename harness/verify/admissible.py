@@ -410,7 +410,7 @@ class Balance(NamedTuple):
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Solve with corrections of the rows with w > 0; return None if that fails.
 
-        λ̂ is the projection of λ + WGν on Λ with W = diag(w), where ν minimises a convex
+        λ̂ is the projection of λ + WGν onto Λ, with W = diag(w); ν minimises a convex
         function with one variable per motion.
         """
         supported, floating = supported_and_floating(self.G, w)
@@ -483,7 +483,7 @@ def _newton(
 def _curvature(
     forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
 ) -> Extended:
-    """Return GᵀWΠ'(λ)G (p, p), with the projection Π on Λ, at a trial point λ (m,).
+    """Return GᵀWΠ'(λ)G (p, p), with the projection Π onto Λ, at a trial point λ (m,).
 
     Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
     radius g.

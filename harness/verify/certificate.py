@@ -133,7 +133,7 @@ class Certificate:
     claimed: float  #: bound (3) of the error of the answer
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if bodies can move rigidly; see the module
+    seminorm: bool  #: True if bodies can move rigidly; see above
 
     @property
     def equilibrium(self) -> Extended:
@@ -458,7 +458,7 @@ def proven(
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    # a small û does not determine the θ of the error; for û = 0, its own θ is 0
+    # the θ of a small û may differ from that of the error; for û = 0, it is 0
     if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)

@@ -244,7 +244,7 @@ def _inner(seconds: float, sample_seconds: float) -> int:
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:
-    """Return VmRSS (resident memory) or VmHWM (its peak), MiB; None if unavailable.
+    """Return VmRSS (resident memory) or VmHWM (its peak) in MiB, or None if unknown.
 
     ``ru_maxrss`` is not a substitute: a process inherits it from its parent, even after
     exec.

@@ -132,7 +132,7 @@ def _worst(qp: QP, s: Solution) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Linearisation:
-    """Projections on discs and cones, linearised at x + τ·force."""
+    """Projections onto discs and cones, linearised at x + τ·force."""
 
     sets: Sequence[ConvexSet]
     block: NDArray[
