@@ -62,7 +62,7 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks of the finite bounds: first of lower, then of upper bounds."""
+        """Return the slacks of finite bounds: first of lower, then of upper bounds."""
         size, limits = np.abs(x), list[Limits]()
         for bound, sign in ((self.lower, 1), (self.upper, -1)):
             is_finite = np.isfinite(bound)
