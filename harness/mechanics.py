@@ -498,7 +498,7 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # to be sorted last
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # placed last by the sort below
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]

@@ -140,8 +140,8 @@ class Record(Measurement):
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
-    #: [mean, largest] over ranks of the seconds spent in each of the categories
-    #: `harness.distributed.vectors.PARTS`, by name of the category
+    #: [mean, largest] over ranks of the seconds spent in each category of work, by
+    #: name; see `harness.distributed.vectors.PARTS`
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: [mean, largest] over ranks of the numbers of reductions, messages and bytes
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)

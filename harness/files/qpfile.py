@@ -196,7 +196,7 @@ def load_qp(
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            # without zeros, the matrix is a view of its values, which may be mapped
+            # if no entry is zero, return a view of the values, which may be mapped
             M = matrices[name]
             rows, columns = M.shape
             full = M.nnz == rows * columns and M.has_canonical_format

@@ -98,8 +98,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         pass_fds=(*fds, write),
         env=os.environ | {RECORD: str(write)},
     )
-    # While this process kept an end of a pipe open, a reader would not see end of file
-    # when the ranks or the parent close theirs.
+    # If this process kept an end of a pipe open, a reader would not see end of file
+    # after the ranks or the parent have closed their ends.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)

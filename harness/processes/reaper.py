@@ -171,7 +171,7 @@ def _reap() -> dict[int, int]:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command, kill its remaining descendants, and exit as the command did."""
+    """Run the command, kill its descendants, and exit with its code or signal."""
     if arguments[0] == "rank":
         _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments
@@ -254,7 +254,7 @@ def _write(record: int, **what: int) -> None:
 
 
 def _fork_bound_to_parent() -> int:
-    """Fork a child that is killed when this process ends; return as `os.fork` does."""
+    """Fork a child that is killed when this process ends; see `os.fork`."""
     parent = os.getpid()
     child = os.fork()
     if child == 0:

@@ -173,7 +173,7 @@ class Executor:
                 prove=proven,
             )
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self.scratch, "")  # if full: the likely cause
+                refuse_full_disk(self.scratch, "")  # possibly the cause
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or needs_evaluation:
                 yield self._describe(block, record, solution)

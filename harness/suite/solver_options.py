@@ -207,7 +207,7 @@ def with_options(label: str, options: Mapping[str, Any]) -> str:
 
 
 def without_options(label: str) -> Iterator[str]:
-    """Yield a label, then successively the label without its last options.
+    """Yield a label, then the label without its last option, its last two, and so on.
 
     >>> list(without_options("LABEL max_iter=50 scaling=true"))
     ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']

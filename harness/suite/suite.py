@@ -420,7 +420,7 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
-    """Check the values of θ, and return them.
+    """Check the values of θ (see `Suite.tighten`), and return them.
 
     Nonzero values are refused if there are no sequences, or if an accuracy is set.
     """

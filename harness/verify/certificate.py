@@ -233,7 +233,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     Raises
     ------
     UncertifiableError
-        If the answer holds NaN or inf or is too large, or the QP has rows.
+        If the answer contains NaN or inf or is too large, or the QP has rows.
 
     """
     if not np.isfinite(s.x).all():
@@ -280,7 +280,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     Raises
     ------
     UncertifiableError
-        If the answer holds NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or no admissible pair is found near it.
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):

@@ -71,7 +71,7 @@ class Residuals(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest of the four; NaN if any is NaN."""
+        """The largest of the four residuals; NaN if any of them is NaN."""
         return float(np.max(self))
 
 

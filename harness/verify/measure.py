@@ -320,7 +320,7 @@ def _text_of(e: BaseException) -> str:
 
 
 def _checked(answer: object, qp: QP) -> Solution:
-    """Check that an answer is a solution of matching shapes; else return a failure."""
+    """Return an answer if it is a solution of matching shapes, otherwise a failure."""
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)
