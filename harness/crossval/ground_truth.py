@@ -156,8 +156,8 @@ def _plain_truth(
 ) -> GroundTruth | str:
     """Return the reference point of a QP without mechanics, or why there is none.
 
-    Its error is bounded by √(2r), where r is its largest KKT residual, just as the
-    errors of verified answers are.
+    Its error is bounded by √(2r), where r is its largest KKT residual, like the
+    errors of verified answers.
     """
     qp, why = answers[0].case.qp, ""
     try:

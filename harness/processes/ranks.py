@@ -118,7 +118,7 @@ class _RankExits:
     epoll(7) lists file descriptors in the order in which they became ready, even if it
     is polled late. This identifies the rank that ended first, whereas mpiexec names the
     one with the lowest number. The process above a rank writes the exit status of the
-    rank; the status is unknown if that process was killed before.
+    rank; the status is unknown if that process was killed before it could write.
     """
 
     def __init__(self, record: int, ranks: int) -> None:

@@ -31,7 +31,7 @@ class Growth:
 class Problems:
     """All cases of a suite."""
 
-    cold: tuple[CaseId, ...]  #: cases that are solved without use of other cases
+    cold: tuple[CaseId, ...]  #: cases solved without results of other cases
     sequences: tuple[tuple[CaseId, ...], ...]  #: steps of each sequence, in order
     growing: Mapping[str, Growth]  #: position of each case in a series of growing sizes
 

@@ -85,7 +85,7 @@ class Suite:
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
-    cases: tuple[CaseId, ...]  #: distinct cases that are solved without use of others
+    cases: tuple[CaseId, ...]  #: distinct cases, solved without results of others
     text: str  #: TOML of the suite, with the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()

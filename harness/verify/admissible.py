@@ -313,7 +313,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if the load along a motion that leaves all gaps unchanged is nonzero.
+    """Return True if any motion that leaves all gaps unchanged has a load along it.
 
     Loads that do not exceed their rounding count as zero.
 

@@ -140,7 +140,7 @@ class MPIReduction:
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other ranks to v at components `at`; None for all."""
+        """Add other ranks' contributions to v at components `at` (default: all)."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)

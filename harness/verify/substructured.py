@@ -347,7 +347,7 @@ class Reduction(Protocol):
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other processes to v at components `at`; None for all."""
+        """Add other processes' contributions to v at components `at` (default: all)."""
 
     def gathered(self, alpha: Vector) -> Vector:
         """Gather the coefficients of the rigid motions of all subdomains: (r,)."""

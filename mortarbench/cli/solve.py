@@ -140,7 +140,7 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        # test the solver on a QP that has bounds or discs instead, like the dual
+        # test the solver on a QP with bounds or discs instead of rows, like the dual
         reason = reason_to_decline(solver, like_dual)
     except Exception:  # code of a plug-in failed: no hint
         return ""
