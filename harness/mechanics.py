@@ -90,7 +90,7 @@ class Substructures(Protocol):
         """Return PDPv for a vector v (N,), in the precision of v."""
 
     def squared_product(self, v: Vector) -> Vector:
-        """Return the product of v (N,) with D∘D, the squares of the entries of D."""
+        """Return (D∘D)v (N,), where D∘D contains the squares of the entries of D."""
 
     def solve(self, b: Vector) -> Vector:
         """Return PD⁺Pb for forces b (N,), where D⁺ is a generalised inverse of D."""

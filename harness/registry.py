@@ -607,7 +607,7 @@ def _neighbour(name: str, folder: str) -> ModuleSpec | None:
 
 
 def _neighbours(path: Path) -> set[Path]:
-    """Return the files in its folder that a plug-in imports, directly or indirectly."""
+    """Return the files that a plug-in imports from its folder, even indirectly."""
     found: set[Path] = set()
     unread = [path]
     while unread:

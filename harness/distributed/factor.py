@@ -255,7 +255,7 @@ class SummedFactor:
         return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense) -> Dense:
-        """Return the sum (s,) over all ranks of their entries (s_p,) in shared rows."""
+        """Add the entries (s_p,) in shared rows of all ranks; return the sum (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared) if shared.size else shared
@@ -358,7 +358,7 @@ def independent_rows(gram: Matrix) -> Rows:
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return the lower triangular L with LLᵀ = M; do not use its upper triangle."""
+    """Return L with LLᵀ = M, of which only the lower triangle is meaningful."""
     if not len(M):
         return np.zeros((0, 0), order="F")
     L, failed = lapack.dpotrf(M, lower=1, clean=0)

@@ -249,7 +249,7 @@ def _in_foreign_wheel(path: str) -> bool:
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record of threadpoolctl without paths; the owner replaces the path."""
+    """Return an entry of threadpoolctl; the owner of the library replaces its path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],

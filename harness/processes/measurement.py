@@ -163,7 +163,7 @@ def measure_and_judge(
 
 
 def _as_tuples(data: Any) -> Any:
-    """Convert lists, as JSON stores tuples, back to tuples."""
+    """Convert lists back to tuples, which JSON stores as lists."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data

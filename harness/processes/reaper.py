@@ -73,7 +73,7 @@ def descendants(root: int) -> list[int]:
 
 
 def _is_below(process: int, root: int) -> bool:
-    """Return True if a process is `root` or one of its descendants, by /proc."""
+    """Return True if /proc lists a process as `root` or one of its descendants."""
     while process > 0 and process != root:
         process = int(_status(process, 1) or 0)
     return process == root > 0

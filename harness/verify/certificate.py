@@ -335,7 +335,7 @@ def _least_norm(split: Undivided) -> float:
 
 
 def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
-    """Yield certificates of pairs near the answer, or reasons, until one is sharp."""
+    """Yield a certificate of each pair, or why it has none, until one is sharp."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0

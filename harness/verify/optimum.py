@@ -228,7 +228,7 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve with the reference solver; return None unless optimal up to rounding."""
+    """Return the reference solution if it is optimal up to rounding, else None."""
     try:
         point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
