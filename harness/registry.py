@@ -67,7 +67,8 @@ _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
 #: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
-#: Prefix of the folder in the ``__path__`` of a plug-in's package, for `path_hooks`.
+#: Prefix of the folder in the ``__path__`` of a plug-in's package, by which a hook in
+#: `sys.path_hooks` recognises the entry.
 _BESIDE = "beside a plug-in: "
 
 

@@ -421,7 +421,7 @@ def solver_session(
     """Start a process for a solver; yield a function that solves a case to a tolerance.
 
     solver, options, ranks : see `solve`
-    registries : registries with the solver, and with which the process is started
+    registries : registries that contain the solver; the process is started with them
     forks : True if the process may be a fork of this process, provided that a fork is
         safe; see `harness.processes.forking`
 

@@ -267,8 +267,8 @@ def local_factor(
     """Eliminate the inner rows of A_p (k, k) that do not change; called by all ranks.
 
     A : A_p, scaled such that the diagonal entries of the sum A are about one
-    changing : (k,) mask of the rows that may change, of which shared rows are ignored;
-        None for no rows
+    changing : (k,) mask of the rows that may change, in which shared rows are ignored;
+        None if no row may change
 
     Raises
     ------

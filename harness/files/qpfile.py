@@ -166,7 +166,7 @@ def load_qp(
     operators : makers of operators by name (`harness.operators`), for a file that the
         case worker of the same run has written; such a file may contain an operator and
         be of any size. None for a file of unknown origin, which is refused if P is an
-        operator or asymmetric, or the size exceeds the limit of
+        operator or asymmetric, or if its size exceeds the limit of
         `harness.files.datafile`
 
     Raises

@@ -43,7 +43,7 @@ def write_solver(path: Path, solver: Solver) -> None:
             stack.callback(cloudpickle.unregister_pickle_by_value, module)
         try:
             content = cloudpickle.dumps(solver)
-        except Exception as e:  # raised by any __reduce__ that is reached
+        except Exception as e:  # raised by any __reduce__ that is called
             raise InputError(
                 f"solver {kind} cannot be copied into a worker process: "
                 f"{one_line(str(e) or type(e).__name__)}; expected attributes that can "

@@ -94,8 +94,8 @@ def _feasible_near(
     """Move u into the feasible set, with equality on the rows V.
 
     V starts with the closed and the violated rows; rows that a correction violates are
-    added. Corrections aim a few units in the last place inside the feasible set, so
-    that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds do not suffice,
+    added. The target of a correction is a few units in the last place inside the
+    feasible set, so that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds do not suffice,
     θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction rows belong to V
     only if they are closed, that is, if they stick.
 
