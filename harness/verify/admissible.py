@@ -95,9 +95,9 @@ def _feasible_near(
 
     V starts with the closed and the violated rows; rows that a correction violates are
     added. The target of a correction is a few units in the last place inside the
-    feasible set, so that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds do not suffice,
-    θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction rows belong to V
-    only if they are closed, that is, if they stick.
+    feasible set, so that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds
+    do not suffice, θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction
+    rows belong to V only if they are closed, that is, if they stick.
 
     nearest : returns, for rows V, the map from violations t (v,) to a
         correction δ with B_V δ = −t
