@@ -216,8 +216,8 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    In space, two variables, the slip w = Tu − s, and a variable t ≥ ‖w‖ are added for
-    each tangential vector, where (t, w) lies in a second-order cone:
+    In space, the two components of the slip w = Tu − s and a variable t ≥ ‖w‖ are added
+    for each tangential vector, where (t, w) lies in a second-order cone:
 
     ::
 
@@ -311,7 +311,7 @@ class AdmissibleForces:
         """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
         The norm of a projected multiplier equals g only up to rounding in extended
-        precision, about 1e-19. As work, this error would dominate certificates, which
+        precision, about 1e-19. Counted as work, this error would dominate certificates, which
         contain its square root.
         """
         radius = self.discs.radius

@@ -46,8 +46,8 @@ def expand_problems(
     in keys that are zipped with this key. They are in the order of its values.
 
     blocks : value of ``problems`` in the suite
-    folder : folder of the suite, in which relative paths are searched if they do not
-        exist relative to the working directory
+    folder : folder of the suite, to which relative paths refer if they do not exist in
+        the working directory
     most : largest total number of cases
 
     Raises

@@ -438,7 +438,7 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """Return the energies that single variables can gain, as far as determined.
+    """Return the energies that single variables can gain, omitting undetermined ones.
 
     The energy of variable i is |½Pᵢᵢxᵢ² + qᵢxᵢ| at its minimum within the bounds. If
     the minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ

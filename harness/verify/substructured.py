@@ -436,10 +436,10 @@ class Sharing:
     def matched(self, v: Extended) -> Extended:
         """Subtract from v (N,) the rigid motions of subdomains that minimise jumps.
 
-        A jump is the difference between copies of a component, or from zero if the
-        component is fixed; jumps are weighted by Z. The coefficients α of the motions
-        satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the coarse problem for
-        forces.
+        A jump is the difference between two copies of a component or, if the component
+        is fixed, between a copy and zero; jumps are weighted by Z. The coefficients α
+        of the motions satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the
+        coarse problem for forces.
         """
         x, reduction = v[self._rows].astype(np.float64), self._reduction
         pulls = reduction.completed(self._T.T @ (self._w * x), self._at)

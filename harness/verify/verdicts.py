@@ -100,7 +100,7 @@ def judged(
 ) -> Record:
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
-    prove : returns the proven optimum of `qp`; called if residuals cannot decide
+    prove : returns the proven optimum of `qp`; called if residuals do not decide
     values : residuals and objective as evaluated by ranks; None to evaluate them here
     """
     record = record.replace(
@@ -204,9 +204,9 @@ def evaluated_by_ranks(
     Returns
     -------
     a dict with `values`: objective and residuals, or None if they require the whole QP;
-    `bounds`: fields of `certified`, or None; `quantities`: physical quantities, or None
-    if they require the whole QP; `recover_seconds`: time to evaluate the quantities;
-    `notes`: reasons of failures
+    `bounds`: fields of `certified`, or None if they require the whole QP; `quantities`:
+    physical quantities, or None if they require the whole QP; `recover_seconds`: time
+    to evaluate the quantities; `notes`: reasons of failures
 
     """
     found: dict[str, Any] = {
