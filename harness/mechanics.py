@@ -156,7 +156,7 @@ class Friction:
     def residual(self, normal: Vector) -> float:
         """Return the relative distance of the bound g from the one the law requires.
 
-        The distance is ‖g − demanded‖₂/‖g‖₂, or without the divisor if g = 0.
+        The distance is ‖g − demanded‖₂/‖g‖₂, or the numerator alone if g = 0.
 
         normal : (m,) multipliers λ_n of the contact rows
         """
@@ -311,8 +311,8 @@ class AdmissibleForces:
         """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
         The norm of a projected multiplier equals g only up to rounding in extended
-        precision, about 1e-19. Counted as work, this error would dominate certificates, which
-        contain its square root.
+        precision, about 1e-19. Counted as work, this error would dominate certificates,
+        which contain its square root.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])

@@ -324,8 +324,8 @@ class Family(ABC):
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Describe the geometry that `refined` leaves unrefined; "" if there is none.
 
-        The text follows an estimate of the discretisation error, for instance "of the
-        bodies as they are meshed".
+        The text is appended to an estimate of the discretisation error, for instance
+        "of the bodies as they are meshed".
         """
         return ""
 

@@ -287,7 +287,7 @@ class Registries:
             ) from None
 
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
-        """Return the families, which then read missing files from a result folder.
+        """Return families that read missing input files from a result folder.
 
         folder : result folder with copies, checked by `refuse_links`; None if there are
             no copies

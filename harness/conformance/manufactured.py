@@ -166,7 +166,7 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
 def degenerate_cone() -> tuple[QP, Vector]:
     """Return min ½‖x‖² − 4x₁ − 4x₂ over the cone ‖(x₂, x₃)‖ ≤ x₁, and x* = (4, 4, 0).
 
-    The unconstrained minimiser is on the boundary of the cone, so its multiplier is
+    The unconstrained minimiser is on the boundary of the cone, so the multiplier is
     zero. The error in x is therefore of the order of the square root of the error in
     complementarity.
     """

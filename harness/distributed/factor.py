@@ -332,8 +332,8 @@ def independent_rows(gram: Matrix) -> Rows:
 
     The pivot of a row is the square of its distance from the span of the previous rows.
     A row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times its squared
-    length. After a dependent row, pivots consist of rounding errors. Therefore, only
-    the first dependent row is dropped before the pivots are computed again.
+    length. Pivots that follow a dependent row consist of rounding errors. Therefore,
+    only the first dependent row is dropped before the pivots are computed again.
 
     gram : (r, r) matrix GGᵀ
 

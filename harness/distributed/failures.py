@@ -4,7 +4,7 @@ If a single rank raised an exception, the other ranks would wait for its message
 ever. Work that may fail is therefore called by `run_collectively`, which then exchanges
 the outcomes of all ranks, on a communicator that is used only for this purpose. A rank
 whose work failed waits in this exchange for the others. If they do not arrive in time,
-they are waiting for messages of the failed rank, which then ends all processes
+they must be waiting for messages of the failed rank, which then ends all processes
 (`abort`).
 """
 

@@ -182,7 +182,7 @@ class WorkerProcess:
         the request is repeated once in a new process, since an earlier solve may have
         damaged the old one.
 
-        time_limit : limit in s from the event "start" on, which excludes imports,
+        time_limit : limit in s, counted from the event "start", that is, after imports,
             warm-up and loading of the QP. The same limit applies to the emission of the
             QP by ranks; the limit for their evaluation of the answer is at least
             `POINT_SECONDS`

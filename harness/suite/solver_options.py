@@ -1,7 +1,7 @@
 """Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
 
 A value is converted to the type of the option: the annotation of the dataclass field
-or, if there is none or it is Any or object, the type of the default.
+or, if the field has no annotation or one of Any and object, the type of the default.
 """
 
 from __future__ import annotations

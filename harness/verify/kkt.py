@@ -196,7 +196,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
       from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
       ‖Aᵀy + Gᵀz + z_box‖∞.
 
-    tol : a disc or cone is active if its relative slack is at most this
+    tol : a disc or cone is active if its relative slack is at most `tol`
 
     Examples
     --------
