@@ -141,7 +141,7 @@ class Source(StrEnum):
 
     #: The worker and the parent read the QP from a file; the parent judges the answer
     FILE = "file"
-    #: Each MPI rank emits its share of the QP. The parent has all of it and judges
+    #: Each MPI rank emits its share of the QP. The parent has the entire QP and judges
     SHARES = "shares"
     #: Each rank emits its share, and the ranks judge jointly; none has the entire QP
     RANKS = "ranks"

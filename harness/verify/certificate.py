@@ -133,7 +133,7 @@ class Certificate:
     claimed: float  #: bound (3) of the error of the answer
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if bodies can move rigidly; see above
+    seminorm: bool  #: True if bodies can move rigidly; see module docstring
 
     @property
     def equilibrium(self) -> Extended:

@@ -157,7 +157,7 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     try:
         with np.errstate(all="ignore"):  # a point may contain 1e300
             return plain(case.quantities(s)), ""
-    except Exception as e:  # errors of the family must not lose the record
+    except Exception as e:  # an error of the family must not discard the record
         return {}, note_of("quantities", e)
 
 
@@ -269,7 +269,7 @@ def _certified(
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"
-    except Exception as e:  # errors of the family must not lose the record
+    except Exception as e:  # an error of the family must not discard the record
         return {}, note_of("energy_bound", e)
     return {
         "energy_bound": bound.bound,
