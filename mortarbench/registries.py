@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 #: Lock that lets only one thread at a time load plug-ins, build, solve or validate.
-#: These actions change thread counts, standard output and modules of the whole process.
+#: For the whole process, these actions set the number of threads, redirect standard
+#: output and register modules.
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py

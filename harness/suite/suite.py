@@ -95,7 +95,7 @@ class Suite:
     #: for each value, and 0 stands for constant tolerances
     tighten: tuple[float, ...] = (0.0,)
     #: relative half-width of confidence intervals: no further repeats are measured once
-    #: it is reached for every ratio to the fastest solver; None for `repeats` repeats
+    #: it is reached for every ratio to the fastest solver; if None, `repeats` applies
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     budget: float = 600.0  #: seconds per case and tolerance, if a precision is set

@@ -65,8 +65,8 @@ MAX_ASSEMBLED = 800
 #: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
 #: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
-#: energy changes by E. Over √2 such lengths from its minimum, the quadratic term alone
-#: changes by E. With 0 and with infinity,
+#: energy changes by E. At a distance of √2 such lengths from its minimum, the quadratic
+#: term alone has grown by E. With 0 and with infinity,
 #: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)

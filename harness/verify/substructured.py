@@ -61,8 +61,8 @@ SAFETY = 16
 #: precision, and 0.2 to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
 #: Error of the same sum with the sign of u, in units in the last place. Random signs
-#: may fail to excite the few soft modes of a slender body: with ¼, the error of a plate
-#: 60 : ½ exceeded its bound by 1 %.
+#: may fail to excite the few soft modes of a slender body: with 0.25, the error for a
+#: plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative norm of a correction of d below which the refinement ends. Bounds are
