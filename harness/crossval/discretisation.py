@@ -48,7 +48,7 @@ FILE = "discretisation.json"  #: name of the file in the result folder
 SCHEMA = 1  #: version of the format of the file
 MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 #: Assumed ratio of the numbers of unknowns after and before the first halving of the
-#: cell size. For later halvings, the ratio observed before is assumed.
+#: cell size. For later halvings, the ratio of the previous halving is assumed.
 GROWTH = 4.0
 #: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5

@@ -48,7 +48,7 @@ PIVOT_SHIFT = 1e-15
 #: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
 #: Largest number of rows of a matrix that is factorised as an array by compiled code.
-#: For 500 rows, this takes longer than a factorisation by a sparse library.
+#: For 500 rows, this takes longer than the overhead of calling a sparse library.
 MAX_ARRAY_ROWS = 256
 
 
