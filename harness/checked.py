@@ -35,7 +35,7 @@ def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
-    """Check that `value` is an integer from 1 to `most`, not 2.0 or True; return it."""
+    """Check that `value` is an int (no float or bool) from 1 to `most`; return it."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
     if value > most:

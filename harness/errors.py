@@ -28,7 +28,7 @@ class InputError(Exception):
 
 
 class PastEndError(InputError):
-    """Error for a step beyond the end of a sequence, such as a converged fixed point.
+    """Error for a step after the end of a sequence, e.g. after convergence.
 
     If a suite asks for more steps than exist, its sequence ends at the last step.
     """

@@ -90,7 +90,7 @@ class Substructures(Protocol):
         """Return PDPv for a vector v (N,), in the precision of v."""
 
     def squared_product(self, v: Vector) -> Vector:
-        """Return the product of v (N,) with D∘D, the squares of the entries of D."""
+        """Return (D∘D)v (N,), where D∘D contains the squares of the entries of D."""
 
     def solve(self, b: Vector) -> Vector:
         """Return PD⁺Pb for forces b (N,), where D⁺ is a generalised inverse of D."""
@@ -156,7 +156,7 @@ class Friction:
     def residual(self, normal: Vector) -> float:
         """Return the relative distance of the bound g from the one the law requires.
 
-        The distance is ‖g − demanded‖₂/‖g‖₂, or without the divisor if g = 0.
+        The distance is ‖g − demanded‖₂/‖g‖₂, or the numerator alone if g = 0.
 
         normal : (m,) multipliers λ_n of the contact rows
         """
@@ -216,8 +216,8 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    In space, two variables, the slip w = Tu − s, and a variable t ≥ ‖w‖ are added for
-    each tangential vector, where (t, w) lies in a second-order cone:
+    In space, the two components of the slip w = Tu − s and a variable t ≥ ‖w‖ are added
+    for each tangential vector, where (t, w) lies in a second-order cone:
 
     ::
 
@@ -311,8 +311,8 @@ class AdmissibleForces:
         """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
         The norm of a projected multiplier equals g only up to rounding in extended
-        precision, about 1e-19. As work, this error would dominate certificates, which
-        contain its square root.
+        precision, about 1e-19. Counted as work, this error would dominate certificates,
+        which contain its square root.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -403,7 +403,7 @@ class RigidMotions(NamedTuple):
     free: Any  #: (n, q) sparse; motions that change gaps and slip by rounding only
     G: Extended  #: (m, p)  B·constrained
     largest: (
-        Any  #: (n, p) `constrained` with each nonzero replaced by its column's largest
+        Any  #: (n, p) `constrained`; each nonzero becomes the largest of its column
     )
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
@@ -488,7 +488,7 @@ def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
 
 
 def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
-    """Return the facets (k, m) of all cells, their keys (k, dim), cell numbers (k,).
+    """Return facets (k, m) of all cells, their keys (k, dim) and cell numbers (k,).
 
     The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
     cells have the same key for their common facet. Degenerate facets between repeated
@@ -498,7 +498,7 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # sorted to the end
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # placed last by the sort below
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
@@ -547,7 +547,7 @@ class Mechanics:
     names: tuple[
         str, ...
     ] = ()  #: names of the bodies, in the order of the columns of `rigid`
-    scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
+    scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
     #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`
     grid: Grid | None = None

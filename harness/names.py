@@ -202,8 +202,8 @@ def unbuilt(name: object, e: BaseException) -> str:
 def is_shared(name: CaseId) -> bool:
     """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
 
-    The result is False if the family raises an exception. `build` will raise the same
-    exception, and is the place to report it.
+    The result is False if the family raises an exception. `build` raises the same
+    exception, which is reported there.
     """
     try:
         return name.family.emission(name.form, name.params) is not None
@@ -228,7 +228,7 @@ def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _path_key(family: Family) -> str:
-    """Return "path" if the family reads files, which makes it a key, else ""."""
+    """Return "path", a key of families that read files, or "" for other families."""
     return "" if family.path_suffix is None else "path"
 
 

@@ -83,7 +83,7 @@ class Compiled(Protocol):
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
-    maker : name of the function in `makers` that builds the product
+    maker : name of the function in `makers` that builds the map x ↦ Px
     arrays : plain arrays by name, the argument of the maker
     makers : functions by name; a worker loads the same plug-ins, and so has the same
         table
@@ -128,7 +128,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return self._product
 
     def diagonal(self) -> NDArray[np.float64] | None:
-        """Return the diagonal of P (n,), or None if the product has no `diagonal`."""
+        """Return the diagonal of P (n,), or None if x ↦ Px has no such method."""
         product = self.build()
         return product.diagonal() if hasattr(product, "diagonal") else None
 
@@ -142,7 +142,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return getattr(self.build(), "least_eigenvalue", None)
 
     def forget(self) -> None:
-        """Discard the product, so that the next solver has to build it on the clock."""
+        """Discard the product: the next solver builds it again while the clock runs."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,13 +160,13 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
 
 def preconditioned(P: Any) -> Preconditioned | None:
-    """Return the product of P, or P itself, if it is `Preconditioned`; else None."""
+    """Return P or its map x ↦ Px if that object is `Preconditioned`, else None."""
     product: Any = P.build() if isinstance(P, SerialisableOperator) else P
     return product if hasattr(product, "preconditioner") else None
 
 
 def linear_map(P: Any) -> LinearMap | None:
-    """Return x ↦ Px as a compiled map if P or its product is `Compiled`; else None."""
+    """Return x ↦ Px as a compiled map, or None if no compiled map is available."""
     product = P.build() if isinstance(P, SerialisableOperator) else P
     return getattr(product, "linear_map", None)
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 Value = int | float | str  #: value of a key in a case name
-#: Function that solves a QP accurately; families receive it and import no solver.
+#: Function that solves a QP accurately. Families receive it instead of importing a
+#: solver.
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
@@ -142,8 +143,8 @@ class About:
         return f"not installed: {module} (pip install {self.package})"
 
 
-#: State of a node without contact pressure whose shear is at the bound of Tresca's law,
-#: which does not depend on the pressure.
+#: State of a node that has no contact pressure, but whose shear has reached the bound
+#: of Tresca's law, which does not depend on the pressure.
 SLIDING = "sliding without contact"
 
 
@@ -163,7 +164,7 @@ class ContactSide:
     #: (s,) tangential traction on the side, Pa; in space its magnitude
     shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; "" at nodes without a contact row. Old
-    #: files have "open" instead of `SLIDING` and ""
+    #: files contain "open" in place of both `SLIDING` and ""
     friction: NDArray[Any] | None = None
     friction_force: NDArray[Any] | None = None  #: (s, dim) tangential part of `force`
     #: (k, 3) analytical solution, if known. Columns: distance along the side from its
@@ -313,7 +314,7 @@ class Family(ABC):
         """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the params for halved cell size, or None if there is no such mesh.
+        """Return the params for half the cell size, or None if there is no such mesh.
 
         Estimates of the discretisation error need these params, and `Mechanics.grid` of
         both cases; see `harness.crossval.discretisation`.
@@ -323,8 +324,8 @@ class Family(ABC):
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Describe the geometry that `refined` leaves unrefined; "" if there is none.
 
-        The text follows an estimate of the discretisation error, for instance "of the
-        bodies as they are meshed".
+        The text is appended to an estimate of the discretisation error, for instance
+        "of the bodies as they are meshed".
         """
         return ""
 

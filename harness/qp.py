@@ -22,8 +22,8 @@ NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: Largest absolute entry of P − Pᵀ that counts as rounding, relative to that of P.
 SYMMETRY_TOLERANCE = 1e-12
-#: Number of rows up to which convexity of P is checked by a Cholesky factorisation,
-#: which then takes 0.25 s.
+#: Largest number of rows of P for which convexity is checked by a Cholesky
+#: factorisation. The factorisation of a P of this size takes 0.25 s.
 _MAX_FACTORED_ROWS = 2000
 #: Least permitted eigenvalue of the scaled P. It is negative, since entries rounded to
 #: six digits, as in some text formats, may perturb zero eigenvalues.
@@ -335,8 +335,8 @@ def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
     A solver that reads entries of P should call this function in `declines`. If a
-    solver declines for this reason and P is small, the matrix is assembled on the
-    clock, and `declines` is called again.
+    solver declines for this reason and P is small, the matrix is assembled while the
+    clock runs, and `declines` is called again.
 
     Examples
     --------

@@ -31,7 +31,7 @@ MAX_LEVELS = 20  #: largest depth of nested lists and tables in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
-#: fields whose values are equal in many lines, and therefore stored once
+#: fields whose values are equal in many lines; equal values are stored once
 _TEXTS = (
     "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
     "session",
@@ -135,13 +135,13 @@ class Record(Measurement):
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
     canary_seconds: float | None = (
-        None  #: time of a fixed computation just before, which reveals drift
+        None  #: time of a fixed computation before the measurement, to reveal drift
     )
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
-    #: [mean, largest] over ranks of the seconds spent on products, exchange, coarse and
-    #: waiting; see `harness.distributed.vectors.PARTS`
+    #: [mean, largest] over ranks of the seconds spent in each category of work, by
+    #: name; see `harness.distributed.vectors.PARTS`
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     #: [mean, largest] over ranks of the numbers of reductions, messages and bytes
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -207,7 +207,7 @@ class Record(Measurement):
 
     @property
     def claims_answer(self) -> bool:
-        """True if the solver claims a solution, or has proven infeasibility."""
+        """True if a solution is claimed, or a claim of infeasibility is proven."""
         return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
     def replace(self, **changes: Any) -> Self:

@@ -67,7 +67,8 @@ _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
 #: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
-#: Prefix of the folder in the ``__path__`` of a plug-in's package, for `path_hooks`.
+#: Prefix of the folder in the ``__path__`` of a plug-in's package, by which a hook in
+#: `sys.path_hooks` recognises the entry.
 _BESIDE = "beside a plug-in: "
 
 
@@ -363,7 +364,7 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
     Raises
     ------
     InputError
-        If both contain the same name, since its results would be ambiguous.
+        If both contain the same name: results under this name would be ambiguous.
 
     """
     if both := sorted(known.keys() & new.keys()):
@@ -493,7 +494,7 @@ def _forget(package: str) -> None:
 
 
 class _PluginLoader(SourceFileLoader):
-    """Loader of the modules of a plug-in, which redirects imports to its neighbours."""
+    """Loader of the modules of a plug-in; redirects their imports to neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
         # bypass __pycache__, since rewritten imports depend on the files in the folder
@@ -607,7 +608,7 @@ def _neighbour(name: str, folder: str) -> ModuleSpec | None:
 
 
 def _neighbours(path: Path) -> set[Path]:
-    """Return the files in its folder that a plug-in imports, directly or indirectly."""
+    """Return the files that a plug-in imports from its folder, even indirectly."""
     found: set[Path] = set()
     unread = [path]
     while unread:
@@ -681,7 +682,7 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
 
 
 def is_solver(thing: object) -> bool:
-    """Return True if `thing` has the methods of a solver, also as a class."""
+    """Return True if `thing`, an object or a class, has the methods of a solver."""
     return _has(_SOLVER_PARTS, thing)
 
 

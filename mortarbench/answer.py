@@ -328,7 +328,7 @@ def _is_open(case: Case, record: Record, solution: Solution) -> bool:
 
 
 def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
-    """Yield a remark if kinematics is linear but a body moves by more than its size."""
+    """Yield a remark if, in linear kinematics, a body moves by more than its size."""
     if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
         return
     mechanics = case.family_case.mechanics
@@ -421,7 +421,7 @@ def solver_session(
     """Start a process for a solver; yield a function that solves a case to a tolerance.
 
     solver, options, ranks : see `solve`
-    registries : registries with the solver, and with which the process is started
+    registries : registries that contain the solver; the process is started with them
     forks : True if the process may be a fork of this process, provided that a fork is
         safe; see `harness.processes.forking`
 

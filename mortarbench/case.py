@@ -99,7 +99,7 @@ class Case(plugin.Case):
 
     @property
     def unsettled(self) -> float:
-        """Relative distance of the QP from the fixed point of its sequence; else 0."""
+        """Relative residual of the QP's fixed-point iteration; 0 if there is none."""
         return self.family_case.unsettled
 
     def recover(self, solution: Solution) -> Vector:

@@ -152,7 +152,7 @@ def describe(solver: Solver) -> dict[str, Any]:
 def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return the row of a solver in the list.
 
-    The description states if the library of the solver is missing.
+    The description contains a remark if the library of the solver is missing.
 
     entry : entry of the solver in the catalogue, see `describe`
     """

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 #: Lock that lets only one thread at a time load plug-ins, build, solve or validate.
-#: These actions change thread counts, standard output and modules of the whole process.
+#: For the whole process, these actions set the number of threads, redirect standard
+#: output and register modules.
 TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
@@ -287,7 +288,7 @@ class Registries:
             ) from None
 
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
-        """Return the families, which then read missing files from a result folder.
+        """Return families that read missing input files from a result folder.
 
         folder : result folder with copies, checked by `refuse_links`; None if there are
             no copies

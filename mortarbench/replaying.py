@@ -96,7 +96,7 @@ def replay(
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    run_id : `run_id` in a line of the journal, or the first digits of it
+    run_id : `run_id` in a line of the journal, or its first digits
     plugins : Python files with more solvers or families
     registries : replaces our registries, installed plug-ins and `plugins`
 

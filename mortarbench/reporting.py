@@ -28,8 +28,8 @@ class Report:
 
     files: tuple[Path, ...]
     said: tuple[str, ...] = ()  #: main statements, one line each
-    #: changes from the first folder to each of the others, as plain data
-    #: as printed by ``report --json``
+    #: changes from the first folder to each of the others: the plain data that
+    #: ``report --json`` prints
     changes: tuple[dict[str, Any], ...] = ()
     failed_on: tuple[str, ...] = ()  #: conditions of `fail_on` that are met
 
@@ -80,16 +80,16 @@ def report(
         verdict became worse; ``slower``, the confidence interval of a ratio of times
         lies above 1, see docs/statistics-growth.md
     pool_forms : True if means, ranks and profiles compare solvers over the cases of all
-        forms together, where a declined form counts as unsolved; False if within each
-        form
+        forms together, where a declined form counts as unsolved; False if they compare
+        solvers within each form
     registries : replaces our registries, whose report function is used
 
     Raises
     ------
     InputError
         If a folder contains no measurements, a format or the factor is invalid,
-        `pool_forms` is requested for a comparison, or it cannot be decided if a
-        condition in `fail_on` is met.
+        `pool_forms` is requested for a comparison, or it cannot be decided whether
+        a condition in `fail_on` is met.
 
     Examples
     --------

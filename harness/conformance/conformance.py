@@ -1,9 +1,10 @@
 """Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
 The name of each check is a statement about the solver. A check passes, or it fails with
-a description of the violation. If the solver declines the QP, so is the check, for the
-reason that the solver states. If the answer changes under an equivalent formulation of
-the QP, the check reports a weakness, since many otherwise correct solvers would fail.
+a description of the violation. If the solver declines the QP, the check counts as
+declined, for the reason that the solver states. If the answer changes under an
+equivalent formulation of the QP, the check reports a weakness, since many otherwise
+correct solvers would fail.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Error if verdict or answer change under an equivalent formulation."""
+    """Error if an equivalent formulation changes the verdict or the answer."""
 
 
 class DeclinedError(Exception):
@@ -74,7 +74,8 @@ def same_answer(
         If the solver declines one of the QPs, or, for a change other than `UNCHANGED`,
         if its answer to the unchanged QP is not verified.
     WeaknessError
-        If the answer to the changed QP is not verified, or differs from the other.
+        If the answer to the changed QP is not verified, or differs from the answer to
+        the unchanged QP.
 
     """
     qp = strings(form)

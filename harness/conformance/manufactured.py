@@ -37,9 +37,9 @@ def manufactured(
     """Return a random QP with a known KKT point.
 
     The point, its multipliers and the active set are drawn at random, and q follows
-    from stationarity. The entries of the matrices are of order one. Of every kind of
-    constraint in the shape, some are active. The minimiser is unique except for the
-    shape "singular".
+    from stationarity. The entries of the matrices are of order one. Some constraints of
+    every kind in the shape are active. The minimiser is unique except for the shape
+    "singular".
 
     shape : a key of `SHAPES`
 
@@ -69,7 +69,7 @@ def _plant(
     y = rng.standard_normal(m)
     # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of four variables, one is at its lower bound, one is at its upper bound, and two
+    # one of four variables is at its lower bound, one is at its upper bound, and two
     # are between their bounds
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
@@ -105,12 +105,12 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
     """Return a random QP over discs and cones, with its solution.
 
     A block has two tangential components, and a cone also a normal one. Radii and
-    normal components are between 0.1 and 10. Of three successive discs, two are active.
-    Of three successive cones, the point is on the boundary of one (slip), at the apex
-    of one (open), and in the interior of one (stick). Multipliers of active blocks are
-    at least 0.5 from the boundary of the normal cone, so that complementarity is
-    strict. The eigenvalues of P are above 0.1. Two further variables have lower bounds,
-    one of which is active.
+    normal components are between 0.1 and 10. Two of three successive discs are
+    active. For three successive cones, the point is on the boundary of one (slip), at
+    the apex of one (open), and in the interior of one (stick). Multipliers of active
+    blocks are at least 0.5 from the boundary of the normal cone, so that
+    complementarity is strict. The eigenvalues of P are above 0.1. Two further variables
+    have lower bounds, one of which is active.
 
     shape : a key of `SET_SHAPES`
 
@@ -166,7 +166,7 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
 def degenerate_cone() -> tuple[QP, Vector]:
     """Return min ½‖x‖² − 4x₁ − 4x₂ over the cone ‖(x₂, x₃)‖ ≤ x₁, and x* = (4, 4, 0).
 
-    The unconstrained minimiser is on the boundary of the cone, so its multiplier is
+    The unconstrained minimiser is on the boundary of the cone, so the multiplier is
     zero. The error in x is therefore of the order of the square root of the error in
     complementarity.
     """

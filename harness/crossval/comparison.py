@@ -249,7 +249,7 @@ def _refutations(a: Answer) -> Iterable[str]:
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Add a remark to answers with a valid claim, but far less accurate than others."""
+    """Add a remark to valid answers that are far less accurate than the others."""
     groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
     for a in answers:
         if not a.refuted and a.error is not None:

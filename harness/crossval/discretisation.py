@@ -16,11 +16,12 @@ state. Estimates are relative to ‖û‖, like the bounds of `harness.verify.ce
 An estimate by differences of potential energies, ‖u_h − u‖² ≤ 2(J_h − J), would be
 simpler. But these differences contain terms of the same order in h that are not errors
 of u: each mesh approximates a curved side by a different polygon, and its boundary
-values differ. This estimate is 1.5 times the true error on the membrane, and an eighth
-of it on a cylinder with four cells per contact half-width. A load step is linearised at
-the previous solution on the same mesh, and the effect of this counts as part of the
-error. Under a point load, the energy decreases without limit, like log h; in this case,
-only the distance to the solution on the next mesh is reported.
+values differ. Such an estimate is 1.5 times the true error on the membrane, and an
+eighth of it on a cylinder with four cells per contact half-width. A load step is
+linearised at the previous solution on the same mesh, and the effect of this
+linearisation counts as part of the error. Under a point load, the energy decreases
+without limit, like log h; in this case, only the distance to the solution on the next
+mesh is reported.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
 FILE = "discretisation.json"  #: name of the file in the result folder
 SCHEMA = 1  #: version of the format of the file
-MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh on which is solved
+MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 #: Assumed ratio of the numbers of unknowns after and before the first halving of the
-#: cell size. For later halvings, the ratio of the previous one is assumed.
+#: cell size. For later halvings, the ratio of the previous halving is assumed.
 GROWTH = 4.0
 #: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5

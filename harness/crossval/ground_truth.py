@@ -108,7 +108,7 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return the reference point, its origin, and the reason if an answer replaces it.
+    """Return the reference point, its origin, and the reason if it is an answer.
 
     If there is no reference point, a message with the reason is returned instead.
     """
@@ -156,8 +156,8 @@ def _plain_truth(
 ) -> GroundTruth | str:
     """Return the reference point of a QP without mechanics, or why there is none.
 
-    Its error is bounded by √(2r), where r is its largest KKT residual, just as the
-    errors of verified answers are.
+    Its error is bounded by √(2r), where r is its largest KKT residual, like the
+    errors of verified answers.
     """
     qp, why = answers[0].case.qp, ""
     try:

@@ -1,4 +1,4 @@
-"""Interpolation from a mesh to its refinement, in which every cell is halved.
+"""Interpolation from a mesh to its refinement with half the cell size.
 
 A node of the coarse mesh is found in the refined mesh by its position. Positions cannot
 be used for new nodes: on a curved side, a new node does not lie on the chord, and its
@@ -43,7 +43,7 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     Raises
     ------
     ValueError
-        If `fine` is not the mesh `coarse` with every cell halved.
+        If `fine` is not the refinement of `coarse` with half the cell size.
 
     """
     to, near = _shared(coarse, fine), _neighbours(fine)

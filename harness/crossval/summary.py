@@ -34,8 +34,8 @@ class Row:
     penetration: float | None  #: largest penetration relative to the mesh size
     balance: float | None  #: largest relative resultant force or moment on a body
     contradicted_rows: int  #: number of rows whose state contradicts the reference
-    primal_dual: float | None  #: largest distance between its primal and dual answers
-    from_ours: float | None  #: largest distance between its answers and those of `ours`
+    primal_dual: float | None  #: largest distance between primal and dual answers
+    from_ours: float | None  #: largest distance from the answers of `ours`
 
 
 def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:

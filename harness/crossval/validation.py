@@ -238,7 +238,7 @@ def _pointless(records: Sequence[Record]) -> str:
 def _built(
     folder: _Folder, records: Sequence[Record]
 ) -> tuple[dict[str, Case], list[Listed]]:
-    """Rebuild the cases that have answers, and list the answers to those that fail."""
+    """Rebuild the cases with answers; list answers whose case cannot be rebuilt."""
     cases: dict[str, Case] = {}
     lost: list[Listed] = []
     answered = [r for r in records if r.vectors or _is_proven(r)]
@@ -255,7 +255,7 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims of success, equal points of a solver once.
+    """Read the stored points of claims of success; equal points of a solver only once.
 
     Points that cannot be read are returned as a list with the reasons.
     """

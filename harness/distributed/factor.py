@@ -48,7 +48,7 @@ PIVOT_SHIFT = 1e-15
 #: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
 #: Largest number of rows of a matrix that is factorised as an array by compiled code.
-#: For 500 rows, this takes longer than the calls of a sparse library.
+#: For 500 rows, this takes longer than the overhead of calling a sparse library.
 MAX_ARRAY_ROWS = 256
 
 
@@ -255,7 +255,7 @@ class SummedFactor:
         return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense) -> Dense:
-        """Return the sum (s,) over all ranks of their entries (s_p,) in shared rows."""
+        """Add the entries (s_p,) in shared rows of all ranks; return the sum (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared) if shared.size else shared
@@ -267,8 +267,8 @@ def local_factor(
     """Eliminate the inner rows of A_p (k, k) that do not change; called by all ranks.
 
     A : A_p, scaled such that the diagonal entries of the sum A are about one
-    changing : (k,) mask of the rows that may change, of which shared rows are ignored;
-        None for no rows
+    changing : (k,) mask of the rows that may change, in which shared rows are ignored;
+        None if no row may change
 
     Raises
     ------
@@ -332,8 +332,8 @@ def independent_rows(gram: Matrix) -> Rows:
 
     The pivot of a row is the square of its distance from the span of the previous rows.
     A row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times its squared
-    length. After a dependent row, pivots consist of rounding errors. Therefore, only
-    the first dependent row is dropped before the pivots are computed again.
+    length. Pivots that follow a dependent row consist of rounding errors. Therefore,
+    only the first dependent row is dropped before the pivots are computed again.
 
     gram : (r, r) matrix GGᵀ
 
@@ -358,7 +358,7 @@ def independent_rows(gram: Matrix) -> Rows:
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return the lower triangular L with LLᵀ = M; do not use its upper triangle."""
+    """Return L with LLᵀ = M, of which only the lower triangle is meaningful."""
     if not len(M):
         return np.zeros((0, 0), order="F")
     L, failed = lapack.dpotrf(M, lower=1, clean=0)

@@ -4,7 +4,7 @@ If a single rank raised an exception, the other ranks would wait for its message
 ever. Work that may fail is therefore called by `run_collectively`, which then exchanges
 the outcomes of all ranks, on a communicator that is used only for this purpose. A rank
 whose work failed waits in this exchange for the others. If they do not arrive in time,
-they are waiting for messages of the failed rank, which then ends all processes
+they must be waiting for messages of the failed rank, which then ends all processes
 (`abort`).
 """
 
@@ -48,7 +48,7 @@ def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
         If `work` failed on some ranks only, or with different messages.
 
     """
-    # Dup is collective: its first access must be at a place that all ranks reach
+    # The first access is collective, and must be at a place that all ranks reach.
     comm = ranks.private_comm
     failure: Exception | None = None
     try:

@@ -79,7 +79,7 @@ class Ranks:
         return int(self.comm.rank)
 
     def total(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sum over all ranks of arrays of equal shape, on every rank."""
+        """Return, on every rank, the sum over all ranks of arrays of equal shape."""
         part = np.ascontiguousarray(part, dtype=float)
         if part.size <= MAX_ORDERED_SUM:
             return np.asarray(self.gather_all(part).sum(axis=0))
@@ -90,7 +90,7 @@ class Ranks:
         return total
 
     def extreme(self, value: float, pick: Callable[[Any], Any]) -> float:
-        """Return the least or the largest of the numbers on all ranks, on every rank.
+        """Return, on every rank, the least or the largest of the numbers of all ranks.
 
         pick : np.min or np.max
         """
@@ -292,7 +292,7 @@ def _rewrap(ranks: Ranks, result: Any) -> Any:
 
 
 def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
-    """Return the product of local slices (n,) or (k, n), (n, k), summed over ranks."""
+    """Return a @ b, summed over ranks, for slices (n,) or matrices (k, n), (n, k)."""
     product = ranks.total(np.atleast_1d(a @ b))
     return product if np.ndim(a) + np.ndim(b) > 2 else float(product[0])
 

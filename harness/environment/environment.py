@@ -67,7 +67,7 @@ def capture(
     Values that cannot be read are None. The entries on threads describe the calling
     process; `capture_in` returns those of a worker.
 
-    plugins : plug-in files, of whose code digests are included
+    plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
     """
     # import these, since threadpoolctl finds only libraries that are loaded
@@ -249,7 +249,7 @@ def _in_foreign_wheel(path: str) -> bool:
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record of threadpoolctl without paths; the owner replaces the path."""
+    """Return an entry of threadpoolctl; the owner of the library replaces its path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],

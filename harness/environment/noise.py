@@ -1,8 +1,8 @@
 """Noise floor of a machine, determined by an A/A comparison.
 
-The two times of a pair are measured with the same kernel, one after the other, just as
-solvers are compared within blocks. A difference between two solvers is not significant
-if it is smaller than the differences within such pairs.
+The two times of a pair are measured with the same kernel in immediate succession, just
+as solvers are compared within blocks. A difference between two solvers is not
+significant if it is smaller than the differences within such pairs.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class NoiseFloor:
 def noise_floor(
     seconds: float = 2.0, clock: Callable[[], float] = time.perf_counter
 ) -> NoiseFloor:
-    """Compare the times of a kernel with each other, on the CPU of a run's workers.
+    """Compare repeated times of one kernel, on the CPU to which workers are bound.
 
     Pairs are measured in the order AB, BA, AB, …, and the log ratios of two successive
     pairs are averaged, so that a linear drift of the machine cancels. The bootstrap

@@ -133,7 +133,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Convert all exceptions of a parser, raised in the block, to errors of this file.
+    """Convert exceptions that a parser raises in the block to errors about the file.
 
     wrong : message of the error
     room : bytes by which the address space may grow in the block, beyond the 256 MiB

@@ -19,9 +19,9 @@ from typing import IO
 from mortarbench.harness.errors import InputError
 
 _UNFINISHED = ".mortarbench-*.tmp"  #: name of a file that is not yet complete
-#: the same in older versions and in case folders
+#: patterns of such names in older versions and in case folders
 _OTHERS = ("*.tmp", "*.new", ".*.new")
-_OLD = ("suite.tmp", "environment.tmp")  #: the same in result folders of older versions
+_OLD = ("suite.tmp", "environment.tmp")  #: in result folders of older versions
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

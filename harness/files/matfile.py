@@ -91,7 +91,7 @@ def save_mat(
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read the variables of a .mat file; the value is None if not numbers or text.
+    """Read the variables of a .mat file by name; None for unsupported types.
 
     Raises
     ------

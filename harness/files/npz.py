@@ -41,8 +41,8 @@ class _PickledError(ValueError):
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays to a file that can be mapped.
 
-    An existing file is replaced, not truncated: truncation would kill any process that
-    has mapped the file, by SIGBUS.
+    An existing file is replaced, not truncated: truncation would raise SIGBUS in any
+    process that has mapped the file.
     """
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():

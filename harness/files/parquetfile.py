@@ -94,7 +94,7 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
-    """Read a QP and its meta data; matrices that were saved from sparse ones are CSC.
+    """Read a QP and its meta data; matrices that were sparse are in CSC format.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     """Read the columns and the text of the meta data in a separate process.
 
-    A damaged file may crash Arrow, and would end this process too.
+    A damaged file may crash Arrow, which would otherwise end this process.
 
     Raises
     ------

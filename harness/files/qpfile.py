@@ -166,7 +166,7 @@ def load_qp(
     operators : makers of operators by name (`harness.operators`), for a file that the
         case worker of the same run has written; such a file may contain an operator and
         be of any size. None for a file of unknown origin, which is refused if P is an
-        operator or asymmetric, or the size exceeds the limit of
+        operator or asymmetric, or if its size exceeds the limit of
         `harness.files.datafile`
 
     Raises
@@ -196,7 +196,7 @@ def load_qp(
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            # without zeros, the matrix is a view of its values, which may be mapped
+            # if no entry is zero, return a view of the values, which may be mapped
             M = matrices[name]
             rows, columns = M.shape
             full = M.nnz == rows * columns and M.has_canonical_format

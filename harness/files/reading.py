@@ -180,7 +180,7 @@ def _number(text: str) -> float:
 
 
 def _limit(most: float) -> float:
-    """Return the size limit: that of the environment variable, or `most`; in MiB."""
+    """Return the size limit in MiB: the environment variable if set, else `most`."""
     text = os.environ.get(VARIABLE)
     if text is None:
         return most

@@ -14,7 +14,7 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
 * ``{"shared": NAME}`` asks, without building the case, whether ranks can emit its QP
   themselves. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
-  solver, for verdicts that residuals cannot decide, and writes the solution to the
+  solver, if the residuals do not decide a verdict, and writes the solution to the
   second. Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
 
 If a case cannot be built, the reply to the first two requests is ``{"event": "done",

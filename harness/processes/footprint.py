@@ -23,7 +23,7 @@ class Footprint:
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
-        # inode numbers by name of the new files in SHARED that the tree had open
+        # inode number of each new file in SHARED that the tree had open, by file name
         self._created: dict[str, int] = {}
 
     def mib(self, tree: Iterable[int], limit: float) -> float:

@@ -1,4 +1,4 @@
-"""Workers forked from the parent, instead of started as new interpreters.
+"""Workers forked from the parent, instead of being started as new interpreters.
 
 A fork saves half a second of CPU time for loading numpy and scipy. Like a worker
 started by its command, a forked worker runs below a sub-reaper

@@ -163,7 +163,7 @@ def measure_and_judge(
 
 
 def _as_tuples(data: Any) -> Any:
-    """Convert lists, as JSON stores tuples, back to tuples."""
+    """Convert lists back to tuples, which JSON stores as lists."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data
@@ -180,7 +180,7 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-    ):  # rank 0 measures only its own memory, the parent that of all ranks
+    ):  # rank 0 measures only its own memory; the parent measures all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)

@@ -139,9 +139,9 @@ def measures(request: Mapping[str, Any]) -> bool:
 class Source(StrEnum):
     """Origin of the QP of a measurement, which determines who judges the answer."""
 
-    #: The worker reads the QP from a file. The parent reads it too, and judges
+    #: The worker and the parent read the QP from a file; the parent judges the answer
     FILE = "file"
-    #: Each MPI rank emits its share of the QP. The parent judges with the entire QP
+    #: Each MPI rank emits its share of the QP. The parent has the entire QP and judges
     SHARES = "shares"
     #: Each rank emits its share, and the ranks judge jointly; none has the entire QP
     RANKS = "ranks"

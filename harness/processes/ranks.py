@@ -98,8 +98,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         pass_fds=(*fds, write),
         env=os.environ | {RECORD: str(write)},
     )
-    # While this process kept an end of a pipe open, a reader would not see end of file
-    # when the ranks or the parent close theirs.
+    # If this process kept an end of a pipe open, a reader would not see end of file
+    # after the ranks or the parent have closed their ends.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)
@@ -118,7 +118,7 @@ class _RankExits:
     epoll(7) lists file descriptors in the order in which they became ready, even if it
     is polled late. This identifies the rank that ended first, whereas mpiexec names the
     one with the lowest number. The process above a rank writes the exit status of the
-    rank; the status is unknown if that process was killed before.
+    rank; the status is unknown if that process was killed before it could write.
     """
 
     def __init__(self, record: int, ranks: int) -> None:
@@ -204,7 +204,7 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks; bind this rank to a CPU of its own if there are enough.
+    """Join the other ranks; bind this rank to its own CPU if there are enough CPUs.
 
     The speed of communication is measured at this point, before any solve is timed.
     """

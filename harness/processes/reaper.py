@@ -73,7 +73,7 @@ def descendants(root: int) -> list[int]:
 
 
 def _is_below(process: int, root: int) -> bool:
-    """Return True if a process is `root` or one of its descendants, by /proc."""
+    """Return True if /proc lists a process as `root` or one of its descendants."""
     while process > 0 and process != root:
         process = int(_status(process, 1) or 0)
     return process == root > 0
@@ -171,7 +171,7 @@ def _reap() -> dict[int, int]:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command, kill its remaining descendants, and exit as the command did."""
+    """Run the command, kill its descendants, and exit with its code or signal."""
     if arguments[0] == "rank":
         _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments
@@ -254,7 +254,7 @@ def _write(record: int, **what: int) -> None:
 
 
 def _fork_bound_to_parent() -> int:
-    """Fork a child that is killed when this process ends; return as `os.fork` does."""
+    """Fork a child that is killed when this process ends; see `os.fork`."""
     parent = os.getpid()
     child = os.fork()
     if child == 0:

@@ -1,8 +1,8 @@
 """Solver objects stored in files, from which worker processes load copies.
 
 Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
-notebook) with their code. To functions and classes of other modules it refers by name.
-A worker would not find plug-ins, nor modules in the folder of the script, since workers
+notebook) with their code. It refers to functions and classes of other modules by name.
+A worker would not find plug-ins or modules in the folder of the script, since workers
 do not search the working directory. Such modules are therefore stored with their code
 as well.
 """
@@ -43,7 +43,7 @@ def write_solver(path: Path, solver: Solver) -> None:
             stack.callback(cloudpickle.unregister_pickle_by_value, module)
         try:
             content = cloudpickle.dumps(solver)
-        except Exception as e:  # raised by any __reduce__ that is reached
+        except Exception as e:  # raised by any __reduce__ that is called
             raise InputError(
                 f"solver {kind} cannot be copied into a worker process: "
                 f"{one_line(str(e) or type(e).__name__)}; expected attributes that can "

@@ -182,7 +182,7 @@ class WorkerProcess:
         the request is repeated once in a new process, since an earlier solve may have
         damaged the old one.
 
-        time_limit : limit in s from the event "start" on, which excludes imports,
+        time_limit : limit in s, counted from the event "start", that is, after imports,
             warm-up and loading of the QP. The same limit applies to the emission of the
             QP by ranks; the limit for their evaluation of the answer is at least
             `POINT_SECONDS`
@@ -492,8 +492,8 @@ class WorkerProcess:
         if self._process is None:
             return []
         processes = reaper.descendants(self._process.pid)
-        # Checked after the listing: if the sub-reaper was dead, another process may
-        # have reused its ID, and the descendants are those of that process.
+        # Checked after the listing: if the sub-reaper has ended, another process may
+        # have reused its ID, and the listed descendants may belong to that process.
         return [] if self._is_dead() else processes
 
     def _others(self) -> list[int]:
@@ -583,9 +583,9 @@ class WorkerProcess:
         return bool(poller.poll(0))
 
     def _death(self) -> tuple[str, int]:
-        """Describe a worker's end, with its last line of output; and return the signal.
+        """Describe a worker's end; return also the signal that ended it, or 0.
 
-        The signal is 0 if none ended the worker.
+        The description includes the last line of the worker's output.
         """
         how, number = "ended, and other code of this process took its exit code", 0
         with suppress(ChildProcessError):

@@ -21,8 +21,8 @@ def ended_by_signals() -> Iterator[None]:
     """On SIGTERM or SIGHUP, unwind the block and exit with code 128 + signal number.
 
     The block is unwound by a `TerminatedError`. Signals that already have a handler or
-    are ignored (nohup ignores SIGHUP) keep their disposition. In other threads than the
-    main one nothing changes, because Python sets signal handlers only in the main
+    are ignored (nohup ignores SIGHUP) keep their disposition. In threads other than the
+    main thread, nothing changes, because Python sets signal handlers only in the main
     thread.
     """
     numbers = [

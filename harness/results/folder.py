@@ -57,7 +57,7 @@ _FILE_PREFIXES = (
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a result folder that contains links, pipes, devices or too deep nesting.
+    """Refuse a result folder with links, pipes, devices or too deeply nested folders.
 
     The folder may come from an untrusted source. Through a link, files elsewhere could
     be overwritten or deleted; opening a pipe could block for ever; deeply nested

@@ -84,8 +84,8 @@ def on_cluster(
     Raises
     ------
     InputError
-        If Dask is not installed or the scheduler does not answer. While blocks are
-        executed, if a node is unsuitable for measurements or the scheduler is lost.
+        If Dask is not installed or the scheduler does not answer; later, while blocks
+        are executed, if a node is unsuitable or the scheduler is lost.
 
     """
     try:
@@ -272,7 +272,7 @@ class _Cluster:
         future.add_done_callback(self._finished.put)
 
     def _measured(self, future: Any) -> Iterator[Outcome]:
-        """Yield the outcomes of a finished turn, and submit the next of its block."""
+        """Yield the outcomes of a finished turn; submit the next turn of its block."""
         from distributed import CancelledError
 
         if (active := self._active.get(future)) is None:  # its worker was lost

@@ -173,7 +173,7 @@ class Executor:
                 prove=proven,
             )
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self.scratch, "")  # the likely cause, if it is full
+                refuse_full_disk(self.scratch, "")  # possibly the cause
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or needs_evaluation:
                 yield self._describe(block, record, solution)
@@ -305,7 +305,7 @@ class Executor:
         is_limited = block.warm_up is not None
         for _ in range(
             2
-        ):  # again if it was killed from outside, or crashed due to an earlier case
+        ):  # retry if it was killed from outside, or an earlier case made it crash
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)},
                 time_limit=block.time_limit if is_limited else inf,
@@ -402,9 +402,9 @@ def _step_tol(record: Record, entry: StoredCase) -> float | None:
 
 
 def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
-    """Yield a result for each step after the one, `end`, that ended the sequence.
+    """Yield results for the steps `rest`, which follow the end of their sequence.
 
-    Each of these results has the verdict of `end`.
+    Each of these results has the verdict of `end`, the record that ended the sequence.
     """
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"

@@ -34,7 +34,7 @@ class Ratio(NamedTuple):
 
 
 def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None:
-    """Return the mean ratio of two solvers' times over the blocks that both have.
+    """Return the mean ratio of two solvers' times over their common blocks.
 
     The logarithms of the ratios within blocks are averaged, and Student's t yields the
     interval. A disturbance that slows down a whole block cancels in the ratio. If there
@@ -90,7 +90,7 @@ def unpaired_ratio(
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Return the paired ratio of two solvers' times if possible, or else the unpaired.
+    """Return the paired ratio of two solvers' times if possible, else the unpaired one.
 
     If there are too few times for either ratio, return None.
 

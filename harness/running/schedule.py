@@ -1,6 +1,6 @@
 """Schedule of a suite: remaining measurements, their order, and a stopping rule.
 
-The experimental design is one of complete randomised blocks. In each block, every
+The experimental design is a randomised complete block design. In each block, every
 solver is measured once on one case (or sequence) at one tolerance, in random order;
 every second block reverses the order of the previous one. If the suite sets a
 precision, further blocks are measured after the prescribed repeats. They end when, for
@@ -104,7 +104,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Exclude all cases of a block as unbuilt; return False if all were already."""
+        """Exclude all cases of a block as unbuilt; return False if none is new."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)

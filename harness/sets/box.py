@@ -62,7 +62,7 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks of the finite lower bounds, then those of upper bounds."""
+        """Return the slacks of finite bounds: first of lower, then of upper bounds."""
         size, limits = np.abs(x), list[Limits]()
         for bound, sign in ((self.lower, 1), (self.upper, -1)):
             is_finite = np.isfinite(bound)
@@ -114,7 +114,7 @@ class Box:
         return {"lb": self.lower, "ub": self.upper}
 
     def _sides(self, z: Vector) -> Iterator[tuple[Vector, Vector, int]]:
-        """Yield finite bounds, multipliers ≥ 0 and the sign of z: lower, then upper."""
+        """Yield finite bounds, multipliers ≥ 0 and sign of z: lower bounds first."""
         for bound, sign in ((self.lower, -1), (self.upper, 1)):
             is_finite = np.isfinite(bound)
             if is_finite.any():

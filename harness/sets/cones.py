@@ -60,7 +60,7 @@ class Cones(Blocks):
         return lower, upper
 
     def project(self, x: Vector) -> Vector:
-        """Project x (n,) on the cones; the polar cones are mapped to the apex."""
+        """Project x (n,) onto the cones; the polar cones are mapped to the apex."""
         nearest = x.copy()
         normal, tangent = x[self.index[:, 0]], x[self.index[:, 1:]]
         parts = _projection(normal, tangent, np.ones_like(self.slope), self.slope)
@@ -68,7 +68,7 @@ class Cones(Blocks):
         return nearest
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks μx_N − ‖x_T‖ of all cones, then their slacks x_N."""
+        """Return the slacks μx_N − ‖x_T‖ of all cones, followed by the slacks x_N."""
         normal, tangents = x[self.index[:, 0]], norms(x[self.index[:, 1:]])
         pull, zero = self.slope * normal, np.zeros_like(normal)
         return [
@@ -77,7 +77,7 @@ class Cones(Blocks):
         ]
 
     def admissible(self, z: Vector) -> Vector:
-        """Return the projection of z (n,) on the polar cones."""
+        """Return the projection of z (n,) onto the polar cones."""
         part = np.zeros_like(z)
         normal, tangent = z[self.index[:, 0]], z[self.index[:, 1:]]
         against, along = _projection(
@@ -144,7 +144,7 @@ class Cones(Blocks):
 def _projection(
     normal: Vector, tangent: Vector, a: Vector, b: Vector
 ) -> tuple[Vector, Vector]:
-    """Project normals n (k,) and tangents t (k, d − 1) on the cones a‖t‖ ≤ bn, n ≥ 0.
+    """Project normals n (k,) and tangents t (k, d − 1) onto cones a‖t‖ ≤ bn, n ≥ 0.
 
     The polar cones are b‖t‖ ≤ −an.
 

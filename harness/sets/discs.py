@@ -55,7 +55,7 @@ class Discs(Blocks):
         return -size, size
 
     def project(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Project x (n,) on the discs, in the precision of x."""
+        """Project x (n,) onto the discs, in the precision of x."""
         sizes = self._norms(x)
         is_outside = sizes > self.radius
         x, outside = x.copy(), self.index[is_outside]

@@ -3,7 +3,7 @@
 Such a suite may only be extended: solvers, cases and tolerances may be added, the
 number of repeats may be raised, and a precision may be set or tightened. Limits,
 accuracy, and the solver that belongs to a label must not change, since the stored
-measurements depend on them. Suites with equal settings of this kind can be united.
+measurements depend on them. Suites in which these settings agree can be united.
 """
 
 from __future__ import annotations

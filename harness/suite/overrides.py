@@ -36,8 +36,8 @@ def with_overrides(
         registry to run instead; empty to keep all solvers of the suite
     cases : names of cases to select, or shell globs over canonical names; empty to
         keep all cases
-    options : values of solver options, as texts; there is a variant of each solver for
-        each of several values
+    options : values of solver options, as texts; if an option has several values, each
+        solver is run in several variants, one for each value
 
     Raises
     ------

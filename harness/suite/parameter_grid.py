@@ -31,7 +31,7 @@ class Growth:
 class Problems:
     """All cases of a suite."""
 
-    cold: tuple[CaseId, ...]  #: cases that are solved without use of other cases
+    cold: tuple[CaseId, ...]  #: cases solved without results of other cases
     sequences: tuple[tuple[CaseId, ...], ...]  #: steps of each sequence, in order
     growing: Mapping[str, Growth]  #: position of each case in a series of growing sizes
 
@@ -46,8 +46,8 @@ def expand_problems(
     in keys that are zipped with this key. They are in the order of its values.
 
     blocks : value of ``problems`` in the suite
-    folder : folder of the suite, in which relative paths are searched if they do not
-        exist relative to the working directory
+    folder : folder of the suite, to which relative paths refer if they do not exist in
+        the working directory
     most : largest total number of cases
 
     Raises
@@ -161,7 +161,7 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
     """Return the files that match a pattern, relative to the working directory.
 
     Files that are missing but have a copy in the result folder are included. If there
-    is no match, the pattern is taken as relative to the folder of the suite.
+    is no match, the pattern is interpreted relative to the folder of the suite.
     """
     missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
     if paths := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
@@ -187,9 +187,9 @@ def _located(
 ) -> dict[str, object]:
     """Return the keys of a case, with a path that leads to its file.
 
-    If the path does not exist relative to the working directory, it is taken as
+    If the path does not exist relative to the working directory, it is interpreted
     relative to the folder of the suite. If the file is missing there as well, the path
-    is replaced by that of a copy in the result folder, if only one copy matches.
+    is replaced by that of a copy in the result folder, if exactly one matches.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():

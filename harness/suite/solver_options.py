@@ -1,7 +1,7 @@
 """Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
 
 A value is converted to the type of the option: the annotation of the dataclass field
-or, if there is none or it is Any or object, the type of the default.
+or, if the field has no annotation or one of Any and object, the type of the default.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def with_options(label: str, options: Mapping[str, Any]) -> str:
 
 
 def without_options(label: str) -> Iterator[str]:
-    """Yield a label, then successively the label without its last options.
+    """Yield a label, then the label without its last option, its last two, and so on.
 
     >>> list(without_options("LABEL max_iter=50 scaling=true"))
     ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']

@@ -85,7 +85,7 @@ class Suite:
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
-    cases: tuple[CaseId, ...]  #: distinct cases that are solved without use of others
+    cases: tuple[CaseId, ...]  #: distinct cases, solved without results of others
     text: str  #: TOML of the suite, with the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
@@ -95,7 +95,7 @@ class Suite:
     #: for each value, and 0 stands for constant tolerances
     tighten: tuple[float, ...] = (0.0,)
     #: relative half-width of confidence intervals: no further repeats are measured once
-    #: it is reached for every ratio to the fastest solver; None for `repeats` repeats
+    #: it is reached for every ratio to the fastest solver; if None, `repeats` applies
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
@@ -420,7 +420,7 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
-    """Check the values of θ, and return them.
+    """Check the values of θ (see `Suite.tighten`), and return them.
 
     Nonzero values are refused if there are no sequences, or if an accuracy is set.
     """

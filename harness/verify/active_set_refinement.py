@@ -106,7 +106,7 @@ def predicted(
 ) -> ActiveSet:
     """Return the states of rows: closed if λ + v/D is inside Λ.
 
-    For other rows, `limits` of the result is the projection of λ + v/D on Λ.
+    For other rows, `limits` of the result is the projection of λ + v/D onto Λ.
 
     multipliers : λ (m,)
     softness : (m,) compliances D ≥ 0 of the rows

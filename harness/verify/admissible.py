@@ -94,10 +94,10 @@ def _feasible_near(
     """Move u into the feasible set, with equality on the rows V.
 
     V starts with the closed and the violated rows; rows that a correction violates are
-    added. Corrections aim a few units in the last place inside the feasible set, so
-    that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds do not suffice,
-    θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction rows belong to V
-    only if they are closed, that is, if they stick.
+    added. The target of a correction is a few units in the last place inside the
+    feasible set, so that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds
+    do not suffice, θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction
+    rows belong to V only if they are closed, that is, if they stick.
 
     nearest : returns, for rows V, the map from violations t (v,) to a
         correction δ with B_V δ = −t
@@ -313,7 +313,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if the load along a motion that leaves all gaps unchanged is nonzero.
+    """Return True if any motion that leaves all gaps unchanged has a load along it.
 
     Loads that do not exceed their rounding count as zero.
 
@@ -410,7 +410,7 @@ class Balance(NamedTuple):
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Solve with corrections of the rows with w > 0; return None if that fails.
 
-        λ̂ is the projection of λ + WGν on Λ with W = diag(w), where ν minimises a convex
+        λ̂ is the projection of λ + WGν onto Λ, with W = diag(w); ν minimises a convex
         function with one variable per motion.
         """
         supported, floating = supported_and_floating(self.G, w)
@@ -483,7 +483,7 @@ def _newton(
 def _curvature(
     forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
 ) -> Extended:
-    """Return GᵀWΠ'(λ)G (p, p), with the projection Π on Λ, at a trial point λ (m,).
+    """Return GᵀWΠ'(λ)G (p, p), with the projection Π onto Λ, at a trial point λ (m,).
 
     Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
     radius g.

@@ -133,7 +133,7 @@ class Certificate:
     claimed: float  #: bound (3) of the error of the answer
     least: float  #: lower bound of ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
-    seminorm: bool  #: True if bodies can move rigidly; see the module
+    seminorm: bool  #: True if bodies can move rigidly; see module docstring
 
     @property
     def equilibrium(self) -> Extended:
@@ -233,7 +233,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     Raises
     ------
     UncertifiableError
-        If the answer holds NaN or inf or is too large, or the QP has rows.
+        If the answer contains NaN or inf or is too large, or the QP has rows.
 
     """
     if not np.isfinite(s.x).all():
@@ -280,7 +280,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     Raises
     ------
     UncertifiableError
-        If the answer holds NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or no admissible pair is found near it.
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
@@ -335,7 +335,7 @@ def _least_norm(split: Undivided) -> float:
 
 
 def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
-    """Yield certificates of pairs near the answer, or reasons, until one is sharp."""
+    """Yield a certificate of each pair, or why it has none, until one is sharp."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0
@@ -458,7 +458,7 @@ def proven(
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    # a small û does not determine the θ of the error; for û = 0, its own θ is 0
+    # the θ of a small û may differ from that of the error; for û = 0, it is 0
     if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)

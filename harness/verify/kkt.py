@@ -71,7 +71,7 @@ class Residuals(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """The largest of the four; NaN if any is NaN."""
+        """The largest of the four residuals; NaN if any of them is NaN."""
         return float(np.max(self))
 
 
@@ -196,7 +196,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
       from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
       ‖Aᵀy + Gᵀz + z_box‖∞.
 
-    tol : a disc or cone is active if its relative slack is at most this
+    tol : a disc or cone is active if its relative slack is at most `tol`
 
     Examples
     --------
@@ -438,7 +438,7 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """Return the energies that single variables can gain, as far as determined.
+    """Return the energies that single variables can gain, omitting undetermined ones.
 
     The energy of variable i is |½Pᵢᵢxᵢ² + qᵢxᵢ| at its minimum within the bounds. If
     the minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ

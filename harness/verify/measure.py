@@ -244,7 +244,7 @@ def _inner(seconds: float, sample_seconds: float) -> int:
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:
-    """Return VmRSS (resident memory) or VmHWM (its peak), MiB; None if unavailable.
+    """Return VmRSS (resident memory) or VmHWM (its peak) in MiB, or None if unknown.
 
     ``ru_maxrss`` is not a substitute: a process inherits it from its parent, even after
     exec.
@@ -320,7 +320,7 @@ def _text_of(e: BaseException) -> str:
 
 
 def _checked(answer: object, qp: QP) -> Solution:
-    """Check that an answer is a solution of matching shapes; else return a failure."""
+    """Return an answer if it is a solution of matching shapes, otherwise a failure."""
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)

@@ -106,7 +106,7 @@ def with_multipliers(
     for one in others:
         block[one.block] = True
     steps = NEWTON_STEPS if others and unknown & {"y", "z"} else 1
-    for _ in range(2):  # relative to the largest force, then to forces by component
+    for _ in range(2):  # relative to the largest force, then to that of each component
         scales = _Scales(1 / size, E)
         linearised = _Linearisation(qp.sets[1:], block, x, scales.reach())
         for k in range(steps):
@@ -132,7 +132,7 @@ def _worst(qp: QP, s: Solution) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Linearisation:
-    """Projections on discs and cones, linearised at x + τ·force."""
+    """Projections onto discs and cones, linearised at x + τ·force."""
 
     sets: Sequence[ConvexSet]
     block: NDArray[
@@ -292,7 +292,7 @@ def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
 
 
 def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:
-    """Minimise w²(force − ζ)² + (slack·ζ/E)² over ζ for each component: (n,)."""
+    """Return the ζ (n,) that minimises w²(force − ζ)² + (slack·ζ/E)² componentwise."""
     price = np.divide(
         slack, scales.E * scales.w, out=np.zeros(slack.size), where=slack != 0
     )

@@ -65,8 +65,8 @@ MAX_ASSEMBLED = 800
 #: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
 #: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
-#: energy changes by E. Over √2 such lengths from its minimum, the quadratic term alone
-#: changes by E. With 0 and with infinity,
+#: energy changes by E. At a distance of √2 such lengths from its minimum, the quadratic
+#: term alone has grown by E. With 0 and with infinity,
 #: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
@@ -228,7 +228,7 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve with the reference solver; return None unless optimal up to rounding."""
+    """Return the reference solution if it is optimal up to rounding, else None."""
     try:
         point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):

@@ -140,7 +140,7 @@ class MPIReduction:
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other ranks to v at components `at` (t,), or all."""
+        """Add other ranks' contributions to v at components `at` (default: all)."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)
@@ -216,7 +216,7 @@ class MPIReduction:
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
-    """Bound the error of an answer; all ranks must call this and get the same bound.
+    """Bound the error of an answer; all ranks call this and obtain the same bound.
 
     The same pairs are tried as in `harness.verify.certificate.certify`, except for the
     pair that results from an exchange of closed rows.
@@ -233,7 +233,7 @@ def certify_over_ranks(
     Raises
     ------
     UncertifiableError
-        If the answer holds NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or no admissible pair is found near it.
 
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()

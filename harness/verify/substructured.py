@@ -61,8 +61,8 @@ SAFETY = 16
 #: precision, and 0.2 to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
 #: Error of the same sum with the sign of u, in units in the last place. Random signs
-#: may fail to excite the few soft modes of a slender body: with ¼, the error of a plate
-#: 60 : ½ exceeded its bound by 1 %.
+#: may fail to excite the few soft modes of a slender body: with 0.25, the error for a
+#: plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative norm of a correction of d below which the refinement ends. Bounds are
@@ -347,7 +347,7 @@ class Reduction(Protocol):
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add contributions of other processes to v at components `at` (t,), or all."""
+        """Add other processes' contributions to v at components `at` (default: all)."""
 
     def gathered(self, alpha: Vector) -> Vector:
         """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
@@ -436,10 +436,10 @@ class Sharing:
     def matched(self, v: Extended) -> Extended:
         """Subtract from v (N,) the rigid motions of subdomains that minimise jumps.
 
-        A jump is the difference between copies of a component, or from zero if the
-        component is fixed; jumps are weighted by Z. The coefficients α of the motions
-        satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the coarse problem for
-        forces.
+        A jump is the difference between two copies of a component or, if the component
+        is fixed, between a copy and zero; jumps are weighted by Z. The coefficients α
+        of the motions satisfy R_TᵀZ(v − R_Tα) = 0, which has the same matrix as the
+        coarse problem for forces.
         """
         x, reduction = v[self._rows].astype(np.float64), self._reduction
         pulls = reduction.completed(self._T.T @ (self._w * x), self._at)

@@ -100,7 +100,7 @@ def judged(
 ) -> Record:
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
-    prove : returns the proven optimum of `qp`; called if residuals cannot decide
+    prove : returns the proven optimum of `qp`; called if residuals do not decide
     values : residuals and objective as evaluated by ranks; None to evaluate them here
     """
     record = record.replace(
@@ -157,7 +157,7 @@ def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     try:
         with np.errstate(all="ignore"):  # a point may contain 1e300
             return plain(case.quantities(s)), ""
-    except Exception as e:  # errors of the family must not lose the record
+    except Exception as e:  # an error of the family must not discard the record
         return {}, note_of("quantities", e)
 
 
@@ -204,9 +204,9 @@ def evaluated_by_ranks(
     Returns
     -------
     a dict with `values`: objective and residuals, or None if they require the whole QP;
-    `bounds`: fields of `certified`, or None; `quantities`: physical quantities, or None
-    if they require the whole QP; `recover_seconds`: time to evaluate the quantities;
-    `notes`: reasons of failures
+    `bounds`: fields of `certified`, or None if they require the whole QP; `quantities`:
+    physical quantities, or None if they require the whole QP; `recover_seconds`: time
+    to evaluate the quantities; `notes`: reasons of failures
 
     """
     found: dict[str, Any] = {
@@ -269,7 +269,7 @@ def _certified(
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"
-    except Exception as e:  # errors of the family must not lose the record
+    except Exception as e:  # an error of the family must not discard the record
         return {}, note_of("energy_bound", e)
     return {
         "energy_bound": bound.bound,

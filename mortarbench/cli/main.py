@@ -120,7 +120,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         try:
             code = run(registries, options)
         except TerminatedError:
-            if argv[:1] != ["run"]:  # `run` reports itself that it can be continued
+            if argv[:1] != ["run"]:  # `run` prints its own message
                 _print_error("terminated")
             raise
         # flush here, where `main` handles a closed pipe, not at interpreter exit

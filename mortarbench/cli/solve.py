@@ -140,7 +140,7 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        # test the solver on a QP that has bounds or discs instead, like the dual
+        # test the solver on a QP with bounds or discs instead of rows, like the dual
         reason = reason_to_decline(solver, like_dual)
     except Exception:  # code of a plug-in failed: no hint
         return ""
@@ -151,8 +151,8 @@ def _imports_from_working_directory() -> bool:
     """Return True if libraries may have been imported from the working directory.
 
     ``python -m`` searches this directory first, but workers do not, because they are
-    started with -P. A fork of this process could therefore use different libraries than
-    the worker of a run.
+    started with -P. A fork of this process could therefore use libraries other than
+    those of the worker of a run.
     """
     first, *others = sys.path
     return first in ("", os.getcwd()) and first not in others
