@@ -170,7 +170,7 @@ def test_blocks_are_substituted_with_their_variables():
         with pytest.raises(ValueError, match="cannot be scaled unevenly"):
             one.substituted(T, np.zeros(N))
     reversed_normal = csr_array(np.diag(np.where(np.arange(N) == 1, -1.0, 1.0)))
-    with pytest.raises(ValueError, match="nor reversed"):
+    with pytest.raises(ValueError, match="or reversed"):
         CONES.substituted(reversed_normal, np.zeros(N))
 
 

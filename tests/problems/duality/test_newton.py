@@ -765,5 +765,5 @@ def test_a_node_between_two_segments_keeps_one_of_them():
 def test_contact_stiffness_needs_bodies_that_supports_hold():
     path = patch_path(contact="nts", contact_stiffness="geometric")
 
-    with pytest.raises(InputError, match="contact alone holds a body is not built"):
+    with pytest.raises(InputError, match="is not built for bodies supported by contact alone"):
         path.iterations(1)
