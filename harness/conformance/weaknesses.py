@@ -40,7 +40,7 @@ opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so 
 verdict nor answer should change.
 
 A change of units multiplies the non-dimensional quantities by the factors below. They
-follow from the load (10⁸ N/m) and the length (2 m) of the paper's benchmark, expressed
+follow from the load and the length of the paper's benchmark, expressed
 in the new units and rounded to powers of two:
 
 """
