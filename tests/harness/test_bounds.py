@@ -198,7 +198,8 @@ def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path, monkeypatch):
     (tmp_path / "latin").write_bytes(b"a = '\xe9'")
     for path, wrong in (
         ("/dev/zero", "a device or a pipe"), (tmp_path / "pipe", "a device or a pipe"),
-        (tmp_path, "a folder"), (large, "larger than 1 MiB"), ("a\0b", "not a valid file name"),
+        (tmp_path, "a folder"), (large, "larger than 1 MiB"),
+        ("a\0b", "not a valid file name"),
         (tmp_path / "latin", "not UTF-8"), (tmp_path / "none", "No such file"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"{wrong}.*; expected a TOML file"):

@@ -61,7 +61,8 @@ def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant
     elsewhere.mkdir(mode=0o700)
     plant(ours(shared), elsewhere)
 
-    with ExitStack() as stack, pytest.raises(InputError, match="that only this user can access"):
+    alone = "only this user can access"
+    with ExitStack() as stack, pytest.raises(InputError, match=alone):
         claim_cpu(stack)
     assert not list(elsewhere.iterdir())
 
@@ -71,7 +72,8 @@ def test_a_folder_of_locks_of_another_user_is_refused(shared, monkeypatch):
     monkeypatch.setattr(os, "getuid", lambda: us + 1)
     ours(shared).mkdir(mode=0o700)  # which is ours, not that other user's
 
-    with ExitStack() as stack, pytest.raises(InputError, match="that only this user can access"):
+    alone = "only this user can access"
+    with ExitStack() as stack, pytest.raises(InputError, match=alone):
         claim_cpu(stack)
 
 

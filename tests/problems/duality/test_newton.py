@@ -765,5 +765,6 @@ def test_a_node_between_two_segments_keeps_one_of_them():
 def test_contact_stiffness_needs_bodies_that_supports_hold():
     path = patch_path(contact="nts", contact_stiffness="geometric")
 
-    with pytest.raises(InputError, match="is not built for bodies supported by contact alone"):
+    reason = "is not built for bodies supported by contact alone"
+    with pytest.raises(InputError, match=reason):
         path.iterations(1)
