@@ -210,7 +210,11 @@ def main() -> None:
     for n in RANKS:
         command = ["mpiexec", "-n", str(n), sys.executable, "-m",
                    "benchmarks.scaling_model", "rank"]  # fmt: skip
-        lines = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+        # ranks with several threads each would compete for the CPUs
+        one_thread = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        lines = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=one_thread
+        )
         rows += [Row(**json.loads(line)) for line in lines.stdout.splitlines()]
     alone = {r.cluster: r.measured[APPLICATIONS] for r in rows if r.ranks == 1}
     cluster: Column = ("$m$", lambda r: str(r.cluster))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import fields
 from typing import Any, ClassVar
 
@@ -12,7 +13,7 @@ from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.sets.convex import Vector
 
 
-class Blocks:
+class Blocks(ABC):
     """Base of dataclasses that define a convex set on each of k blocks of variables.
 
     The first field is `index` (k, d), whose rows list the variables of the blocks; the
@@ -81,12 +82,12 @@ class Blocks:
                 f"{kind}: variable {twice[0]} is listed twice; expected disjoint blocks"
             )
 
+    @abstractmethod
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the distance (k,) of z from the normal cone at x in each block.
 
         tol : relative slack below which x counts as a point of the boundary
         """
-        raise NotImplementedError
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the fields, keyed by their names in files, such as `disc_index`."""
