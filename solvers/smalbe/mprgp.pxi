@@ -55,6 +55,9 @@ cdef enum:
     # Number of steps before the first Newton step, about the number of products that a
     # Newton step takes on these patches. With 10, Mindlin's problem with 1468 discs
     # takes up to 40 % more products.
+    # On n unknowns it is √n if that is larger: Mindlin's problem, ν = 0.3, then takes
+    # 61, 154 and 246 products with 1468, 41 684 and 166 740 discs. With Newton steps
+    # after 100, it took 61, 217 and 444 products, and five times the memory.
     FIRST_NEWTON = 100
 
 

@@ -90,7 +90,8 @@ cdef class SMALBE(MPRGP):
         if problem.discs:  # with discs, CG takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
-        self.patience = FIRST_NEWTON
+        # n is that of all ranks, so that they take the same decisions
+        self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.over.total(self.n)))
         self.tangents = Directions(
             self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0, self.over
         )
