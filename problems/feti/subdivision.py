@@ -2,9 +2,9 @@
 
 The global numbers of torn nodes and of gluing rows are determined by the subdomains
 that contain each node. For blocks of structured grids, these subdomains are computed
-from tables as long as the sides of the grids (`problems.feti.structured.Layout`).
-Otherwise the interface nodes, which belong to several subdomains, are listed
-(`ListedSubdivision`).
+from tables with one entry per row, or per column, of nodes
+(`problems.feti.structured.Layout`). For all other bodies, the interface nodes, which
+belong to several subdomains, are listed (`ListedSubdivision`).
 """
 
 from __future__ import annotations
