@@ -82,7 +82,7 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Return the cells of bodies, nondimensional in the same units l and F₀ as K."""
+    """Return the cells of bodies, nondimensional with the units l and F₀ of K."""
     l, F = bodies.length, bodies.force
     mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
     laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
