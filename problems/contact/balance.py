@@ -110,11 +110,11 @@ def check_friction(
 ) -> None:
     """Check that supports, contacts and friction within bounds can balance the load.
 
-    A load can be balanced if there are forces λ_n ≥ 0 of the contact rows B and
+    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B and
     ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
     minimises the 1-norm of this residual. In space, circumscribed polygons with
-    `POLYGON` sides replace the discs. A load that exceeds friction by less than 2 % may
-    hence pass this check and fail in the solve.
+    `POLYGON` sides replace the discs. A load that exceeds the friction bound by less
+    than 2 % may hence pass this check and fail in the solve.
 
     step : number of the load step
     share : load factor of this step

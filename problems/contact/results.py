@@ -29,7 +29,7 @@ IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
 class BulkResults(NamedTuple):
-    """Results of the bodies other than those of contact."""
+    """Results for the bodies, without contact results."""
 
     nodes: int
     elements: int

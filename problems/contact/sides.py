@@ -27,7 +27,7 @@ from mortarbench.problems.fem.mesh import (
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
-_STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest
+_STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest name
 
 
 def contact_sides(

@@ -53,7 +53,7 @@ def continue_slip(end: State) -> State:
 
 
 def restart_slip(end: State) -> State:
-    """Return the final state of the preceding stage, with the slip origin at its u."""
+    """Return the final state of the preceding stage, with its u as slip origin."""
     return end._replace(slip_origin=end.u)
 
 

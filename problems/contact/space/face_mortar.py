@@ -66,11 +66,12 @@ CHUNK = 2**16
 #: of the radii of both faces. Smaller values require more steps, larger values yield
 #: more candidate faces
 CLOSE = 1.5
-#: largest number of steps of this search. Each step covers at least half the remaining
-#: distance to a side that is inclined by at most 60° (`Reach.cosine`)
+#: largest number of steps of the search along a ray. Each step covers at least half of
+#: the remaining distance to a side that is inclined by at most 60° (`Reach.cosine`)
 MAX_STEPS = 64
-#: radius, in the same units, of a ball about the end of the search that contains all
-#: faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60° across it
+#: radius, in the units of CLOSE, of a ball about the end of the search that contains
+#: all faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60°
+#: across it
 MAX_SPREAD = 5.0
 #: largest number of corners of a triangle clipped by a triangle
 MAX_CORNERS = 6
