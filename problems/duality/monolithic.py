@@ -55,7 +55,7 @@ class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
 
     bodies: Bodies  #: with the load and the supports of the stage
-    primal: QP  #: (1) of the paper
+    primal: QP  #: equation (1) of the paper
     friction: Friction
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
     #: returns the dual with the initial friction bounds, which `solve` replaces

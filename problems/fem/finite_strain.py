@@ -53,8 +53,8 @@ NEARLY_INCOMPRESSIBLE = 0.4
 #: this share of the largest magnitude: rounding may make the zero eigenvalues of
 #: translations negative
 EIGENVALUE_ROUNDING = 1e-12
-#: positive replacement of negative eigenvalues of a cell tangent, as a share of its
-#: largest eigenvalue in magnitude
+#: positive value that replaces negative eigenvalues of a cell tangent, as a share of
+#: the largest magnitude of its eigenvalues
 CLIPPED_EIGENVALUE = 1e-6
 
 
@@ -141,7 +141,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     Raises
     ------
     InvertedCellError
-        If J ≤ 0 at a Gauss point. The error states the cell with the smallest J.
+        If J ≤ 0 at a Gauss point. The error names the cell with the smallest J.
 
     """
     F = deformation_gradients(cells, u)
