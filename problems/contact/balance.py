@@ -21,10 +21,10 @@ from mortarbench.harness import Friction, InputError, Matrix
 from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.fem.elasticity import rigid_motions
 
-#: largest unbalanced share of the load that is attributed to rounding of coordinates,
-#: normals and tractions
+#: largest unbalanced fraction of the load that is attributed to rounding of
+#: coordinates, normals and tractions
 MAX_IMBALANCE = 1e-6
-#: components of a motion below this share of the largest one are not reported
+#: components of a motion below this fraction of the largest one are not reported
 _MIN_MOTION = 1e-3
 _AXES = "xyz"
 #: number of sides of polygons around discs; the radius of their corners is
@@ -122,7 +122,7 @@ def check_friction(
     Raises
     ------
     InputError
-        If no such forces exist. The message states the unbalanced share of the load.
+        If no such forces exist. The message states the unbalanced fraction of the load.
 
     """
     R, _, _ = _motions(bodies)
@@ -149,9 +149,9 @@ def check_friction(
     )
     if program.x is not None and program.fun > MAX_IMBALANCE * size:
         raise InputError(
-            f"load step {step}: friction cannot hold the load; within the bound of "
-            f"Tresca's law nothing balances {program.fun / size:.2%} of it; expected "
-            "supports that hold the bodies, or a larger bound"
+            f"load step {step}: friction cannot hold the load: "
+            f"{program.fun / size:.2%} of the load remains unbalanced within the bound "
+            "of Tresca's law; expected additional supports, or a larger bound"
         )
 
 

@@ -58,7 +58,7 @@ def contact_sides(
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        # 0.0 − x instead of −x: no negative zeros in reports
+        # 0.0 − x instead of −x avoids negative zeros in reports
         slave = pair.slave_nodes
         contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)

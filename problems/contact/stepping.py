@@ -80,7 +80,7 @@ class Stage:
     """One linearisation of a load step."""
 
     step: int  #: number of the load step, 1, 2, …
-    part: float  #: load factor: share of `forces` that acts
+    part: float  #: load factor: fraction of `forces` that acts
     forces: Forces  #: full load
     fixed: Nodes  #: components fixed by supports
     laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction

@@ -105,7 +105,7 @@ MIN_STEP = 2.0**-16  #: smallest step length of the line search
 #: allowance, steps near the solution would be rejected, because the decrease of the
 #: merit function is smaller than its rounding error
 MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
-ARMIJO_FRACTION = 1e-4  #: required share of the decrease predicted by the slope
+ARMIJO_FRACTION = 1e-4  #: required fraction of the decrease predicted by the slope
 #: weight of the penalty relative to the largest multiplier; the penalty function is
 #: exact for values above 1
 PENALTY_FACTOR = 1.5
@@ -246,8 +246,8 @@ class NewtonPath:
                 size /= 2
                 if size < least:
                     raise InputError(
-                        f"load step {k} of {self.steps}: the last equilibrium is that "
-                        f"at the load factor {reached:.6g}; beyond it, {e}; expected "
+                        f"load step {k} of {self.steps}: the largest load factor with "
+                        f"an equilibrium was {reached:.6g}; {e}; expected "
                         f"{self._advice(target)}"
                     ) from None
                 continue
@@ -273,7 +273,7 @@ class NewtonPath:
             / (load_factor * self._free_norm(self.bodies.f) or 1.0)
         )
         if share <= TOLERANCE:
-            return "a smaller load, or supports that hold the bodies better"
+            return "a smaller load, or additional supports"
         return (
             f"a larger load, or kinematics=linear: at strains this small, the relative "
             f"rounding error of the forces is {share:.0e}, above the tolerance "
@@ -341,16 +341,17 @@ class NewtonPath:
                     continue
             if gaps.keep_segments is None:
                 raise NoEquilibriumError(
-                    f"at {load_factor:.6g}, iteration {len(iterations) + 1} ended with "
-                    f"a residual of {best:.1e}: {reason}"
+                    f"at the load factor {load_factor:.6g}, iteration "
+                    f"{len(iterations) + 1} ended with a residual of {best:.1e}: "
+                    f"{reason}"
                 )
             pressing = lam > ACTIVE_THRESHOLD * lam.max(initial=0.0)
             gaps = gaps.keep_segments(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
         raise NoEquilibriumError(
-            f"at {load_factor:.6g}, {MAX_ITERATIONS} iterations left a residual of "
-            f"{best:.1e}"
+            f"at the load factor {load_factor:.6g}, {MAX_ITERATIONS} iterations left a "
+            f"residual of {best:.1e}"
         )
 
     def _configuration(

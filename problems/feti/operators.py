@@ -80,13 +80,14 @@ STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
 #: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
 #: singular where contact rows are linearly dependent
 CONTACT_SHIFT = 1e-8
-#: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
+#: eigenvalues of a block of B W Bᵀ below this fraction of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
 #: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
 #: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
 #: amplified to at most 1e5·2⁻⁵³, far below any tolerance
 LEAST_DIAGONAL = 1e-10
-#: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding errors
+#: off-diagonal entries of B W Bᵀ below this fraction of the diagonal are rounding
+#: errors
 COUPLING_ROUNDING = 1e-12
 
 

@@ -123,7 +123,7 @@ class ListedSubdivision:
     body: Integers  #: (S,) body of each subdomain
     sizes: NDArray[np.int64]  #: (S,) number of nodes of each subdomain
     node: Nodes  #: (k,) listed nodes, ascending
-    #: (k + 1,) index of the first holder of each node, followed by l
+    #: (k + 1,) index in `holders` of the first holder of each node, followed by l
     start: NDArray[np.int64]
     holders: Nodes  #: (l,) subdomains that contain each node, ascending
     #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, corners) as

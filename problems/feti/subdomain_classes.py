@@ -244,9 +244,9 @@ class Subdomains:
         return v
 
 
-#: eigenvalues of C_cC_cᵀ below this share of the largest indicate dependent rows, where
-#: C_c are the rows of C of one cluster. The modes of faces are orthonormal, so that all
-#: other eigenvalues are much larger
+#: eigenvalues of C_cC_cᵀ below this fraction of the largest indicate dependent rows,
+#: where C_c are the rows of C of one cluster. The modes of faces are orthonormal, so
+#: that all other eigenvalues are much larger
 DEPENDENT_SHARE = 1e-10
 
 

@@ -541,8 +541,9 @@ class _Rows(NamedTuple):
 
     number: Nodes  #: (t,) global numbers, ascending
     B: csr_array  #: (t, N_p) in local torn unknowns
-    #: (t,) number of the first row of the tangential vector that contains the row, or
-    #: of the row itself; all rows of such a group have the same owner
+    #: (t,) for a row of a tangential vector, the number of the first row of this
+    #: vector; for any other row, its own number. All rows of a vector have the same
+    #: owner
     group: Nodes
     reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
     c: Vector  #: (t,) right-hand side

@@ -163,7 +163,7 @@ class Membranes:
     def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
         """Return the decomposed problem of both membranes.
 
-        rows : kind of the rows that join copies of a node, the key `glue`
+        rows : type of the rows that join copies of a node, the value of the key `glue`
         cluster : number of subdomains per side of a cluster; 0 for no clusters
         """
         layout = Layout.of(self.grids, self.n)

@@ -152,7 +152,7 @@ class Plate:
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
-    moduli: Vector  #: (k,) moduli of the materials, that of steel first
+    moduli: Vector  #: (k,) moduli of the materials, the modulus of steel first
     plane: Plane | None  #: None in space
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP

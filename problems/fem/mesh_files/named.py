@@ -23,7 +23,7 @@ DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
 #: bound on the magnitude of coordinates; products of larger ones could overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items()}
-#: order of the corners that mirrors a cell, by kind
+#: permutation of the corners that mirrors a cell, by kind of cell
 _MIRRORED = {
     "tetra": [1, 0, 2, 3], "wedge": [3, 4, 5, 0, 1, 2],
     "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],

@@ -338,7 +338,7 @@ def test_the_smallest_part_of_a_load_step_is_its_256th(k, steps):
 def test_a_step_that_fails_is_tried_down_to_its_256th():
     asked = []
     path = Loaded(bodies=None, cells=asked, gaps=None, reference=0.0)
-    with pytest.raises(InputError, match="the load factor 0; beyond it, no; expected"):
+    with pytest.raises(InputError, match="an equilibrium was 0; no; expected"):
         path._load_step(1)
     assert asked == [2.0**-i for i in range(9)]
 
@@ -428,7 +428,7 @@ def test_full_steps_settle_to_the_tolerance_and_rounding(length, residual, settl
 def test_a_load_has_a_number_of_iterations():
     message, log = iterated(lambda n: (1.0, 1.0))
     assert len(log["posed"]) == newton.MAX_ITERATIONS
-    assert message == "at 1, 60 iterations left a residual of 1.0e+00"
+    assert message == "at the load factor 1, 60 iterations left a residual of 1.0e+00"
 
 
 def test_weights_are_above_all_multipliers_so_far_however_small():
@@ -696,9 +696,9 @@ def test_an_impossible_load_says_where_it_stopped(monkeypatch):
 
     with pytest.raises(
         InputError,
-        match=r"^load step 1 of 1: the last equilibrium is that at the load factor "
-        r"[\d.]+; beyond it, at [\d.]+, iteration \d+ ended with a residual of .*: "
-        r"cell \d+ is inverted: det F = .*; expected a smaller load",
+        match=r"^load step 1 of 1: the largest load factor with an equilibrium was "
+        r"[\d.]+; at the load factor [\d.]+, iteration \d+ ended with a residual of "
+        r".*: cell \d+ is inverted: det F = .*; expected a smaller load",
     ):
         path.iterations(1)
 

@@ -447,9 +447,7 @@ def test_two_passes_are_remarked_upon_and_share_the_force(described):
 
 
 def test_a_contact_that_is_described_twice_is_refused(described):
-    with pytest.raises(
-        InputError, match=r"contacts\[1\]: .* are those of contacts\[0\]"
-    ):
+    with pytest.raises(InputError, match=r"contacts\[1\]: .* of contacts\[0\]"):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
@@ -565,13 +563,13 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 @pytest.mark.parametrize(
     ("load", "supports", "message"),
     [
-        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
-        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
-        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, which"),
+        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, where"),
+        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, where"),
+        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, where"),
         (POINT_LOAD, '[[supports]]\npoint = "corner"\nfix = ["y"]\n',
-         "acts on 'corner' in y, which"),
+         "acts on 'corner' in y, where"),
         ('boundary = "top"\nforce = [1e5, -1e8]',
-         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, where"),
     ],
 )  # fmt: skip
 def test_a_load_that_its_supports_take_up_is_refused(
@@ -583,8 +581,8 @@ def test_a_load_that_its_supports_take_up_is_refused(
         build(f"{described(toml=toml)}/step=1/dual")
 
     assert str(e.value) == (
-        f"a.toml: loads[0] {message} fix holds there: it has no effect; load another "
-        "side, or hold other components"
+        f"a.toml: loads[0] {message} a support fixes the displacement; expected a load "
+        "on another side, or other fixed components"
     )
 
 

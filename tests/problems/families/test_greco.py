@@ -117,7 +117,9 @@ def test_values_out_of_range_are_refused(name, message):
 
 
 def test_an_iterate_beyond_the_last_is_refused():
-    with pytest.raises(InputError, match="iterate=99: the fixed point of step 1 has"):
+    with pytest.raises(
+        InputError, match="iterate=99: the fixed-point iteration of step"
+    ):
         solved(2, iterate=99)
 
 

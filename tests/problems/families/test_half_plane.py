@@ -176,7 +176,7 @@ def test_an_interior_point_method_finds_the_same():
     ("name", "message"),
     [("Q=0.5", "Q=0.5 needs law=cattaneo"), ("peak=0.5", "peak=0.5 needs law=cattaneo"),
      ("law=cattaneo", "Q=0.0 must be between 0 and 1"),
-     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
      ("law=cattaneo/Q=-0.5", "Q=-0.5 must be between 0 and 1"),
      ("law=cattaneo/Q=0.6/peak=0.5", "must be between -peak and peak=0.5"),
      ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),

@@ -314,7 +314,7 @@ def test_of_a_fixed_point_every_tresca_problem_can_be_had():
     ("keys", "message"),
     [("Q=0.5", "friction=none with a tangential force; expected friction=coulomb"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
-     ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
      ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
      ("friction=coulomb/mu=0.3/Q=0.6/peak=0.4", "must be between -peak and peak=0.4"),
      ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),

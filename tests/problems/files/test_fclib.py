@@ -281,7 +281,7 @@ def test_a_qp_over_cones_becomes_a_file(tmp_path):
 
 
 def test_a_qp_without_cones_is_not_written(tmp_path):
-    with pytest.raises(InputError, match="FCLIB holds friction cones of all variables"):
+    with pytest.raises(InputError, match="store only friction cones of all variables"):
         mb.export("contact-patch/dual", tmp_path / "patch.hdf5")
     assert not list(tmp_path.iterdir())
 
