@@ -1,4 +1,4 @@
-"""Face mortar in space, against exact clipping, the patch test and balance."""
+"""Mortar contact between faces: exact clipping, patch test and equilibrium."""
 
 from fractions import Fraction
 
@@ -103,7 +103,7 @@ def grid(counts, z, *, kind, up, distort=0.0):
 
 
 def stacked(lower, upper, *, gap=0.0):
-    """Return points, slave faces (the upper side of a lower body) and master faces."""
+    """Return points, slave faces (top of the lower body) and master faces."""
     (p, slave), (q, master) = lower, upper
     return np.concatenate([p, q + np.array([0, 0, gap])]), slave, master + len(p)
 
@@ -115,7 +115,7 @@ KINDS = [
 
 
 def nodal_areas(points, faces):
-    """Return ∫N of all nodes, with N of the triangles about the mean of the corners."""
+    """Return ∫N at all nodes; N is linear on the triangles about the mean corner."""
     total = np.zeros(len(points))
     for face in faces:
         corners = list(dict.fromkeys(face))
@@ -245,7 +245,8 @@ def test_the_overlaps_cover_the_common_part_exactly_once():
 
 
 def test_faces_are_searched_independently_of_each_other():
-    """The side is steep, so that faces take different numbers of search steps."""
+    """The slave side is steep, so that its faces require different numbers of search
+    steps."""
     points, slave, master = stacked(
         grid((8, 8), 0.0, kind="quad", up=True),
         grid((6, 6), 0.0, kind="triangle", up=False),

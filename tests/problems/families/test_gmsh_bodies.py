@@ -1,4 +1,4 @@
-"""Bodies from gmsh files, compared with the family of the paper's benchmark."""
+"""Bodies from gmsh files, compared with the benchmark of the paper."""
 
 import re
 import shutil
@@ -64,7 +64,10 @@ def edges(chain):
 
 
 def parts(flip=False):
-    """Return cells by name as gmsh writes them: unordered, of any orientation."""
+    """Return cells, curves and points by name.
+
+    flip : True for random order and orientation, as in files of gmsh
+    """
     sides, rng = RING.mesh.boundaries, np.random.default_rng(577215)
     curves = {name: edges(sides[name]) for name in ("left", "outer", "bottom", "top")}
     curves["feet"] = np.vstack([edges(sides["left_foot"]), edges(sides["right_foot"])])
@@ -81,7 +84,8 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1 with one entity per physical group, or per set of other cells."""
+    """Write ASCII format 4.1, with one entity per physical group or unnamed set of
+    cells."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
@@ -114,7 +118,8 @@ POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
 
 @pytest.fixture
 def described(tmp_path, monkeypatch):
-    """Write a mesh and a TOML file to the working directory; return the case name."""
+    """Return a function that writes a mesh and a TOML file to the working directory and
+    returns the case name."""
     monkeypatch.chdir(tmp_path)
 
     def write(mesh=None, toml=TOML):
@@ -332,8 +337,8 @@ master = "table"
 def sheared_blocks(described):
     """Two squares of side 2 in a state of constant pressure and shear stress.
 
-    Their Poisson's ratio is zero, so that their common side stays straight: every load
-    step has the same contact rows. Friction alone holds the upper one sideways.
+    Poisson's ratio is zero, so that the common side stays straight and every load step
+    has the same contact rows. Friction alone supports the upper square horizontally.
     """
     mesh = stacked_mesh(right=[[2, 5], [5, 8], [11, 14], [14, 17]])
     return lambda toml=SHEARED: described(mesh, toml)
@@ -345,7 +350,8 @@ def sheared_blocks(described):
 def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
     sheared_blocks, contact, form, step
 ):
-    """Each step has its share of the stress, and of the displacement (γy, −εy)."""
+    """After step k of 3, stress and displacement (γy, −εy) are k/3 of their final
+    values."""
     text = f"{sheared_blocks()}/contact={contact}/steps=3/step={step}/{form}"
     case = build(text)
     s = reference_solution(case.qp)
@@ -452,7 +458,8 @@ def test_a_contact_that_is_described_twice_is_refused(described):
 
 
 def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
-    """Its top is on rollers: K is singular, but rounding lets it be factorised."""
+    """The top of the body is on rollers, so that K is singular; because of rounding,
+    its factorisation succeeds."""
     there = ROOT / "suites" / "crossval"
     shutil.copy(there / "punch.msh", tmp_path)
     toml = (there / "punch.toml").read_text()
@@ -469,7 +476,8 @@ def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 def test_the_order_of_the_nodes_in_the_file_does_not_matter(described, form):
-    """Gmsh numbers points first, then curves, then surfaces, across the bodies."""
+    """Gmsh numbers the nodes of points first, then of curves, then of surfaces,
+    regardless of the bodies."""
     to = np.random.default_rng(662607).permutation(len(POINTS))
     quads, curves, spots = ({k: to[v] for k, v in named.items()} for named in parts())
     shuffled = POINTS[np.argsort(to)]
@@ -575,7 +583,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 def test_a_load_that_its_supports_take_up_is_refused(
     described, load, supports, message
 ):
-    """All displacements at the load are prescribed as zero: it has no effect."""
+    """A load is rejected if supports fix all displacements along it."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")
@@ -615,7 +623,7 @@ def read(tmp_path, *contents, **kinds):
 
 
 def bent(points):
-    """Move the middle node beyond a corner."""
+    """Return the points of nine nodes with the middle node moved beyond a corner."""
     return np.where(np.arange(9)[:, None] == 4, [-0.5, -0.5, 0.0], points)
 
 
@@ -658,9 +666,9 @@ def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
 
 
 def untagged(text):
-    """Set the physical tags of format 2.2 to zero where they have no name.
+    """Set physical tags without a name to zero in a file of format 2.2.
 
-    This is what Mesh.SaveAll = 1 writes of entities in no physical group.
+    With Mesh.SaveAll = 1, gmsh writes tag 0 for entities without a physical group.
     """
     named = set(re.findall(r'^\d (\d+) "', text, re.M))
     head, cells = text.split("$Elements\n")
@@ -675,7 +683,7 @@ SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
 
 @pytest.mark.parametrize("writer", SAVED)
 def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
-    """Unnamed curves and points, written with Mesh.SaveAll = 1, change nothing."""
+    """Unnamed curves and points, which Mesh.SaveAll = 1 writes, have no effect."""
     quads, curves, spots = parts()
     more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
     read = []
@@ -706,7 +714,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
 
 def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
-    """Return a binary file whose first curve has no physical tag."""
+    """The first curve of the binary file has no physical tag."""
     text = msh41(POINTS, *parts())
     (tmp_path / "a.msh").write_text(text)
     mesh = meshio.gmsh.read(tmp_path / "a.msh")
@@ -865,7 +873,7 @@ def test_a_surface_that_is_not_plane_is_refused(described):
 
 
 def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
-    """A force of 2 MN/m passes through a disc and acts on both of its contacts."""
+    """A force of 2 MN/m is transferred through a disc and both of its contacts."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
     values = case.quantities(reference_solution(case.qp))
 

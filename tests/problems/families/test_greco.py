@@ -1,4 +1,4 @@
-"""GRECO's plate: published digits, and those of an independent prototype."""
+"""GRECO's plate: published digits, and digits of an independent prototype."""
 
 from functools import cache
 
@@ -59,7 +59,7 @@ def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
 
 
 def test_forces_are_in_equilibrium():
-    """Friction and reactions on the right balance the horizontal load."""
+    """Friction and the reactions on the right side balance the horizontal load."""
     case, s = solved(8)
     got, reaction = case.quantities(s), case.mechanics.to_primal(s).y * 5e7 * 0.04
     fx, fy = got["contact_force"]
@@ -83,7 +83,7 @@ def test_every_form_has_the_same_answer():
 
 
 def test_the_fixed_point_begins_without_friction_and_contracts():
-    """The key `iterate` selects each of its Tresca problems."""
+    """The key `iterate` selects each Tresca problem of the fixed-point iteration."""
     case, s = solved(8)
     count, residuals = case.quantities(s)["tresca_problems"], []
     for i in range(1, count + 1):

@@ -25,7 +25,8 @@ def solved(keys, solver="smalbe"):
 
 
 def test_radius_pressure_and_approach_are_those_of_hertz():
-    """R = 8, E = 200, ν = 0.3, P = 10 with eight cells per contact radius."""
+    """The data are R = 8, E = 200, ν = 0.3 and P = 10, with eight cells per contact
+    radius."""
     case, s, found = solved("dual")
 
     assert found["contact_radius"] == pytest.approx(0.648715, rel=5e-3)
@@ -95,7 +96,8 @@ def test_the_support_of_the_lower_sphere_along_z_has_no_reaction():
 
 
 def test_formulae_have_the_digits_of_two_larger_spheres():
-    """R = 50, E = 2e4, ν = 0.3, approach 4: a = 10 is beyond this family's a/R."""
+    """For R = 50, E = 2e4, ν = 0.3 and an approach of 4, a = 10, which exceeds the
+    limit of a/R of the family."""
     modulus = 2e4 / (1 - 0.3**2) / 2
     exact = PointContact(4 / 3 * modulus * 10**3 / 25, 25, modulus)
 
@@ -135,7 +137,7 @@ def test_errors_fall_with_the_cells():
 
 
 def test_units_do_not_matter():
-    """Lengths in mm instead of m, and E in MPa: forces in N are the same."""
+    """With lengths in mm instead of m and E in MPa, forces in N are unchanged."""
     one, other = solved("n=3/dual")[2], solved("n=3/R=8000/E=200e-6/dual")[2]
 
     assert other["contact_force"] == pytest.approx(one["contact_force"], rel=1e-9)
@@ -188,7 +190,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
 
 
 def test_a_tangential_force_leaves_the_middle_sticking():
-    """Cattaneo and Mindlin, with two cells along the contact radius."""
+    """The problem of Cattaneo and Mindlin has two cells per contact radius."""
     values = solved(f"n=2/{MOOSE}/Q=0.5/dual")[2]
     pressed = solved(f"n=2/{MOOSE}/dual")[2]
     force = 0.5 * 0.3 * 10_000

@@ -54,7 +54,7 @@ def test_sizes_are_those_of_the_table(size):
 
 
 def test_the_stiffness_is_exact_for_functions_of_the_element_space():
-    """∫|∇u|² of u = 1, x, y and xy on the unit square: 0, 1, 1 and 2/3."""
+    """For u = 1, x, y and xy on the unit square, ∫|∇u|² is 0, 1, 1 and 2/3."""
     n = 5
     x = np.tile(np.linspace(0, 1, n + 1), n + 1)
     y = np.repeat(np.linspace(0, 1, n + 1), n + 1)
@@ -67,7 +67,7 @@ def test_the_stiffness_is_exact_for_functions_of_the_element_space():
 
 @pytest.mark.parametrize("n", [3, 4, 8])
 def test_the_load_integrates_polynomials_of_the_first_degree(n):
-    """The edge of the loaded strip may be inside a cell."""
+    """The edge of the loaded strip may lie inside a cell."""
     y = np.linspace(0, 1, n + 1)
     share = hat_integrals(n, 0.75, 1.0)
 
@@ -88,7 +88,8 @@ def test_the_forms_have_one_solution_in_every_gluing(glue):
 
 
 def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
-    """The contact force is the load, ¼; contact covers part of the edge only."""
+    """The contact force equals the load, ¼, and only a part of the edge is in
+    contact."""
     case = built("dual", S=2, n=8)
     s = solution(case)
     values = case.quantities(s)

@@ -1,4 +1,4 @@
-"""The plate in subdomains: published condition numbers, and agreement of all forms."""
+"""The plate in subdomains: published condition numbers, and agreement of the forms."""
 
 from typing import Any
 

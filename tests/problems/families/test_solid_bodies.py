@@ -1,4 +1,4 @@
-"""Bodies in space from gmsh files, compared with exact solutions and cut bodies."""
+"""Bodies in space from gmsh files, compared with exact solutions and divided bodies."""
 
 import meshio
 import numpy as np
@@ -50,7 +50,8 @@ def build(text):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keys", ["primal", "dual", "basis=standard/dual"])
 def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
-    """u = p/E (ν x, ν y, −z) in both blocks, on interfaces that do not match."""
+    """On interfaces that do not match, the displacement is p/E (ν x, ν y, −z) in both
+    blocks."""
     case = build(f"bodies:{solid_blocks(tmp_path, KINDS[kind])}/{keys}")
     s = reference_solution(case.qp)
     fields = case.fields(s)
@@ -88,7 +89,8 @@ def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
 
 
 def test_loads_on_faces_are_spread_by_area(tmp_path):
-    """Both tetrahedra and a total force; the corners' shares differ by triangles."""
+    """Tractions and total forces are tested on tetrahedra, whose numbers of triangles
+    differ from corner to corner."""
     for load in ("traction = [3e5, -2e5, 1e6]", "force = [3e5, -2e5, 1e6]"):
         toml = TOML.replace("traction = [0, 0, -1e6]", load)
         whole = read_bodies(solid_blocks(tmp_path, TETRAHEDRA, toml), "strain")
@@ -161,7 +163,8 @@ def test_what_volumes_do_not_support_is_refused_in_one_line(
 
 
 def test_a_block_that_tips_over_an_edge_is_refused_with_its_axis(tmp_path):
-    """Its resultant acts at x = 1.25, beyond the edge x = 1 of its foot."""
+    """The resultant of the loads acts at x = 1.25, beyond the edge of the foot at
+    x = 1."""
     toml = TOML.replace('boundary = "left"', 'boundary = "foot"')
     toml = toml.replace('boundary = "front"', 'boundary = "foot"')
     toml = toml.replace('fix = ["z"]', 'fix = ["x", "y", "z"]')

@@ -57,7 +57,7 @@ SOLVED = 1e-10  #: what two references may leave of another point to linearise a
 
 
 def emitted(ranks, cases):
-    """Return the assembled parts of several ranks, by case."""
+    """Return the parts that several ranks assemble, by case."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
@@ -71,7 +71,7 @@ def emitted(ranks, cases):
 
 @pytest.fixture(scope="module")
 def described(tmp_path_factory):
-    """Cases of described bodies in parts, by topic."""
+    """Names of cases of user-defined bodies in parts, by topic."""
     path = press.described(tmp_path_factory.mktemp("press"))
     name = f"bodies:{path}/parts=8"
     return {
@@ -99,7 +99,7 @@ def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request, described):
-    """Return the assembled parts of several ranks."""
+    """Parts that several ranks assemble for all cases."""
     bodies = described["first"], described["friction"]
     return emitted(request.param, [*CASES, *bodies])
 
@@ -140,7 +140,8 @@ def test_problems_after_solutions_equal_those_of_one_process(ranks):
 
 
 def test_every_disc_has_one_owner(found):
-    """Of 16 nodes, whose discs and multipliers are those of one process."""
+    """Together, the ranks store the 16 discs of a single process, with equal indices
+    and radii."""
     of = found[DISCS]
     assert of["discs"][0] == of["discs"][1]
     assert len(of["discs"][0]) == 16
@@ -175,7 +176,8 @@ def test_no_choice_of_keys_is_emitted_as_another_qp(seed):
 
 
 def generated(rng, count=8):
-    """Names of tiny cases, with blocks of all shapes and three subdomains or more."""
+    """Yield names of small cases with blocks of all shapes and at least three
+    subdomains."""
     for _ in range(count):
         glue = rng.choice(["orthonormal", "chain", "redundant"])
         law = rng.choice(["", "/friction=tresca/bound=1e5"])
@@ -221,10 +223,10 @@ def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
 
 
 def generated_with_coulomb_s_law(rng, count=3):
-    """Names of tiny cases with subdomains enough for two ranks.
+    """Yield names of small cases with enough subdomains for two ranks.
 
-    Of cylinders without Q, supports hold the node in the middle of both, whose force of
-    friction is no unique one then.
+    Cylinders without Q are not included: supports fix the central node of both bodies,
+    so that its friction force is not unique.
     """
     for _ in range(count):
         method = (

@@ -1,4 +1,4 @@
-"""QPs from files: the QP that is read equals the one that was written."""
+"""QPs from files: the QP that is read equals the QP that was written."""
 
 import gzip
 import json
@@ -83,7 +83,8 @@ def solved(qp):
 
 @pytest.fixture
 def written(tmp_path, monkeypatch):
-    """Write a file and name it; the working directory is its folder."""
+    """Return a function that writes a file to the working directory and returns its
+    case name."""
     monkeypatch.chdir(tmp_path)
 
     def write(content, name):
@@ -158,7 +159,8 @@ def test_highs_reads_the_same_qp(tmp_path, section):
 
 
 def awkward(rng, n=7, *, symmetric=True):
-    """Every kind of bound, an empty row and column, numbers of 17 and of few digits."""
+    """Return a QP with all kinds of bounds, empty rows and columns, and numbers with
+    few or 17 digits."""
     P = rng.standard_normal((n, n))
     P = P @ P.T
     P[:, -1] = P[-1] = 0
@@ -178,7 +180,7 @@ def awkward(rng, n=7, *, symmetric=True):
 
 
 def of_symmetric_part(qp):
-    """The QP with the symmetric part of P, on which the objective depends alone."""
+    """Return the QP with the symmetric part of P, which determines the objective."""
     M = {name: csc_array(M) for name, M in explicit_matrices(qp)[0].items()}
     return replace(qp, **{**M, "P": csc_array((M["P"] + M["P"].T) / 2)}, structure=None)
 
@@ -202,7 +204,7 @@ def test_the_export_of_a_case_as_qps_is_its_qp(written, command, form):
 
 
 def test_highs_reads_an_exported_qps(tmp_path):
-    """Also where P is symmetric up to rounding only."""
+    """P is symmetric only up to rounding."""
     qp = awkward(np.random.default_rng(32), symmetric=False)
     save_qps(tmp_path / "a.mps", qp, {})
     qp = of_symmetric_part(qp)
@@ -433,7 +435,8 @@ def test_a_bad_mat_file_is_named_with_what_is_wrong(written, changes, message):
     ids=["concave", "saddle", "small", "large"],
 )
 def test_a_qp_that_is_not_convex_is_refused(written, P, message):
-    """min −½x² over −1 ≤ x ≤ 1 has its maximum, a KKT point, at 0."""
+    """For example, min −½x² over −1 ≤ x ≤ 1 has a KKT point at 0, which is its
+    maximum."""
     n = P.shape[0]
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.zeros(n)}
     with pytest.raises(InputError) as e:
@@ -511,7 +514,8 @@ def test_the_error_for_a_missing_path_states_the_syntax(text):
 
 @pytest.fixture
 def command(capsys):
-    """Run the command line; return exit code, stdout and stderr."""
+    """Return a function that runs the command line and returns exit code, stdout and
+    stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda *_, **__: [],
