@@ -18,7 +18,7 @@ from mortarbench.problems.experiments.scaling_model import (
 )
 from tests.support import ROOT
 
-#: ms per product times √m of a prototype, by cores; m = 1, 2, 4, 8
+#: √m times ms per product of a prototype, by cores, for m = 1, 2, 4, 8
 PROTOTYPE = {
     128: (15,), 1024: (18, 21), 10240: (92, 27, 29), 102400: (1835, 168, 41.5, 41.1),
 }  # fmt: skip
@@ -135,6 +135,4 @@ def test_one_core_sends_nothing_and_congruent_subdomains_share_a_block():
 
 
 def test_a_block_contains_the_surface_of_a_subdomain():
-    assert (
-        Distribution(cores=1, cells=2).block == 3 * 26
-    )  # 27 nodes, one of them inside
+    assert Distribution(cores=1, cells=2).block == 3 * 26  # one of 27 nodes is inside

@@ -51,7 +51,7 @@ DOWN = [("upper", "top left", [0, -1e6]), ("upper", "top right", [0, -1e6])]
 
 
 def test_loads_that_press_down_within_the_support_are_balanced():
-    for share in (0.5, 0.01, 0.99, 1.0):  # up to its very edge
+    for share in (0.5, 0.01, 0.99, 1.0):  # up to the edge of the support
         forces = [
             ("upper", "top left", [0, -2e6 * share]),
             ("upper", "top right", [0, -2e6 * (1 - share)]),

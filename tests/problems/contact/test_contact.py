@@ -8,11 +8,11 @@ from mortarbench.problems.contact import node_to_segment as contact
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.surface import surface
 
-#: a master below the slave: body under the chain means the chain runs right to left
+#: master below the slave; its chain runs from right to left, so that the body is below
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
 
 
-#: above MASTER, its body on the left: it runs from left to right
+#: chain above MASTER from left to right, so that the body is above
 FLAT = np.array([[0.5, 0.25], [1.5, 0.25], [2.5, 0.25]])
 ROOF = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
 

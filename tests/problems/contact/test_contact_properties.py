@@ -48,7 +48,7 @@ def test_rows_are_blind_to_translations(side):
         forces = B.toarray().reshape(len(c), len(side[0]), 2)
 
         assert np.isfinite(c).all(), name
-        # a sliver of cover extrapolates with large entries that cancel
+        # if a small part of a segment is covered, entries are large and cancel
         size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
         assert (abs(forces.sum(axis=1) / size) <= 1e-14).all(), name
 
@@ -80,7 +80,7 @@ def test_forces_of_a_mortar_row_have_no_moment(side):
             [-x[:, 1], x[:, 0]]
         )
 
-        # terms of the integrals: with a sliver of cover ∫|Φ_j| is large beside ∫N_j
+        # if a small part of a segment is covered, ∫|Φ_j| is large compared with ∫N_j
         terms = 1 + np.abs(moments).sum(axis=(1, 2))
         if phi is not None:
             sums = np.zeros(len(slave))

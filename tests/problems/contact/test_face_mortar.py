@@ -58,7 +58,7 @@ def test_areas_of_overlaps_are_those_of_exact_clipping():
     count = 400
     first = anticlockwise(RNG.random((count, 3, 2)))
     other = anticlockwise(RNG.random((count, 3, 2)))
-    # also common corners, common edges and equal triangles
+    # include triangles with common corners or edges, and equal triangles
     other[:50, 0] = first[:50, 0]
     other[50:100, :2] = first[50:100, 1::-1]
     other[100:150] = first[100:150]
@@ -180,7 +180,7 @@ def test_the_gap_of_parallel_sides_is_their_distance():
     )  # fmt: skip
     rows = face_mortar(points, np.zeros(points.size), slave, master)
     assert_allclose(rows.c, 0.3, atol=1e-14)
-    # closing by 0.1 leaves 0.2, and c is that of the total displacement
+    # moving down by 0.1 leaves a gap of 0.2; c refers to the total displacement
     u = np.zeros_like(points)
     u[np.unique(master), 2] = -0.1
     moved = face_mortar(points, u.ravel(), slave, master)
@@ -219,7 +219,8 @@ def test_only_covered_nodes_have_rows_and_half_covered_faces_pass_the_patch_test
         grid((3, 3), 0.0, kind="quad", up=False),
     )
     upper = np.unique(master)
-    points[upper, 0] = 0.30 + 0.4 * points[upper, 0]  # cuts through slave faces
+    # the edge of the side cuts slave faces
+    points[upper, 0] = 0.30 + 0.4 * points[upper, 0]
     for basis in ("dual", "standard"):
         rows = face_mortar(points, np.zeros(points.size), slave, master, basis=basis)
         assert 0 < len(rows.c) < 25

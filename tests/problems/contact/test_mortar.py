@@ -324,7 +324,7 @@ def test_on_straight_sides_rows_are_those_with_the_normal_outside_of_the_integra
     assert c == pytest.approx(np.full(8, 0.05), abs=1e-15)
 
 
-# the paper's geometry and reach -------------------------------------------------------
+# geometry and reach of the benchmark --------------------------------------------------
 
 
 @pytest.mark.parametrize("basis", BASES)
@@ -431,7 +431,7 @@ def test_odd_shapes_give_finite_rows(shape, basis):
         "zigzag": ([[0, 0], [1, 0], [0.5, 0], [1.5, 0]],
                    [[2, -1], [1, -1], [1.5, -1], [-1, -1]]),
         "touching": ([[0, 0], [1, 0], [2, 0]], [[2, 0], [1, 0], [0, 0]]),
-        # beyond the point where the normals of a convex slave meet, inside its body
+        # the master is beyond the point where the normals of the slave meet
         "focus": ([[-1, 0.2], [0, 0], [1, 0.2]], [[2, 9], [-2, 9]]),
     }[shape]  # fmt: skip
     B, c, *_ = rows(np.array(slave, float), np.array(master, float), basis=basis,

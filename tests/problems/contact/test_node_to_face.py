@@ -64,7 +64,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
         tangential=tangential,
     )  # fmt: skip
 
-    # the displacement of the plane in every layer
+    # every layer has the displacement of the plane problem
     motion = RNG.standard_normal(flat.shape)
     in_space = np.zeros_like(points)
     in_space[:, [0, 2]] = np.concatenate(

@@ -130,7 +130,7 @@ def test_normals_and_areas_of_a_side_in_space_follow_its_rotation():
         assert side.normal == pytest.approx(np.tile(turn[:, 2], (len(facets), 1)))
         assert side.node_normal == pytest.approx(np.tile(turn[:, 2], (12, 1)))
         assert side.areas.sum() == pytest.approx(1.5)
-    # an edge of a body, where two sides meet, has the mean of their normals
+    # nodes on the edge between two sides have the mean of both normals
     corner = np.concatenate([BLOCK.boundaries["top"], BLOCK.boundaries["right"]])
     side = current_surface(BLOCK.points, np.zeros(BLOCK.dofs), corner, "slave")
     on_edge = (side.x[:, 0] == 1) & (side.x[:, 2] == 0.5)

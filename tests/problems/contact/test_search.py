@@ -131,7 +131,7 @@ def test_an_invalid_reach_is_refused(wrong, message):
 def test_by_default_the_larger_side_bounds_the_distance():
     small, large = surface(arc(4, 0.1), "s"), surface(arc(4, 2.0), "m")
 
-    expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
+    expected = 2 * np.sqrt(5)  # the bounding box of a half circle is 2r × r
     assert Reach().max_distance(small, large) == pytest.approx(expected)
     assert Reach().max_distance(large, small) == pytest.approx(expected)
     assert Reach(distance=0.25).max_distance(small, large) == 0.25

@@ -294,7 +294,7 @@ def test_a_dual_is_charged_for_a_factor_that_was_there_already(form):
     family = PROBLEMS["beam-ring"]
     for step in (1, 2):
         params = family.complete(dict(Nr=3, Nh=2, step=step))
-        # of the problem that `build` uses: caches of bodies forget it earlier
+        # the bodies of the same cached problem that `build` uses
         bodies = problem(params).bodies
         factor = {"dual": bodies.floating, "dual-bounds": bodies.clamped}[form]
         assert factor.seconds > 0
@@ -332,7 +332,7 @@ def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transfo
 
     last = path.answer(6)
 
-    assert inverse.solves == 2  # of the load, and of the last step
+    assert inverse.solves == 2  # one for the load, and one for the last step
     primal = path.primal(6)
     assert kkt_residuals(primal, last).worst <= 1e-6
     path.answer(3), path.answer(3)

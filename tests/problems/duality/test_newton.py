@@ -167,7 +167,8 @@ def test_the_residual_holds_the_largest_penetration(equilibrium):
     open_row = int(np.argmin(lam[at.rows.place]))
     gap[open_row] = -0.25
     free = lam.copy()
-    free[at.rows.place[open_row]] = 0.0  # no multiplier: it is no gap under one
+    # without a multiplier, only the penetration counts
+    free[at.rows.place[open_row]] = 0.0
     balanced = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
     assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
 
@@ -222,14 +223,14 @@ def configuration(u, energy, gap, r=-1.0, strain_energy=0.0):
 @pytest.mark.parametrize(
     ("table", "length"),
     [
-        # slope −1 − 2·½ = −2 from a merit of 0 + 2·½: 1 − 2e-4 is enough at length 1
+        # slope −1 − 2·½ = −2, merit 0 + 2·½ = 1: 1 − 2e-4 suffices at length 1
         ({1.0: (-2.1e-4, -0.5)}, 1.0),
         ({1.0: (-1.9e-4, -0.5), 0.5: (-1.1e-4, -0.5)}, 0.5),
         ({1.0: (-1.9e-4, -0.5), 0.5: (-0.9e-4, -0.5), 0.25: (-1e-4, -0.5)}, 0.25),
-        # energy may grow where penetration, times its weight, falls by more
+        # energy may increase by less than the weighted decrease of the penetration
         ({1.0: (0.9, 0.0)}, 1.0),
         ({1.0: (0.9, -0.1), 0.5: (0.5, -0.2)}, 0.5),
-        # a gap that opens gains nothing
+        # an open gap does not reduce the merit function
         ({1.0: (1.1, 5.0), 0.5: (0.9, 0.5)}, 0.5),
     ],
 )
@@ -321,7 +322,7 @@ def loaded(largest, k=1, steps=1):
 def test_a_load_step_is_halved_until_its_parts_are_small_enough():
     """Step 3 of 4 increases the load factor from ½ to ¾."""
     path = Loaded(bodies=None, cells=[], gaps=None, reference=2.0)
-    assert path._load_step(1) == (1.0, 1)  # one step unless told
+    assert path._load_step(1) == (1.0, 1)  # `steps` is 1 by default
     assert loaded(0.3, k=3, steps=4) == (1, [0.75])
     assert loaded(0.07, k=3, steps=4) == (
         4, [0.75, 0.625, 0.5625, 0.625, 0.6875, 0.75],
@@ -416,7 +417,7 @@ def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
 @pytest.mark.parametrize(
     ("length", "residual", "settled"),
     [
-        (1.0, 1.9e-9, True),  # 1e-9 for the problem and as much for rounding
+        (1.0, 1.9e-9, True),  # 1e-9 is the tolerance, and 1e-9 the rounding
         (1.0, 2.1e-9, False),
         (0.5, 0.0, False),
     ],
@@ -551,14 +552,14 @@ def test_contact_stiffness_that_leaves_the_tangent_definite_is_part_of_it():
     lam = np.zeros(path._places)
     plain, _, clipped = path._convex(at, lam, None)
     assert clipped == 0
-    unit = path.bodies.force / path.bodies.length  # Pa·m of stiffness one
-    # the last one alone is raised, to a millionth of its size
+    unit = path.bodies.force / path.bodies.length  # stiffness 1 in Pa·m
+    # only the last one is indefinite; it is raised to a millionth of its magnitude
     for size, expected in ((-1e-3, -1e-3), (1.0, 1.0), (-1e9, 1e3)):
         bent, (i, j) = curved(path, size * unit)
         K, _, clipped = bent._convex(at, lam, bent.gaps.curvature)
-        assert clipped == 0  # no cell has to give for contact
+        assert clipped == 0  # cell tangents are unchanged
         difference = (K - plain).toarray()
-        held = path.bodies.B_D.indices  # ρ goes with the largest diagonal entry
+        held = path.bodies.B_D.indices  # ρ is the largest diagonal entry
         difference[held, held] = 0
         difference[[i, j], [i, j]] -= expected
         assert abs(difference).max() <= 1e-12 * abs(K).max()
@@ -655,7 +656,7 @@ def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
         return move(self, at, posed, lam, weight, best)
 
     monkeypatch.setattr(newton.NewtonPath, "_line_search", spied)
-    hertz._newton_path.cache_clear()  # another test may have solved it
+    hertz._newton_path.cache_clear()  # another test may have cached it
     plane_path().iterations(1)
     assert len(seen) >= 3
     largest = np.maximum.accumulate([most for most, _ in seen])
@@ -724,7 +725,7 @@ def test_advice_is_a_larger_load_for_tiny_loads_and_a_smaller_one_otherwise(
         plane_path(load=1e-3).iterations(1)
     monkeypatch.setattr(newton, "MAX_ITERATIONS", 1)
     with pytest.raises(InputError, match=r"expected a smaller load"):
-        plane_path(load=9.0).iterations(1)  # no other test has kept its iterations
+        plane_path(load=9.0).iterations(1)  # not cached by another test
 
 
 def test_an_iteration_that_is_not_there_is_refused():

@@ -84,7 +84,7 @@ def test_one_linearisation_has_the_digits_of_an_independent_code(form, solver):
     [("dual", SMALBE(), 1e-9), ("dual-bounds", SMALBE(), 1e-9),
      ("dual", OSQP(), 1e-9), ("primal", OSQP(), 1e-9),
      ("dual", ProxQP(), 1e-9), ("primal", ProxQP(), 1e-9),
-     # an interior point keeps λ > 10⁻⁶ max λ on nearly touching rows until 1e-10
+     # interior-point methods have λ ≤ 10⁻⁶ max λ on open rows only at 1e-10
      ("dual", Clarabel(), 1e-10), ("primal", Clarabel(), 1e-10)],
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )  # fmt: skip
@@ -204,7 +204,7 @@ def test_no_contact_no_force():
     case = build("dual-bounds", Nr=4, Nh=3, steps=1)
     primal = build("primal", Nr=4, Nh=3, steps=1)
     gaps = primal.qp.h
-    lifted = replace(case.qp, q=2 * gaps - case.qp.q)  # load reversed: c − B K⁻¹(−f)
+    lifted = replace(case.qp, q=2 * gaps - case.qp.q)  # reversed load: c − B K⁻¹(−f)
 
     assert (gaps > 0).all()
     assert (reference_solution(lifted).x == 0).all()
@@ -218,7 +218,7 @@ def test_the_load_of_a_step_is_its_share():
 
 
 CONVERGED = [
-    # contact Nr plane: u(2, 0.5), u(1, 0.75) in m; ΣBᵀλ in 10⁷ N/m; active rows
+    # contact, Nr, plane; u(2, 0.5) and u(1, 0.75) in m; ΣBᵀλ in 10⁷ N/m; active rows
     ("nts 10", (-0.03723, -0.29317, 0.01777, -0.04142), (3.0963, 18.0797), 8),
     ("nts 20", (-0.03739, -0.29423, 0.01782, -0.04148), (3.0632, 18.0928), 16),
     ("nts 30", (-0.03742, -0.29446, 0.01783, -0.04151), (3.0771, 18.0904), 24),
@@ -322,7 +322,7 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
 
     assert len(energies) == 6
     for values in energies.values():
-        assert len(values) == 6  # SMALBE on the dual, Clarabel on both, each two ways
+        assert len(values) == 6  # three solutions, each with two energies
         assert values == pytest.approx(values[:1] * 6, rel=1e-6)
 
 

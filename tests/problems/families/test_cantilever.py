@@ -58,7 +58,7 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
     assert values["clipped_in_step"] == 0
     assert values["load_parts"] == 1
     assert values["residual"] < 1e-8
-    # at the end of Newton's method the model of the QP is the potential itself
+    # at convergence, the quadratic model equals the potential
     s = answer.solution
     emitted_case = case.family_case
     objective = emitted_case.scale * case.qp.objective(s.x) + emitted_case.constant

@@ -38,7 +38,7 @@ def solved(name):
     return case, s, case.quantities(s)
 
 
-# mu: tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows of 8 active ones
+# mu, tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows (8 are active)
 DIGITS = [
     (0.1, -0.295871, 1.79947, 1),
     (0.3, -0.29546, 1.7963, 1),
@@ -158,7 +158,7 @@ def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
         "/primal",
         PROBLEMS,
     ).build(reference_solution)
-    share = np.array([1, 2, 2, 2, 1]) / 8  # of a side of 1 m in four cells
+    share = np.array([1, 2, 2, 2, 1]) / 8  # shares of a side of 1 m with four cells
 
     assert case.mechanics.friction.bound * 1e6 == pytest.approx(2e5 * share)
 
@@ -274,7 +274,8 @@ def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
     _, _, first = solved(f"{name}/iterate=1/dual-bounds")
     _, _, smooth = solved(f"{SMALL}/dual-bounds")
     last, _, _ = solved(f"{name}/dual-bounds")
-    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)  # of no bound yet
+    # the first bound is zero
+    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)
     residuals = []
     for k in (1, 2, 3, 4):
         case, s, values = solved(f"{name}/iterate={k}/dual-bounds")

@@ -93,7 +93,7 @@ def msh41(points, quads, curves, spots):
             tag += 1
             groups += [f'{dimension} {tag} "{name}"'] if name else []
             box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 writes these, too
+            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 also writes these
             entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
             blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
             for cell in cells:
@@ -200,7 +200,7 @@ def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
     for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
         one, two = getattr(ours.qp, name), getattr(theirs.qp, name)
         one, two = (M.toarray() if hasattr(M, "toarray") else M for M in (one, two))
-        if name == "A" and len(one):  # the order of the supports is our own
+        if name == "A" and len(one):  # the order of support rows differs
             one, two = (M[np.argsort(M.argmax(axis=1))] for M in (one, two))
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
     if form == "dual-bounds":
@@ -597,7 +597,7 @@ def test_a_load_that_its_supports_take_up_is_refused(
 @pytest.mark.parametrize(
     ("load", "supports"),
     [
-        # one node of the top, at its left end, is held
+        # the left end node of the top is fixed
         ('boundary = "top"\nforce = [0, -1e8]', ""),
         ('boundary = "top"\nforce = [0, -1e8]',
          '[[supports]]\nboundary = "top"\nfix = ["x"]\n'),
@@ -643,7 +643,7 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected a name "
          'for each: Physical Surface("NAME") in the .geo file'),
-        # the file has no cells of a surface that has no physical name
+        # gmsh omits the cells of surfaces without a physical name
         (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
          "that bounds no body in the file; expected every body to have a name: "
          'Physical Surface("NAME") in the .geo file'),

@@ -151,7 +151,7 @@ def test_400_elements_have_hertz_s_pressure():
 def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
     got = result(n=400, law="cattaneo", Q=Q, peak=peak)
 
-    assert got["shear_l2_error"] < 8e-3  # of a q that is small at the end
+    assert got["shear_l2_error"] < 8e-3  # relative to q, which is small after unloading
     assert abs(got["shear_centre_error"]) < 1e-3
     assert abs(got["stick_half_width_error"]) < 1e-3
     assert got["dissipation"] > 0
@@ -163,7 +163,7 @@ def test_dissipation_is_the_work_of_the_force_less_the_stored_energy():
     Q = np.linspace(-0.8, 0.8, 201)
     unit = MU * EXACT.P * 2 * MU * EXACT.P / (np.pi * EXACT.E_star)
     moved = [displacement(tangential(q, 0.8).semicircles) for q in Q]
-    back = -np.trapezoid(Q, moved) * unit  # from 0.8 to −0.8, as moved falls
+    back = -np.trapezoid(Q, moved) * unit  # work from 0.8 to −0.8
     got = result(n=200, law="cattaneo", Q=-0.8, peak=0.8)["dissipation"]
 
     assert got == pytest.approx(abs(back), rel=2e-3)

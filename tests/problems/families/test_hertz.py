@@ -98,7 +98,7 @@ def test_the_pressure_is_symmetric_and_none_pulls():
 
     assert force == pytest.approx(force[::-1], abs=1e-8 * force.max())
     assert force.min() >= 0
-    assert abs(s.x[:2]).max() <= 1e-8 * force.max()  # the supports on the axis
+    assert abs(s.x[:2]).max() <= 1e-8 * force.max()  # reactions on the axis
 
 
 @pytest.mark.parametrize(("contact", "basis"), PAIRINGS[:2])
@@ -272,7 +272,7 @@ def test_the_tangential_force_turns_no_body():
     bodies = stated.bodies.assembled
     (x, y), upper = bodies.mesh.points.T, bodies.body_of_node == 0
     load = np.zeros(bodies.mesh.dofs)
-    load[last.component] = last.value / (0.5 * 0.5)  # of Q in units of μP
+    load[last.component] = last.value / (0.5 * 0.5)  # unit of Q is μP
     load[first.component] -= first.value / (0.5 * 0.5)
     load = load.reshape(-1, 2)
     case = CYLINDER.build("dual", params, reference_solution)

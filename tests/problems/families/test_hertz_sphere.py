@@ -46,7 +46,7 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
     assert r[touching].max() == pytest.approx(0.648715, abs=1.5 * 0.648715 / 8)
 
 
-#: two spheres of steel-like numbers, with which MOOSE is verified: a/R = 0.05
+#: two spheres of the verification of MOOSE, with a/R = 0.05
 MOOSE = "against=sphere/R=2/E=1.40625e7/nu=0.25/load=10000"
 
 
@@ -160,7 +160,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     assert abs(divergence).max() <= 1e-8
     sigma = stress(x, nu)
     np.testing.assert_allclose(sigma, sigma.transpose(0, 2, 1), atol=1e-16)
-    # no tractions on the free surface, and the opposite total on every half sphere
+    # the free surface has no tractions; on any half sphere, their resultant is −1
     flat = stress(x * [1, 1, 0], nu)
     assert abs(flat[:, 2]).max() <= 1e-15
     z, weights = np.polynomial.legendre.leggauss(20)
@@ -174,7 +174,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     traction = np.einsum("kij,kj->ki", stress(normal, nu), normal)
     total = np.repeat(weights * 2 * np.pi / 16, 16) @ traction
     assert total == pytest.approx([-f for f in force], abs=1e-12)
-    # compatible with Hooke's law: Beltrami's equation, (1 + ν)∇²σ + ∇∇tr σ = 0
+    # compatibility: Beltrami's equation (1 + ν)∇²σ + ∇∇tr σ = 0
     h, axes = 1e-3, np.eye(3)
     at = x[:5] / np.linalg.norm(x[:5], axis=1, keepdims=True)
     laplacian = sum(
@@ -200,7 +200,7 @@ def test_a_tangential_force_leaves_the_middle_sticking():
     assert values["c_over_a"] == pytest.approx(0.5 ** (1 / 3), rel=0.05)
     assert values["c_over_a_moment"] == pytest.approx(0.5 ** (1 / 3), rel=0.05)
     assert values["friction_residual"] <= 1e-9
-    # bodies of one material: Q does not change the pressure
+    # because both bodies have the same material, Q does not change the pressure
     for name in ("contact_radius", "p_max", "approach"):
         assert values[name] == pytest.approx(pressed[name], rel=1e-3)
 

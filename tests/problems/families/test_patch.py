@@ -159,7 +159,7 @@ def test_the_displacement_in_space_is_the_exact_linear_one(form):
     case, s, quantities = solved(form, dim=3, distort=0.2, ratio=1.0, lower=4, upper=3)
     points = model(FAMILY.defaults | dict(dim=3, distort=0.2, lower=4, upper=3)).mesh
     u = as_vectors(case.recover(s), 3)
-    # uniaxial stress: strains ν p/E, ν p/E, −p/E
+    # the strains under uniaxial stress are ν p/E, ν p/E and −p/E
     exact = points.points * [0.03, 0.03, -0.1]
     assert u == pytest.approx(exact, abs=1e-9)
     assert quantities["energy"] == pytest.approx(-0.5 * 1e6 * 0.1, rel=1e-8)

@@ -62,7 +62,7 @@ def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, key
     assert abs(fields.displacement - exact).max() <= 1e-9 * abs(exact).max()
     assert pair["force"]["upper"] == pytest.approx([0, 0, PRESSURE], abs=1e-9 * 1e6)
     assert pair["largest_pressure"] == pytest.approx(PRESSURE, rel=1e-9)
-    # half the work of the load: area 1, the top moves by −2p/E
+    # half the work of the load on the area 1, whose displacement is −2p/E
     assert values["energy"] == pytest.approx(-(PRESSURE**2) / E, rel=1e-9)
 
 

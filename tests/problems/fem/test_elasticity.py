@@ -81,7 +81,7 @@ def bricks(n, amplitude=0.05):
 
 def test_stiffness_of_hexahedra_equals_an_independent_code():
     mesh = bricks(3)
-    theirs = MeshHex().p  # their order of corners, in [0, 1]³
+    theirs = MeshHex().p  # corners of scikit-fem, in [0, 1]³
     ours = (HEXAHEDRON.corners + 1) / 2
     order = [int((ours == corner).all(axis=1).argmax()) for corner in theirs.T]
     reference = Basis(
@@ -105,7 +105,7 @@ def test_stiffness_of_one_hexahedron_equals_quadrature_by_hand():
     D, x = elasticity_matrix(STEEL, None), mesh.points[mesh.cells[0]]
     expected = np.zeros((24, 24))
     for at in HEXAHEDRON.corners / np.sqrt(3):
-        step = 1e-30j  # derivatives to all digits
+        step = 1e-30j  # complex step: no cancellation
         moved = at + step * np.eye(3)
         N = np.prod(1 + HEXAHEDRON.corners * moved[:, None], axis=2) / 8  # (3, 8)
         dN = N.imag / step.imag
@@ -158,7 +158,7 @@ def test_rigid_modes_of_any_dimension_are_orthonormal_rigid_motions(points, mode
 
     assert R.shape == (N * dim, modes)
     np.testing.assert_allclose(R.T @ R, np.eye(modes), atol=1e-14)
-    apart = points[:, None] - points  # no distance changes, to first order
+    apart = points[:, None] - points  # distances are unchanged to first order
     for mode in R.T:
         v = as_vectors(mode, dim)
         change = np.einsum("abx,abx->ab", apart, v[:, None] - v)

@@ -143,7 +143,7 @@ def test_halved_cells_fill_each_body_and_meet_at_whole_edges(named):
         )
         assert after == pytest.approx(before, rel=1e-13)
         assert len(fine.surfaces[name]) == 4 * len(cells)
-    # Euler's characteristic stays; a node that hangs on an edge would change it
+    # Euler's characteristic is preserved; a hanging node would change it
     before, after = (len(m.points) - edges(m) + len(m.cells) for m in (named, fine))
     assert after == before
 

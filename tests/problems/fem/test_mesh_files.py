@@ -45,7 +45,7 @@ def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
     for side in expected.curves:
         assert facets(chosen, side) == facets(expected, side)
-        # from outside the corners are anticlockwise
+        # corners are anticlockwise as seen from outside
         for one in (chosen, expected):
             a, b, c, d = np.moveaxis(one.points[one.curves[side]], 1, 0)
             one.spots[f"area {side}"] = np.cross(c - a, d - b).sum(axis=0)
@@ -61,7 +61,7 @@ def named_like(path, expected):
     return named_mesh(read_mesh_file(path), expected.surfaces)
 
 
-#: the corners of one element, and the plane of each face S1, S2, …: axis and position,
+#: corners of one element, and the plane (axis and position) of each face S1, S2, …,
 #: or None for the oblique face
 ONE = {
     "C3D8": (

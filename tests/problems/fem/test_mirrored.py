@@ -154,10 +154,10 @@ def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, for
     assert_allclose(v, sign(bodies) * u, rtol=0, atol=1e-8 * abs(u).max())
     assert other == pytest.approx(here, rel=1e-8)
     assert here["energy"] == pytest.approx(here["objective"], rel=1e-9)
-    assert here["up"] > bodies.force  # the ring holds the beam
+    assert here["up"] > bodies.force  # the ring supports the beam
 
 
-#: of length and of force per thickness: SI; mm and N/mm; m and GN/m; inches and lbf
+#: units of length and of force per thickness: SI; mm, N/mm; m, GN/m; inches, lbf
 UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
 
 

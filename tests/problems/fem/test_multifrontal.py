@@ -57,7 +57,7 @@ def choices(mesh):
     every, half = np.arange(n), np.sort(rng.permutation(n)[: n // 2])
     return [
         (every, half[::5]), (half, half[::7]), (every, every), (every, every[:0]),
-        (every[n // 2 :], every[n // 2 :: 9]),  # whole fronts have nothing to eliminate
+        (every[n // 2 :], every[n // 2 :: 9]),  # some fronts have no pivots
     ]  # fmt: skip
 
 

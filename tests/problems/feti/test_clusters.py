@@ -26,7 +26,7 @@ from tests.support.threads import on_threads, without_lock
 
 pytestmark = pytest.mark.together
 
-#: κ(PFP) by a prototype, and the number of rigid motions of all clusters
+#: κ(PFP) of a prototype, and the number of rigid motions of all clusters
 PUBLISHED = [
     ("plate", 10.7836, 48),
     ("plate/cluster=2", 20.8450, 12),
@@ -103,7 +103,7 @@ CASES = [
     ("plate/Sx=3/Sy=2/n=3/ny=2/cluster=2", 2),
     ("plate/Sx=4/Sy=2/n=2/pattern=checkerboard/jump=10/glue=chain/cluster=2", 2),
     ("plate/Sx=3/Sy=3/n=2/plane=stress/glue=redundant/cluster=3", 3),
-    ("plate/Sx=4/Sy=2/n=1/cluster=2", 2),  # rows of C depend on one another
+    ("plate/Sx=4/Sy=2/n=1/cluster=2", 2),  # rows of C are linearly dependent
     ("plate/Sx=2/Sy=2/n=3/height=0.7/cluster=1", 1),
     ("plate/Sx=3/Sy=1/n=1/dim=3/Sz=2/cluster=2", 2),
 ]
@@ -124,7 +124,7 @@ def test_the_spectrum_is_that_of_dense_elimination(name, side):
     assert qp.A.shape[0] == R.shape[1]
     assert spectrum.smallest == pytest.approx(size[0], rel=1e-6)
     assert spectrum.largest == pytest.approx(size[-1], rel=1e-6)
-    # both bases of ker C ∩ ker K, and of the equations, span the same space
+    # both bases of ker C ∩ ker K span the same space
     assert np.linalg.matrix_rank(np.hstack([R, local.units.kernel.toarray()])) == len(
         R.T
     )
@@ -181,7 +181,7 @@ FAMILIES = [
     ("obstacle/n=8/feti=2", "cluster=2"),
     ("beam-ring/Nr=3/Nh=2/steps=2/contact=mortar/feti=2", "glue=chain/cluster=2"),
     ("beam-ring/Nr=2/Nh=2/steps=1/friction=tresca/bound=1e6/feti=2", "cluster=2"),
-    # averages over sides of one cell determine normal gluing rows
+    # with sides of one cell, averages determine the normal gluing rows
     ("contact-patch/lower=4/upper=6/feti=2", "cluster=2"),
     ("contact-patch/lower=4/upper=6/friction=coulomb/mu=0.3/feti=2", "cluster=2"),
     ("cube-wall/n=4/feti=2", "cluster=2"),

@@ -58,15 +58,17 @@ def test_blocks_fill_the_time_until_factors_are_sent():
     more, less = factors.argmax(), factors.argmin()
 
     assert blocks_before_exchange(tasks, more) == 0
-    assert blocks_before_exchange(tasks, less) == 3  # blocks take a third of a factor
+    # a block takes a third of the time of a factor
+    assert blocks_before_exchange(tasks, less) == 3
 
 
 def test_classes_of_a_single_rank_are_factorised_before_the_exchange():
     tasks = {
-        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # the factor takes 6
         "b": Assignment(4, [1], factor_rank=1, block_rank=1),
         "c": Assignment(4, [1], factor_rank=1, block_rank=1),
-        "d": Assignment(40, [0], factor_rank=0, block_rank=0),  # which nobody waits for
+        # not needed by other ranks
+        "d": Assignment(40, [0], factor_rank=0, block_rank=0),
     }
 
     assert blocks_before_exchange(tasks, 1) == 1
@@ -75,17 +77,16 @@ def test_classes_of_a_single_rank_are_factorised_before_the_exchange():
 
 def test_blocks_fill_the_time_until_the_last_factor_is_sent():
     tasks = {
-        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
-        "e": Assignment(
-            16, [1, 2], factor_rank=2, block_rank=1
-        ),  # whose factor takes 12
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # the factor takes 6
+        # the factor takes 12
+        "e": Assignment(16, [1, 2], factor_rank=2, block_rank=1),
         **{name: Assignment(4, [1], factor_rank=1, block_rank=1) for name in "bcd"},
     }
     assert blocks_before_exchange(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
     assert blocks_before_exchange(less, 1) == 1
     alone = {"a": less["a"], "b": Assignment(11, [1], factor_rank=1, block_rank=1)}
-    assert blocks_before_exchange(alone, 1) == 1  # more than half of it fits in
+    assert blocks_before_exchange(alone, 1) == 1  # more than half of the block fits
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
     assert blocks_before_exchange(smaller, 1) == 2
 
@@ -325,9 +326,9 @@ def test_each_of_as_many_ranks_has_one_subdomain():
         balanced_partition(chain(5), ones, ones, 6)
 
 
-#: of eight subdomains of equal work, of which the first four are four times as large
-ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: is even: sizes of 16 and 4
-ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work of 3 and 5, sizes of 12 and 8
+#: ranks of eight subdomains of equal work; the first four are four times as large
+ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: work is balanced; sizes 16 and 4
+ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work 3 and 5, sizes 12 and 8
 BETTER = [0, 0, 0, 1, 0, 1, 1, 1]  #: sizes of 13 and 7
 BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
 
@@ -351,7 +352,7 @@ def test_among_partitions_with_balanced_work_the_best_sizes_win(
 
     def answer(graph, weight, ranks, seed=None):
         assert not graph.diagonal().any()
-        assert (graph.data > 0).all()  # METIS takes no other weights
+        assert (graph.data > 0).all()  # METIS requires positive weights
         assert weight.dtype.kind == "i"
         assert weight.min() == 1
         asks.append((seed, weight.tolist()))
@@ -439,10 +440,10 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
     length[[4, 6]], length[[5, 7]] = 1e3, 1e-3
     parts = np.array([np.diag(2.0 * on / here.sum(axis=0)) for on in here])
     for p, i, j, share in (
-        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # which cancel
+        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # these entries cancel
         (0, 2, 3, 0.25), (1, 2, 3, 0.25),
-        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding of long and of short rows
-        (0, 0, 8, 0.5),  # which is none of those that are asked for
+        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding in long and short rows
+        (0, 0, 8, 0.5),  # row 8 is not selected
         (1, 1, 9, 0.5),
     ):  # fmt: skip
         parts[p, i, j] = parts[p, j, i] = share
@@ -522,7 +523,7 @@ def test_the_sum_of_parts_on_selected_rows_is_inverted_on_all_ranks():
     def work(ranks):
         at = halo_of(ranks, here)
         part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # no other knows
+        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # on no other rank
         owned, inverse = over_ranks._replicated_inverse(
             part, np.isin(at.rows, some) & first_of, at, first
         )

@@ -35,8 +35,8 @@ CASES = (
     "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
     "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
-#: that solutions come before, by number of cells the smallest there are: contact is
-#: linearised there, or the bound of Coulomb's law is theirs
+#: small cases that depend on solutions of previous problems, at which contact is
+#: linearised or from which the bound of Coulomb's law follows
 LATER = (
     "beam-ring/Nr=1/Nh=1/steps=2/relin=2/friction=tresca/bound=1e6/feti=2/dual",
     "beam-ring/Nr=1/Nh=1/steps=2/relin=2/friction=coulomb/mu=0.3/feti=2/dual",
@@ -47,13 +47,13 @@ LATER = (
     "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
     "greco/n=4/dim=3/depth=2/feti=2/dual",
 )
-#: of which active sets alone come in circles (`solvers.reference.over_ranks`)
+#: case in which an active set method alone cycles (`solvers.reference.over_ranks`)
 CIRCLES = (
     "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/glue=chain/contact=mortar/"
     "friction=coulomb/mu=0.3/loading=static/dual"
 )
 COUPLING_ROUNDING = 1e-14
-SOLVED = 1e-10  #: what two references may leave of another point to linearise at
+SOLVED = 1e-10  #: accepted difference of two reference solutions
 
 
 def emitted(ranks, cases):

@@ -185,7 +185,7 @@ def definition(pair, kind, scaling):
         softness.append(1 / stiffness if scaling == "stiffness" else 0 * stiffness + 1)
     B, W = B[:, touched], np.diag(np.concatenate(softness))
     gram, E = B @ W @ B.T, pair.equalities
-    gram[:E, E:] = gram[E:, :E] = 0  # contact does not weigh the equations
+    gram[:E, E:] = gram[E:, :E] = 0  # drop couplings with contact
     B_D = np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ B @ W
     return B_D @ block_diag(*D) @ B_D.T
 
@@ -208,7 +208,7 @@ def test_preconditioners_add_nothing_in_the_kernel_of_redundant_rows():
     deaf = null_space(B.T)
     M = operator_of(pair).build().preconditioner("dirichlet", "stiffness")
 
-    assert deaf.shape[1] == 2 * 3  # six rows of four copies, of rank three
+    assert deaf.shape[1] == 2 * 3  # six rows for four copies have rank 3
     assert_allclose(deaf.T @ M(np.eye(len(B))), 0, atol=1e-13)
 
 

@@ -73,7 +73,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
     free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
     jumps = own.rows.B @ own.spread[:, free]
-    assert abs(jumps).max() <= 1e-15  # none where copies are one
+    assert abs(jumps).max() <= 1e-15  # copies are equal
 
 
 def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
@@ -108,7 +108,7 @@ def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, part
     assert (rank == len(B)) == (glue != "redundant")
 
 
-#: motions that a face across x leaves that is held along some axes
+#: number of rigid motions that remain if a face x = 0 is fixed along some axes
 LEFT = {"x": 3, "y": 4, "z": 4, "xy": 1, "xz": 1, "yz": 3, "xyz": 0}
 
 

@@ -74,7 +74,7 @@ def test_the_error_bounds_hold_and_are_as_small_as_asked(crowded: str) -> None:
     assert abs(found.smallest - 1.0) <= found.smallest_error <= 1e-3
     assert abs(found.largest - 10.0) <= found.largest_error <= 1e-3 * 10.0
     slow = "smallest_error" if crowded == "below" else "largest_error"
-    assert getattr(found, slow) > 1e-8  # the other end is found long before
+    assert getattr(found, slow) > 1e-8  # the other end converges long before
     assert abs(found.condition - 10.0) <= 1.001 * found.condition_error
 
 
@@ -125,7 +125,7 @@ def test_the_projector_is_onto_the_kernel_of_g_in_the_range_of_b(rows: str) -> N
     size, u = np.linalg.eigh(dense @ dense.T)
     u = u[:, size > 1e-12 * size[-1]]
     assert_allclose(u @ (u.T @ y), y, atol=1e-12)  # in range B
-    inside = dense @ np.cos(np.arange(B.shape[1]))  # what is left out is orthogonal
+    inside = dense @ np.cos(np.arange(B.shape[1]))  # the remainder is orthogonal
     assert abs((x - y) @ P(inside)) < 1e-9 * np.linalg.norm(inside)
 
 
@@ -142,7 +142,7 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     return result
 
 
-#: ‖PFP‖/κ of 2 × 2 squares of 4 × 4 cells, and of 8 × 8 (plate; notes of the issue)
+#: ‖PFP‖/κ of plates of 2 × 2 subdomains, by cells per side of a subdomain
 OF_SQUARES = {4: 5.63810 / 9.9829, 8: 10.92276 / 19.4934}
 
 

@@ -130,9 +130,7 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
     all_ = np.arange(of.count)
     keys = [(key, b) for key, b in zip(of.keys(all_), of.body.tolist(), strict=True)]
     nodes = np.split(whole.node, whole.start[1:-1])
-    found = [
-        own[of.cells(s)] for s, own in enumerate(nodes)
-    ]  # cells in the numbers of the whole
+    found = [own[of.cells(s)] for s, own in enumerate(nodes)]  # cells in global numbers
 
     for points, own in zip(of.points(all_), nodes, strict=True):
         assert_array_equal(points, mesh.points[own])

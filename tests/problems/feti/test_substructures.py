@@ -91,4 +91,4 @@ def test_a_squared_product_is_with_the_squares_of_all_entries(
     expected = K**2 @ v
     found = parts.squared_product(v)
     assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
-    assert_allclose(dense(parts), K, atol=0)  # of which none has changed
+    assert_allclose(dense(parts), K, atol=0)  # K is unchanged

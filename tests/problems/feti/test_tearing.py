@@ -141,7 +141,7 @@ def test_boxes_of_graded_cells_are_compact_everywhere():
         length = fine[high] - fine[low]
         h = length / (high - low)
         assert (high - low <= 4).all()
-        # half a cell by rounding their number; a single cell cannot be cut
+        # numbers of cells are rounded to half a cell; a single cell cannot be cut
         assert ((length <= 4 * h.min() + h / 2) | (high - low == 1)).all()
 
 
@@ -167,7 +167,7 @@ def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
     label = blocks((6, 2), 2)
     assert decompose(mesh.points, cells, label, of_one).class_of.tolist() == [0, 0, 0]
     moved = mesh.points.copy()
-    moved[6] += 1e-7  # the upper right corner of the last one, in the first row
+    moved[6] += 1e-7  # upper right corner of the last block, in the first row
     assert decompose(moved, cells, label, of_one).class_of.tolist() == [0, 0, 1]
     of_two = np.where(label == 1, 1, 0)
     assert decompose(mesh.points, cells, label, of_two).class_of.tolist() == [0, 1, 0]
@@ -214,7 +214,7 @@ def test_rows_vanish_exactly_on_continuous_supported_displacements(rows: str) ->
         rtol=1e-10,
     )
     assert_allclose(pair.c[pair.equalities :], pair.scale * primal.h, rtol=1e-12)
-    # nothing else is held: the torn motions that all equations leave at rest
+    # nothing else is fixed: rank of B_E = torn unknowns − free components
     B_E = (pair.B[: pair.equalities]).toarray()
     rank = int((np.linalg.svd(B_E, compute_uv=False) > 1e-9).sum())
     left = pair.B.shape[1] - rank

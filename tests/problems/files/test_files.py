@@ -31,7 +31,7 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: the example of Maros and Mészáros's report, with every kind of row, range and bound
+#: example of Maros and Mészáros's report, with every kind of row, range and bound
 QPS = """\
 * a comment
 NAME          EXAMPLE
@@ -115,7 +115,7 @@ def test_a_qps_text_holds_the_qp_that_its_sections_say():
     given, sign = parse_qps(QPS)
 
     assert sign == 1
-    assert given.r == 4  # the right-hand side of the objective is minus its constant
+    assert given.r == 4  # the RHS of the objective is −r
     np.testing.assert_array_equal(given.q, [1.5, -2, 0, 0, 0])
     expected = np.zeros((5, 5))
     expected[:2, :2] = [[8, 2], [2, 10]]
@@ -298,8 +298,8 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
     case = build(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
     s = solved(case.qp)
 
-    # of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 where both r1 and r2 are at their lower
-    # sides: c₁ = 0.1, c₂ = 1.8
+    # maximum of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 with r1 and r2 at their lower
+    # limits: c₁ = 0.1, c₂ = 1.8
     np.testing.assert_allclose(s.x[:2], [0.1, 1.8], atol=1e-8)
     assert case.quantities(s)["value"] == pytest.approx(-15.33)
     energy = case.scale * case.qp.objective(s.x) + case.constant
@@ -568,14 +568,14 @@ def test_the_dual_s_matrices_obey_the_paper(written, command, form):
     B, R, F, d, c = (csc_array(a[k]).toarray() for k in "BRFdc")
     if form == "dual":
         inverse = np.linalg.pinv(K, rcond=1e-12)
-    else:  # supports are not in B but in K⁺, which is zero there
+    else:  # K⁺ is zero at the supports
         free = np.setdiff1d(np.arange(f.size), csr_array(p["A"]).indices)
         inverse = np.zeros_like(K)
         inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
 
     np.testing.assert_array_equal(F, a["P"].toarray())
     np.testing.assert_array_equal(d, -a["q"])
-    # any generalised inverse serves on the λ that satisfy RᵀBᵀλ = Rᵀf
+    # for λ with RᵀBᵀλ = Rᵀf, any generalised inverse is valid
     T = np.linalg.svd(R.T @ B.T)[2][R.shape[1] :] if R.size else np.eye(len(c))
     scale = abs(T @ F @ T.T).max()
     np.testing.assert_allclose(
