@@ -1,11 +1,12 @@
 """Check, before any solve, that supports and contacts can balance the loads on bodies.
 
-The potential energy has a lower bound if and only if no rigid motion r that the
-supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains energy from the load
-(fᵀr > 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, an
-equivalent condition is the existence of contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.
-By Moreau's decomposition, the residual of the non-negative least-squares problem for λ
-is such a motion r (in coordinates of Z), and also the unbalanced part of the load.
+The potential energy is unbounded below if and only if the load does positive work fᵀr
+on a rigid motion r that the supports allow (B_D r = 0) and that closes no gap (B
+r ≤ 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, the
+energy is bounded if and only if there are contact forces λ ≥ 0 with Zᵀ(f − Bᵀλ) = 0. If
+there are no such forces, Moreau's decomposition applies: the residual of the
+non-negative least-squares problem for λ is a motion r as above (in coordinates of Z),
+and also the unbalanced part of the load.
 """
 
 from __future__ import annotations
@@ -212,7 +213,7 @@ def _is_free_motion(
 def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     """Return the unbalanced part (k,) of a load for contact rows `closing` (m, k).
 
-    It is the residual of the least-squares problem over forces λ ≥ 0.
+    The result is the residual of the least-squares problem over forces λ ≥ 0.
     """
     from scipy.optimize import nnls  # imported here: only floating bodies need it
 

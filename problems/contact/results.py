@@ -73,11 +73,11 @@ def results_of(
 
     `energy` is ½uᵀKu − fᵀu in J/m. `contact_force` is the total force −ΣBᵀλ of contact
     and friction on the body of the master (of the slave if the master is rigid) in N/m.
-    With several pairs it is omitted, because the sum over pairs would be meaningless.
-    In space, energies are in J and forces in N. `max_von_mises` is the largest
-    patch-recovered von Mises stress of each body in Pa. `contacts` contains the results
-    of each pair, see `pair_results`. With friction, the items of `friction_quantities`
-    are added.
+    With several pairs, `contact_force` is omitted, because the sum over pairs would be
+    meaningless. In space, energies are in J and forces in N. `max_von_mises` is the
+    largest patch-recovered von Mises stress of each body in Pa. `contacts` contains the
+    results of each pair, see `pair_results`. With friction, the items of
+    `friction_quantities` are added.
 
     Parameters
     ----------

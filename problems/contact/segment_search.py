@@ -203,7 +203,7 @@ def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
 
 
 def _minimum_per_query(values: Vector, query: Nodes) -> Vector:
-    """Return, for each pair, the minimum over all pairs of its query (sorted)."""
+    """Return for each pair the minimum over its query (queries are sorted)."""
     first = _first_of_each(query)
     pairs = np.diff(first, append=query.size)
     return np.minimum.reduceat(values, first).repeat(pairs)

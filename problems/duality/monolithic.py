@@ -247,8 +247,8 @@ def _path(
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
     """Return the nondimensional primal QP, equation (1) of the paper.
 
-    It minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the load
-    of `bodies` times `load_factor`.
+    The QP minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the
+    load of `bodies` times `load_factor`.
     """
     n = bodies.mesh.dofs
     return QP(

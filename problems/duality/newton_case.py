@@ -158,9 +158,8 @@ def newton_case(
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     """Evaluate the nonlinear problem at a solution of its QP.
 
-    The keys are `energy`, Π in J/m; `residual`, see `NewtonPath.residual`; and
-    `penetration`, the largest penetration in m. All values are NaN if a cell is
-    inverted.
+    The keys are `energy` (Π in J/m), `residual` (see `NewtonPath.residual`) and
+    `penetration` (largest penetration in m). All values are NaN if a cell is inverted.
     """
     try:
         energy, residual, penetration = path.state(at, s)

@@ -186,7 +186,7 @@ def assemble(cells: Cells, tangents: Floats) -> csc_array:
 def convex_tangent(
     cells: Cells, tangents: Floats, positive: Callable[[csc_array], bool]
 ) -> tuple[csc_array, int]:
-    """Assemble K_t; if it is not positive definite, modify the tangents of its cells.
+    """Assemble K_t; if it is not positive definite, modify the tangents of cells.
 
     Negative eigenvalues of a cell tangent are replaced by a small positive fraction of
     its largest eigenvalue (in Teran, Sifakis, Irving and Fedkiw 2005, "Robust

@@ -152,7 +152,7 @@ def floating_inverse(
     fixing: Sequence[Nodes],
     interface: Interface | None = None,
 ) -> GeneralisedInverse:
-    """Factorise the stiffness of floating bodies with consecutive numbers.
+    """Factorise the stiffness of floating bodies that are numbered one after another.
 
     Parameters
     ----------

@@ -521,7 +521,7 @@ def _coupled(
 def _distributed_inverse(
     part: csc_array, rows: Touched, halo: Halo, diagonal: Vector
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Factorise the sum of the contributions to B W Bᵀ of all ranks, distributed.
+    """Factorise B W Bᵀ, the sum of contributions of all ranks, in distributed form.
 
     Parameters
     ----------
@@ -552,7 +552,7 @@ def _distributed_inverse(
 def _replicated_inverse(
     part: csr_array, selected: NDArray[np.bool_], halo: Halo, equalities: int
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Invert B W Bᵀ, summed over all ranks, on selected rows; each rank inverts it.
+    """Invert B W Bᵀ on selected rows, redundantly on every rank.
 
     selected : (t,) mask of the touched rows
 

@@ -178,8 +178,8 @@ def distributed_qp(
 
     If the QP depends on solutions of previous problems, the rounding errors in the data
     of the QP depend on the number of ranks. In this case, the digest of the QP is
-    computed from the first and the number of the previous problems, so that the digest
-    is independent of the number of ranks.
+    computed from the first previous problem and the number of previous problems, so
+    that the digest is independent of the number of ranks.
 
     Parameters
     ----------

@@ -375,7 +375,7 @@ class _Joints:
 
     @property
     def linear_map(self) -> Composition:
-        """The term as a map on packed components."""
+        """The term −V M⁺Vᵀ as a map on packed components."""
         members = [group.members.size for group in self.groups]
         sizes = [group.touched.size for group in self.groups]
         rows = [np.ascontiguousarray(block.T) for block in self.columns]

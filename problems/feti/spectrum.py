@@ -11,8 +11,8 @@ spectra are those of
 without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
 of P, and the same Lanczos process applies to both (Parlett 1998, Chapter 13). Each new
 vector is orthogonalised against its two predecessors, as in the recurrence, then
-against all previous vectors, which excludes spurious copies of eigenvalues. It is also
-projected by P, because components in ker P due to rounding would grow.
+against all previous vectors, which excludes spurious copies of eigenvalues. Each new
+vector is also projected by P, because components in ker P due to rounding would grow.
 
 The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue.
 The norm ‖r‖ is computed from the last component of the eigenvector of the tridiagonal

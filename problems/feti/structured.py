@@ -14,9 +14,9 @@ planes of cells with sides hₜ along the interface and hₙ across it, this sti
 relative to square cells, with the entries C₁₁ and C₆₆ of the elasticity matrix.
 Derivation: the energy of a saw tooth along rows of cells is a quadratic form in its
 amplitudes on successive rows of nodes. The matrix of this form is 4C₁₁/hₜ times the
-mass matrix plus hₜC₆₆/3 times the stiffness matrix of linear elements on a half line;
-s is its Schur complement on the interface. If rows of B are scaled by
-√s, the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
+mass matrix plus hₜC₆₆/3 times the stiffness matrix of linear elements on a half line; s
+is the Schur complement of this matrix on the interface. If rows of B are scaled by √s,
+the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
 """
 
 from __future__ import annotations

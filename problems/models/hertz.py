@@ -11,8 +11,8 @@ prescribed, since the theory does not determine the approach. Contact alone supp
 upper body vertically; hence the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
-Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. Each of the
-`halvings` bisects all cells along both directions.
+Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
+`halvings` is the number of bisections of all cells along both directions.
 
 R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark in the literature, which states no
 units. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.

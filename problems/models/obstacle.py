@@ -188,7 +188,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
 def _rank_quantities(
     grid: StructuredGrid, shape: str, answer: LocalSolution
 ) -> Mapping[str, Any]:
-    """Return `obstacle_quantities` from the solutions of all ranks; collective.
+    """Return `obstacle_quantities` from the solutions of all ranks (collective call).
 
     The energy includes the constant qᵀw − ½wᵀKw of `Problem.energy`, with the lift w.
     """
