@@ -202,7 +202,7 @@ class Membranes:
         return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
 
     def results(self, answer: LocalSolution) -> dict[str, Any]:
-        """Return the values of `quantities`, reduced over all ranks (collective call)."""
+        """Return the values of `quantities`, reduced over all ranks (collective)."""
         lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
         return self._quantities(answer.z, answer.energy, lowest)
 

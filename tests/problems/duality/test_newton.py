@@ -493,11 +493,9 @@ def small_bodies(K, f):
 
 
 def test_rounding_is_bounded_by_that_of_forces_within_cells(equilibrium):
-    """The bound is 2 eps |K
+    """The bound is 2 eps |K|·|u| relative to the load, with |K|·|u| = (8, 8).
 
-    u| relative to the load; |K
-
-    u| is (8, 8), and the second component is fixed.
+    The second component is fixed, so that it does not count.
     """
     K = np.array([[2.0, -2.0], [-2.0, 2.0]])
     bodies = small_bodies(K, [0.25, 7.0])

@@ -212,10 +212,7 @@ def test_inconsistent_keys_are_refused_in_one_line(name, message):
 
 
 def test_a_material_that_softens_is_refused_where_it_does():
-    """The pressure of the St.
-
-    Venant-Kirchhoff material is largest at the stretch 1/√3.
-    """
+    """The pressure on this material is largest at the stretch 1/√3."""
     with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):
         built("contact-patch", stretch=0.5, material="svk")
 

@@ -583,7 +583,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 def test_a_load_that_its_supports_take_up_is_refused(
     described, load, supports, message
 ):
-    """A load is rejected if supports fix all displacements along it."""
+    """A load is rejected if supports fix all displacements in its direction."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")

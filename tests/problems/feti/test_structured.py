@@ -45,6 +45,7 @@ def stiffest_saw_tooth(D, r):
     cells.
 
     r : depth of the cells, whose edge has length 1
+
     With the blocks A, B of one layer of cells for displacements of alternating sign,
     the stiffness is the fixed point of S = A − B(A + S)⁻¹B, which adds one layer at a
     time.
