@@ -59,13 +59,13 @@ class Cantilever(DeclaredFamily):
         p: Any = params
         if not MIN_LOAD <= p["load"] <= MAX_LOAD:
             raise InputError(
-                f"{self.name}: load={p['load']:g}, which is PL²/EI, must be between "
-                f"{MIN_LOAD:g} and {MAX_LOAD:g}"
+                f"{self.name}: load={p['load']:g} must be between {MIN_LOAD:g} and "
+                f"{MAX_LOAD:g} (the load is PL²/EI)"
             )
         if p["slenderness"] < MIN_SLENDERNESS:
             raise InputError(
-                f"{self.name}: slenderness={p['slenderness']:g}, the ratio of length "
-                f"to thickness, must be at least {MIN_SLENDERNESS:g}"
+                f"{self.name}: slenderness={p['slenderness']:g} must be at least "
+                f"{MIN_SLENDERNESS:g} (ratio of length to thickness)"
             )
         if not 0 <= p["nu"] <= MAX_NU:
             raise InputError(

@@ -105,7 +105,7 @@ def test_a_bound_that_holds_no_equilibrium_is_named():
 
     with pytest.raises(InputError, match=r"step 3: no equilibrium.* bound 2 of") as e:
         coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
-    assert str(e.value).endswith("no optimal point")
+    assert "of Coulomb's law (no optimal point): friction cannot" in str(e.value)
 
 
 def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():

@@ -44,7 +44,7 @@ def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
     [(FrictionLaw("oily"), "friction 'oily' is unknown; expected one of none, tresca"),
      (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
      (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
-     (FrictionLaw("coulomb", mu=0.3), "expected reference=")],
+     (FrictionLaw("coulomb", mu=0.3), "expected the argument `reference`")],
 )  # fmt: skip
 def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:

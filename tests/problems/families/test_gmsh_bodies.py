@@ -453,7 +453,9 @@ def test_two_passes_are_remarked_upon_and_share_the_force(described):
 
 
 def test_a_contact_that_is_described_twice_is_refused(described):
-    with pytest.raises(InputError, match=r"contacts\[1\]: .* of contacts\[0\]"):
+    with pytest.raises(
+        InputError, match=r"contacts\[1\] has the slave .* of contacts\[0\]"
+    ):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
