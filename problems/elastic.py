@@ -117,7 +117,8 @@ def one_step(
     reference : argument of `Family.build`; required by Coulomb's law
     parts : total number of subdomains (Total FETI), for form "dual" only; 0 for no
         decomposition
-    glue : constraint rows that join the copies of a node of several subdomains
+    glue : type of the constraint rows that join the copies of nodes of several
+        subdomains
 
     Raises
     ------
@@ -167,7 +168,8 @@ def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
             )
     if law.mu and reference is None:
         raise InputError(
-            "friction coulomb needs a reference solve; expected reference= of build"
+            "friction coulomb needs a reference solver; expected the argument "
+            "`reference` of `Family.build`"
         )
     return law
 

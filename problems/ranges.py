@@ -242,7 +242,7 @@ def check_friction(
     if law != "coulomb" and not elsewhere and params["iterate"]:
         raise InputError(
             f"{family}: iterate={params['iterate']} is not used by friction={law}; "
-            "expected friction=coulomb, whose fixed point has iterates"
+            "expected friction=coulomb, which is solved by iteration"
         )
 
 
@@ -315,8 +315,8 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
     """
     if params["friction"] != "none":
         raise InputError(
-            f"{family}: friction={params['friction']} on curved sides, whose slip "
-            "depends on the mesh; expected friction=tresca on flat sides"
+            f"{family}: friction={params['friction']} on curved sides, where slip "
+            "depends on the mesh; expected flat sides with friction=tresca"
         )
 
 
@@ -328,7 +328,7 @@ def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
     """
     if params["kinematics"] == "finite":
         raise InputError(
-            f"{family}: the error of the mesh with kinematics=finite is not built; "
+            f"{family}: the discretisation error with kinematics=finite is not built; "
             "expected kinematics=linear"
         )
 
@@ -343,8 +343,8 @@ def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
     """
     if "coulomb" in laws:
         raise InputError(
-            f"{family}: friction=coulomb has no energy to minimise, so that no error "
-            f"in its norm exists; compare answers with {meshes}"
+            f"{family}: friction=coulomb minimises no energy, so that no error in an "
+            f"energy norm exists; compare answers with {meshes}"
         )
 
 
@@ -358,7 +358,7 @@ def check_tangential(family: str, params: Mapping[str, Value]) -> None:
     if not 0 < peak < 1:
         key = "Q" if peak == Q else "peak"
         raise InputError(
-            f"{family}: {key}={params[key]} must be between 0 and 1, a part of μP"
+            f"{family}: {key}={params[key]} must be between 0 and 1, a fraction of μP"
         )
     if abs(Q) > peak:
         raise InputError(
@@ -389,6 +389,6 @@ def check_dense_memory(family: str, n: int) -> None:
     if needed > limit:
         raise InputError(
             f"{family}: a full matrix of {n} rows takes {needed:.2g} MiB of memory; "
-            f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
-            "the memory available"
+            f"expected a matrix that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set "
+            "to the memory available"
         )

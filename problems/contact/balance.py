@@ -1,11 +1,12 @@
 """Check, before any solve, that supports and contacts can balance the loads on bodies.
 
-The potential energy has a lower bound if and only if no rigid motion r that the
-supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains energy from the load
-(fᵀr > 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, an
-equivalent condition is the existence of contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.
-By Moreau's decomposition, the residual of the non-negative least-squares problem for λ
-is such a motion r (in coordinates of Z), and also the unbalanced part of the load.
+The potential energy is unbounded below if and only if the load does positive work fᵀr
+on a rigid motion r that the supports allow (B_D r = 0) and that closes no gap (B
+r ≤ 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, the
+energy is bounded if and only if there are contact forces λ ≥ 0 with Zᵀ(f − Bᵀλ) = 0. If
+there are no such forces, Moreau's decomposition applies: the residual of the
+non-negative least-squares problem for λ is a motion r as above (in coordinates of Z),
+and also the unbalanced part of the load.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from mortarbench.harness import Friction, InputError, Matrix
 from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.fem.elasticity import rigid_motions
 
-#: largest unbalanced share of the load that is attributed to rounding of coordinates,
-#: normals and tractions
+#: largest unbalanced fraction of the load that is attributed to rounding of
+#: coordinates, normals and tractions
 MAX_IMBALANCE = 1e-6
-#: components of a motion below this share of the largest one are not reported
+#: components of a motion below this fraction of the largest one are not reported
 _MIN_MOTION = 1e-3
 _AXES = "xyz"
 #: number of sides of polygons around discs; the radius of their corners is
@@ -110,11 +111,11 @@ def check_friction(
 ) -> None:
     """Check that supports, contacts and friction within bounds can balance the load.
 
-    A load can be balanced if there are forces λ_n ≥ 0 of the contact rows B and
+    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B and
     ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
     minimises the 1-norm of this residual. In space, circumscribed polygons with
-    `POLYGON` sides replace the discs. A load that exceeds friction by less than 2 % may
-    hence pass this check and fail in the solve.
+    `POLYGON` sides replace the discs. A load that exceeds the friction bound by less
+    than 2 % may hence pass this check and fail in the solve.
 
     step : number of the load step
     share : load factor of this step
@@ -122,7 +123,7 @@ def check_friction(
     Raises
     ------
     InputError
-        If no such forces exist. The message states the unbalanced share of the load.
+        If no such forces exist. The message states the unbalanced fraction of the load.
 
     """
     R, _, _ = _motions(bodies)
@@ -149,9 +150,9 @@ def check_friction(
     )
     if program.x is not None and program.fun > MAX_IMBALANCE * size:
         raise InputError(
-            f"load step {step}: friction cannot hold the load; within the bound of "
-            f"Tresca's law nothing balances {program.fun / size:.2%} of it; expected "
-            "supports that hold the bodies, or a larger bound"
+            f"load step {step}: friction cannot hold the load: "
+            f"{program.fun / size:.2%} of the load remains unbalanced within the bound "
+            "of Tresca's law; expected additional supports, or a larger bound"
         )
 
 
@@ -212,7 +213,7 @@ def _is_free_motion(
 def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
     """Return the unbalanced part (k,) of a load for contact rows `closing` (m, k).
 
-    It is the residual of the least-squares problem over forces λ ≥ 0.
+    The result is the residual of the least-squares problem over forces λ ≥ 0.
     """
     from scipy.optimize import nnls  # imported here: only floating bodies need it
 

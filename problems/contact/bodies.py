@@ -80,7 +80,7 @@ class ContactSides:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnassembledBodies:
-    """Bodies without their stiffness: mesh, materials, supports, load, contact sides.
+    """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
 
     Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
     divided by `length`, forces (in the plane per thickness) by `force`.

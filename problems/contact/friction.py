@@ -138,8 +138,8 @@ def coulomb_fixed_point(
         except ArithmeticError as e:
             raise InputError(
                 f"load step {step}: no equilibrium was found with bound "
-                f"{len(iterates) + 1} of Coulomb's law: friction cannot hold the "
-                f"load; expected supports or friction that hold the bodies: {e}"
+                f"{len(iterates) + 1} of Coulomb's law ({e}): friction cannot hold the "
+                "load; expected additional supports, or a larger mu"
             ) from None
         residuals.append(friction.residual(forces))
         if residuals[-1] <= FIXED_POINT_TOLERANCE:
@@ -166,8 +166,9 @@ def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
     """
     if iterate > len(problems):
         raise PastEndError(
-            f"iterate={iterate}: the fixed point of step {step} has {len(problems)} "
-            f"problems; expected at most {len(problems)}, or 0 for the last"
+            f"iterate={iterate}: the fixed-point iteration of step {step} has "
+            f"{len(problems)} problems; expected at most {len(problems)}, or 0 for the "
+            "last"
         )
     return problems[iterate - 1]
 
@@ -182,6 +183,6 @@ def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
 
     """
     force = np.zeros(places)
-    # multipliers of inexact solutions may be negative, friction bounds may not
+    # clip negative multipliers of inexact solutions; bounds must not be negative
     force[place] = np.maximum(normal, 0.0)
     return force

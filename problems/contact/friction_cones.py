@@ -19,11 +19,11 @@ its predecessor:
   ``cones``.
 
 If rigid bodies have more contacts than equations of motion, W is singular, and contact
-forces are not unique. In this case the bounds of ``tresca`` would drift in the null
-space of W, and the loop would not converge for three stacked boxes, for instance. The
-loop ``tresca`` therefore takes proximal steps: it adds ½δ‖r − r'‖² to the objective,
-where r' are the forces of the predecessor. The term vanishes as the loop converges. The
-loop ``cones`` takes proximal steps only after one of its problems has had no solution.
+forces are not unique. In this case the bounds of ``tresca`` may drift in the null space
+of W, so that the loop does not converge; three stacked boxes are an example. The loop
+``tresca`` therefore takes proximal steps: it adds ½δ‖r − r'‖² to the objective, where
+r' are the forces of the predecessor. The term vanishes as the loop converges. The loop
+``cones`` takes proximal steps only after one of its problems has had no solution.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
 
 LOOPS = ("cones", "tresca")
 #: largest asymmetry of W, relative to its largest entry, that counts as rounding.
-#: Symmetrising W changes the scaled natural map by about as much, which is far below
-#: the required 1e-6
+#: Symmetrising W changes the scaled natural map by about the same amount, which is far
+#: below the required 1e-6
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9
@@ -147,8 +147,8 @@ class FrictionalContact:
         ----------
         r, multipliers : (n,) forces and λ (p,)
         omega : factor that converts forces to velocities. The default is the largest
-            eigenvalue of W, which makes the result independent of units. FCLIB's error
-            has omega = 1 in the units of the file
+            eigenvalue of W, which makes the result independent of units. The error
+            defined by FCLIB uses omega = 1 in the units of the file
 
         """
         omega = self.stiffness if omega is None else omega

@@ -182,7 +182,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
     deviation[np.abs(deviation) <= NORMAL_ROUNDING] = 0
     D = overlap[..., None] * n_j[:, :, None]
     D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * deviation, N)
-    # M with the same ν and weights as D, so that the forces of a row balance
+    # M has the same ν and weights as D, so that the forces of a row balance
     pull = weighted[..., None] * gauss.field[:, :, None]  # (p, 3, 2, 2)
     M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * gauss.beta - 1))
     measure = gauss.weight * np.linalg.norm(gauss.field, axis=-1)

@@ -19,14 +19,14 @@ Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
 The friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
-Beyond an end of the master, its last node is the closest point, with the normal of the
-last segment.
+For slave nodes beyond an end of the master, the closest point is the end node of the
+master, and n is the normal of its last segment.
 
-A slave node can be assigned to a fixed segment. It then stays on the outer side of the
-whole line through that segment, irrespective of its closest point. Newton's method
-requires this at a re-entrant vertex of the master, where the force of each segment
-pushes the node onto the other segment and the closest segment alternates between
-iterations.
+A slave node can be assigned to a fixed segment. The node then stays on the outer side
+of the whole line through this segment, irrespective of its closest point. Newton's
+method requires this at a re-entrant vertex of the master, where the force of each
+segment pushes the node onto the other segment and the closest segment alternates
+between iterations.
 """
 
 from __future__ import annotations
@@ -141,8 +141,8 @@ def geometric_stiffness(
 
         g'' = a''/L − (a' L'ᵀ + L' a'ᵀ)/L² − a L''/L² + 2a L' L'ᵀ/L³.
 
-    If the closest point is a vertex of the master, the derivative is set to zero,
-    because that of the averaged normal is not implemented.
+    If the closest point is a vertex of the master, the block is set to zero, because
+    the derivative of the averaged normal is not implemented.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def geometric_stiffness(
     in_d, in_e = np.hstack([one, -one, 0 * one]), np.hstack([0 * one, -one, one])
     # suffixes _1, _2: first and second derivatives by the six components
     area_1 = (e @ J.T) @ in_d + (d @ J) @ in_e  # (s, 6)
-    area_2 = in_d.T @ J @ in_e  # a'' is this plus its transpose
+    area_2 = in_d.T @ J @ in_e  # a'' = area_2 + area_2ᵀ
     length_1 = t @ in_e
     across = (one - t[:, :, None] * t[:, None, :]) / L[:, None, None]
     length_2 = in_e.T @ across @ in_e

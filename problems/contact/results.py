@@ -29,7 +29,7 @@ IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
 class BulkResults(NamedTuple):
-    """Results of the bodies other than those of contact."""
+    """Results for the bodies, without contact results."""
 
     nodes: int
     elements: int
@@ -73,11 +73,11 @@ def results_of(
 
     `energy` is ½uᵀKu − fᵀu in J/m. `contact_force` is the total force −ΣBᵀλ of contact
     and friction on the body of the master (of the slave if the master is rigid) in N/m.
-    With several pairs it is omitted, because the sum over pairs would be meaningless.
-    In space, energies are in J and forces in N. `max_von_mises` is the largest
-    patch-recovered von Mises stress of each body in Pa. `contacts` contains the results
-    of each pair, see `pair_results`. With friction, the items of `friction_quantities`
-    are added.
+    With several pairs, `contact_force` is omitted, because the sum over pairs would be
+    meaningless. In space, energies are in J and forces in N. `max_von_mises` is the
+    largest patch-recovered von Mises stress of each body in Pa. `contacts` contains the
+    results of each pair, see `pair_results`. With friction, the items of
+    `friction_quantities` are added.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def friction_quantities(
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
     inactive, active below the bound, and active at the bound. `sliding_without_contact`
     is the number of inactive rows with shear, which Tresca's law allows; these rows do
-    not count as open. `shear_without_contact` is their share of Σ‖λ_t‖.
+    not count as open. `shear_without_contact` is their fraction of Σ‖λ_t‖.
     `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for Tresca's.
     `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m, or J in
     space.

@@ -1,14 +1,14 @@
 """Contact of nodes with rigid bodies: planes, spheres and cylinders.
 
-The gap g(x) of a point is its signed distance from the rigid body, and n the outward
+The gap g(x) of a point is its signed distance from the rigid body, and n is the outward
 normal of the body at the closest point. To first order about the displacement u^k, with
 x = X + u^k and n fixed there,
 
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
-which is exact for planes. The nonzero entries of a row belong to a single node; hence
-the contact rows are orthonormal. Friction rows are T = −t at the node, with the
-tangents t.
+This linearisation is exact for planes. The nonzero entries of a row belong to a single
+node; hence the contact rows are orthonormal. Friction rows are T = −t at the node, with
+the tangents t.
 """
 
 from __future__ import annotations

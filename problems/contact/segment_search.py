@@ -1,18 +1,19 @@
 """Closest-point search on chains of segments, at near-linear cost.
 
-The segments are grouped by four along the chain into a tree of *fat chords*. A
-sub-chain from node A to node B lies within a deviation δ of its chord AB, and AB lies
-within δ of the sub-chain: as a point moves along the sub-chain, its closest point on AB
-traverses all of AB. Hence the distance from any point p satisfies
+Consecutive segments are grouped by fours into a tree of *fat chords*. A sub-chain from
+node A to node B lies within a deviation δ of its chord AB, and AB lies within δ of the
+sub-chain: as a point moves along the sub-chain, its closest point on AB traverses all
+of AB. Hence the distance from any point p satisfies
 
     |p − AB| − δ  ≤  |p − sub-chain|  ≤  |p − AB| + δ.
 
 A query for a point descends the tree into all sub-chains that these bounds do not rule
-out. On a smooth chain δ decreases with the square of the sub-chain's length, so that
-each query visits O(1) sub-chains per level at any distance, whereas with bounding boxes
-or balls their number would grow with the distance. Leaves are segments with δ = 0, so
-that the result is exact. In the worst case, the point is equidistant from the whole
-chain (the centre of an arc), and no sub-chain can be ruled out.
+out. On a smooth chain, δ decreases with the square of the sub-chain's length, so that
+each query visits O(1) sub-chains per level at any distance. With bounding boxes or
+balls, the number of visited sub-chains would grow with the distance. Leaves are
+segments with δ = 0, so that the result is exact. In the worst case, the point is
+equidistant from the whole chain (the centre of an arc), and no sub-chain can be ruled
+out.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
             one = offset[nodes] + np.einsum("px,px->p", start, along)
             return one, one + np.einsum("px,px->p", edge, along)
 
-        # |n| = 1: f_j on a sub-chain is within δ of its values on the chord
+        # because |n| = 1, f_j on a sub-chain is within δ of its values on the chord
         above = np.maximum(*ends(j[query])) >= -level.deviation[node]
         below = np.minimum(*ends(k[query])) <= level.deviation[node]
         followed: NDArray[np.bool_] = above & below
@@ -202,7 +203,7 @@ def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
 
 
 def _minimum_per_query(values: Vector, query: Nodes) -> Vector:
-    """Return, for each pair, the minimum over all pairs of its query (sorted)."""
+    """Return for each pair the minimum over its query (queries are sorted)."""
     first = _first_of_each(query)
     pairs = np.diff(first, append=query.size)
     return np.minimum.reduceat(values, first).repeat(pairs)

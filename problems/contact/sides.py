@@ -27,7 +27,7 @@ from mortarbench.problems.fem.mesh import (
 
 RIGID = "rigid"  #: name of a rigid master
 ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE_THRESHOLD·max λ
-_STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest
+_STATE = f"U{len(SLIDING)}"  #: dtype of arrays of states; SLIDING is the longest name
 
 
 def contact_sides(
@@ -58,7 +58,7 @@ def contact_sides(
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        # 0.0 − x instead of −x: no negative zeros in reports
+        # 0.0 − x instead of −x avoids negative zeros in reports
         slave = pair.slave_nodes
         contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)

@@ -53,7 +53,7 @@ def continue_slip(end: State) -> State:
 
 
 def restart_slip(end: State) -> State:
-    """Return the final state of the preceding stage, with the slip origin at its u."""
+    """Return the final state of the preceding stage, with its u as slip origin."""
     return end._replace(slip_origin=end.u)
 
 
@@ -80,7 +80,7 @@ class Stage:
     """One linearisation of a load step."""
 
     step: int  #: number of the load step, 1, 2, …
-    part: float  #: load factor: share of `forces` that acts
+    part: float  #: load factor: fraction of `forces` that acts
     forces: Forces  #: full load
     fixed: Nodes  #: components fixed by supports
     laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction

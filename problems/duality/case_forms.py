@@ -182,7 +182,8 @@ def contact_case(
         start = perf_counter()
         transform = dualise if form == "dual" else dual_bounds
         transformed = transform(primal, inverse, friction=friction)
-        # include the factorisation even if an earlier load step computed it
+        # include the time of the factorisation even if it belongs to an earlier load
+        # step
         seconds = inverse.seconds + perf_counter() - start
         matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length

@@ -102,7 +102,7 @@ class DecomposedLinearisation:
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) on the contact sides and the normal forces (places,).
 
-        The normal forces are those of all slave nodes. Displacements and forces are
+        `places` is the number of slave nodes. Displacements and forces are
         nondimensional.
         """
         dual, sides = self.dual, self.sides
@@ -143,7 +143,7 @@ def decomposed_path(
 
 @lru_cache(maxsize=4)
 def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
-    """Return the subdivision of bodies, cached; see `Shape.layout`."""
+    """Return the (cached) subdivision of bodies, see `Shape.layout`."""
     return bodies.shape.layout(size)
 
 
@@ -159,7 +159,7 @@ def distributed_qp_of(
     InputError
         If there are fewer subdomains than ranks, if the ranks computed different
         subdomains, or if the fixed-point iteration for Coulomb's law does not converge
-        or has fewer iterates than selected.
+        or takes fewer iterates than the number that `choice` selects.
 
     """
     path = decomposed_path(problem, choice, ranks, reference)
@@ -398,7 +398,7 @@ def elastic_class(
     )
 
 
-BATCH_NODES = 2**15  #: nodes per batch of subdomains; bounds the memory of stresses
+BATCH_NODES = 2**15  #: nodes per batch of subdomains; limits the memory for stresses
 #: layers of cells around a node on which its recovered stress may depend
 STRESS_LAYERS = 3
 
@@ -443,7 +443,7 @@ def local_meshes(
 def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
     """Group subdomains into batches, each of one body and `BATCH_NODES` nodes at most.
 
-    A subdomain with more nodes is a batch of its own.
+    A subdomain with more nodes forms a separate batch.
     """
     sizes = np.diff(layout.subdomain_nodes(subdomains).start)
     first, nodes = [0], 0

@@ -1,8 +1,8 @@
 """Dualisation: transforms of a QP, each with its inverse (paper, Section 3).
 
 The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I.  Each transform
-returns the new problem together with a function that maps a solution of it to a
-solution (point and all multipliers) of the primal problem.
+returns a new problem together with a function that maps a solution of the new problem
+to a solution (point and all multipliers) of the primal problem.
 
 Friction with a prescribed bound g adds Σ g‖Tu − s‖ to the objective. The friction rows
 T, s follow the contact rows in B and c, and the friction multipliers λ_t follow those

@@ -5,9 +5,9 @@
     min ½λᵀFλ − dᵀλ   subject to   λ_I ≥ 0,   RᵀBᵀλ = Rᵀf
     F = BK⁺Bᵀ,   d = BK⁺f − c,   K = diag(K_s),   R = diag(R_s)
 
-The problem is that of `problems.duality.dualisation`, assembled from subdomains (Total
-FETI; Dostál, Horák and Kučera 2006). F is an operator, a sum over subdomains stored as
-plain arrays (`problems.feti.operators`), and RᵀBᵀ is sparse. If averages join
+This is the dual of `problems.duality.dualisation`, assembled from subdomains (Total
+FETI; Dostál, Horák and Kučera 2006). F is an operator: a sum over subdomains, which is
+stored as plain arrays (`problems.feti.operators`). RᵀBᵀ is sparse. If averages join
 subdomains into clusters, K̃⁺ and RN replace K⁺ and R
 (`problems.feti.subdomain_classes.Clusters`).
 """

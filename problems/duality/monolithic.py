@@ -1,9 +1,9 @@
 """Load steps of undivided bodies in contact, with one factor of K for all QPs.
 
-Contact rows are linearised at the displacements of the contact sides, which are
-computed from the dual solution of the previous step by a product with a small matrix.
-Displacements of all other nodes are recovered on demand, by one solve with the factor
-of K per step.
+Contact rows are linearised at the displacements of the contact sides. These
+displacements are computed from the dual solution of the previous step by a product with
+a small matrix. Displacements of all other nodes are recovered on demand, by one solve
+with the factor of K per step.
 """
 
 from __future__ import annotations
@@ -55,12 +55,11 @@ class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
 
     bodies: Bodies  #: with the load and the supports of the stage
-    primal: QP  #: (1) of the paper
+    primal: QP  #: equation (1) of the paper
     friction: Friction
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
-    dual: Callable[
-        [], Transformed
-    ]  #: returns the dual for these rows; `solve` replaces its friction bounds
+    #: returns the dual with the initial friction bounds, which `solve` replaces
+    dual: Callable[[], Transformed]
     reference: Reference
     part: float  #: load factor
 
@@ -88,9 +87,9 @@ class MonolithicLinearisation:
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (n,), valid on contact sides only, and normal forces (places,).
+        """Return u (n,) and the normal forces (places,) of all slave nodes.
 
-        The normal forces are those of all slave nodes.
+        Only the entries of u on the contact sides are valid.
         """
         places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
@@ -169,8 +168,8 @@ def load_path(
 def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Return the load path of a contact problem on undivided bodies.
 
-    Only the contact rows are dualised. If the support rows were included, the dense
-    matrix of the dual would have several times as many rows in space.
+    Only the contact rows are dualised. For bodies in space, the dense matrix of the
+    dual would have several times as many rows if the support rows were included.
     """
     elastic, bodies = problem.bodies, problem.bodies.assembled
 
@@ -201,7 +200,7 @@ def _path(
     transform: Transform,
     initial_force: float,
 ) -> MonolithicPath:
-    # K⁺f of the full load is stored, since several stages have equal loads and supports
+    # K⁺f of the full load is stored, because stages may share their load and supports
     bodies_by_stage = dict[tuple[int, int], Bodies]()
     inverses = dict[int, GeneralisedInverse]()
     free = dict[tuple[int, int], Vector]()
@@ -248,8 +247,8 @@ def _path(
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
     """Return the nondimensional primal QP, equation (1) of the paper.
 
-    It minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the load
-    of `bodies` times `load_factor`.
+    The QP minimises ½uᵀKu − fᵀu subject to B_D u = 0 and B_M u ≤ c_M, where f is the
+    load of `bodies` times `load_factor`.
     """
     n = bodies.mesh.dofs
     return QP(

@@ -13,15 +13,16 @@ u and not to an increment:
 
     min ½uᵀK u + (r − K u^j)ᵀu   subject to   B_D u = 0,   B u ≤ c.                (1)
 
-*K* is the tangent Π''(u^j) if it is positive definite on the motions that the supports
-allow, which is tested by a Cholesky factorisation. Otherwise negative eigenvalues of
-the tangents of single cells are raised (`problems.fem.finite_strain.convex_tangent`).
-The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
-previous iteration ("geometric" contact stiffness), may be added to the tangent. Without
-these derivatives, convergence is linear if both sides deform. The term ρB_DᵀB_D is
-added to K. This term vanishes if u = 0 on the supports, and makes K definite on
-rotations, on which the tangent of a compressed body is indefinite rather than singular.
-The remaining kernel of K consists of the translations that the supports allow.
+*K* is the tangent Π''(u^j) if this tangent is positive definite on the motions that the
+supports allow, which is tested by a Cholesky factorisation. Otherwise negative
+eigenvalues of the tangents of single cells are raised
+(`problems.fem.finite_strain.convex_tangent`). The second derivatives of the gaps,
+−Σ λ_i g_i''(u^j) with the multipliers of the previous iteration ("geometric" contact
+stiffness), may be added to the tangent. Without these derivatives, convergence is
+linear if both sides deform. The term ρB_DᵀB_D is added to K. This term vanishes if
+u = 0 on the supports, and makes K definite on rotations, on which the tangent of a
+compressed body is indefinite rather than singular. The remaining kernel of K consists
+of the translations that the supports allow.
 
 *Line search*: with the solution u of (1), d = u − u^j and a weight w above ‖λ‖∞, d is a
 descent direction of the exact penalty function (Nocedal and Wright, (18.27))
@@ -35,8 +36,9 @@ step halves the smallest residual; hence only finitely many occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
 segments. If the iteration does not converge, pressing nodes (those with multipliers
-λ_i > 0) are assigned to their closest segments. In further iterations, a node keeps its
-segment and may slide slightly beyond its ends, on the straight line through it.
+λ_i > 0) are assigned to their closest segments. In further iterations, such a node
+keeps its segment. It may slide slightly beyond the ends of the segment, along the
+straight line through both ends.
 
 *Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new
 iterate with the multipliers of the QP, is at most TOLERANCE plus a bound on its
@@ -100,13 +102,14 @@ KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
 MAX_HALVINGS = 8  #: largest number of halvings of a load increment
 MIN_STEP = 2.0**-16  #: smallest step length of the line search
 #: rounding error of the merit function relative to the energies; without this
-#: allowance, steps near the solution would be rejected, because their decrease is below
-#: rounding
+#: allowance, steps near the solution would be rejected, because the decrease of the
+#: merit function is smaller than its rounding error
 MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
-ARMIJO_FRACTION = 1e-4  #: required share of the decrease predicted by the slope
-#: weight of the penalty relative to the largest multiplier; above 1 it is exact
+ARMIJO_FRACTION = 1e-4  #: required fraction of the decrease predicted by the slope
+#: weight of the penalty relative to the largest multiplier; the penalty function is
+#: exact for values above 1
 PENALTY_FACTOR = 1.5
-MAX_ROTATION = 1e-8  #: largest rotational share of a motion that counts as rounding
+MAX_ROTATION = 1e-8  #: largest rotational fraction of a motion that counts as rounding
 
 #: maps a displacement (n,) in m and multipliers (m,) in N/m to blocks −λ_i g_i''(u),
 #: (m, k, k) in Pa, and their displacement components (m, k)
@@ -243,8 +246,8 @@ class NewtonPath:
                 size /= 2
                 if size < least:
                     raise InputError(
-                        f"load step {k} of {self.steps}: the last equilibrium is that "
-                        f"at the load factor {reached:.6g}; beyond it, {e}; expected "
+                        f"load step {k} of {self.steps}: the largest load factor with "
+                        f"an equilibrium was {reached:.6g}; {e}; expected "
                         f"{self._advice(target)}"
                     ) from None
                 continue
@@ -270,7 +273,7 @@ class NewtonPath:
             / (load_factor * self._free_norm(self.bodies.f) or 1.0)
         )
         if share <= TOLERANCE:
-            return "a smaller load, or supports that hold the bodies better"
+            return "a smaller load, or additional supports"
         return (
             f"a larger load, or kinematics=linear: at strains this small, the relative "
             f"rounding error of the forces is {share:.0e}, above the tolerance "
@@ -338,16 +341,17 @@ class NewtonPath:
                     continue
             if gaps.keep_segments is None:
                 raise NoEquilibriumError(
-                    f"at {load_factor:.6g}, iteration {len(iterations) + 1} ended with "
-                    f"a residual of {best:.1e}: {reason}"
+                    f"at the load factor {load_factor:.6g}, iteration "
+                    f"{len(iterations) + 1} ended with a residual of {best:.1e}: "
+                    f"{reason}"
                 )
             pressing = lam > ACTIVE_THRESHOLD * lam.max(initial=0.0)
             gaps = gaps.keep_segments(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
         raise NoEquilibriumError(
-            f"at {load_factor:.6g}, {MAX_ITERATIONS} iterations left a residual of "
-            f"{best:.1e}"
+            f"at the load factor {load_factor:.6g}, {MAX_ITERATIONS} iterations left a "
+            f"residual of {best:.1e}"
         )
 
     def _configuration(
@@ -426,8 +430,8 @@ class NewtonPath:
 
         The tangent is positive definite on the motions that the supports allow, except
         for translations. If the exact tangent is indefinite, negative eigenvalues of
-        the contact stiffness are removed first, and those of cell tangents only if this
-        does not suffice.
+        the contact stiffness are removed first. Negative eigenvalues of cell tangents
+        are raised only if this does not suffice.
         """
         supports = self.bodies.B_D
         factorised: list[tuple[csc_array, GeneralisedInverse]] = []

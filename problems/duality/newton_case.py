@@ -82,7 +82,7 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Return the cells of bodies, nondimensional in the same units l and F₀ as K."""
+    """Return the cells of bodies, nondimensional with the units l and F₀ of K."""
     l, F = bodies.length, bodies.force
     mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
     laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
@@ -158,9 +158,8 @@ def newton_case(
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     """Evaluate the nonlinear problem at a solution of its QP.
 
-    The keys are `energy`, Π in J/m; `residual`, see `NewtonPath.residual`; and
-    `penetration`, the largest penetration in m. All values are NaN if a cell is
-    inverted.
+    The keys are `energy` (Π in J/m), `residual` (see `NewtonPath.residual`) and
+    `penetration` (largest penetration in m). All values are NaN if a cell is inverted.
     """
     try:
         energy, residual, penetration = path.state(at, s)

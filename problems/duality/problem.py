@@ -139,7 +139,7 @@ class HalfDiscs(_Joined[HalfDisc]):
 class StructuredSolids:
     """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
 
-    #: numbered as in `problems.fem.mesh.box`; names of boundaries are distinct
+    #: numbered as in `problems.fem.mesh.box`; the names of all boundaries are distinct
     parts: tuple[Mesh, ...]
     divisions: tuple[tuple[int, int, int], ...]  #: cells of each part along x, y and z
     dim = 3
@@ -300,11 +300,11 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
 
 
 class InterfaceState(NamedTuple):
-    """Data and solution of contact, at all nodes or at those of the contact sides."""
+    """Data and solution of a contact problem at all nodes, or only at contact sides."""
 
     bodies: Bodies | ContactSides
-    #: QP at the nodes of `bodies`; P is used only with friction, and then only its
-    #: diagonal
+    #: QP for the nodes of `bodies`; of P only the diagonal is used, and only with
+    #: friction
     primal: QP
     solution: Solution
     friction: Friction
@@ -315,9 +315,8 @@ class DisplacedMesh(NamedTuple):
 
     body: int  #: number of the body
     mesh: Mesh  #: N nodes
-    inner: NDArray[
-        np.bool_
-    ]  #: (N,) False for nodes that belong only to added layers of neighbouring cells
+    #: (N,) False for nodes that belong only to added layers of neighbouring cells
+    inner: NDArray[np.bool_]
     u: Vector  #: (dim·N,) displacement, m
 
 
@@ -353,8 +352,8 @@ class ContactProblem:
 
     bodies: ElasticBodies
     stages: tuple[Stage, ...]
-    #: given bodies (or their contact sides) and the friction laws of their contact
-    #: pairs, returns the function that maps a displacement in m to contact rows
+    #: function of the bodies (or their contact sides) and the friction laws of their
+    #: pairs; it returns a function that maps a displacement in m to contact rows
     linearise: Callable[
         [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
     ]
@@ -362,7 +361,8 @@ class ContactProblem:
     initial_force: float = 0.0
     #: evaluates quantities beyond those common to all elastic bodies
     results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
-    #: (k, 3) x in m, exact pressure and shear in Pa on the slave side; None if unknown
+    #: (k, 3) with the columns x in m, exact pressure and exact shear in Pa on the slave
+    #: side; None if unknown
     exact: NDArray[np.float64] | None = None
 
 
@@ -408,7 +408,7 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
 def cached_problem(
     state: Callable[[Mapping[str, Any]], ContactProblem],
 ) -> Callable[[Mapping[str, Value]], ContactProblem]:
-    """Cache the last four problems of `state`, irrespective of the keys `CHOICES`."""
+    """Cache the last four problems of `state`; the keys `CHOICES` are ignored."""
     cached = lru_cache(maxsize=4)(lambda items: state(dict(items)))
 
     @wraps(state)

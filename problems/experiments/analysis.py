@@ -26,7 +26,7 @@ from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 
 #: variants by name; True if K⁺ is condensed onto the interface
-WAYS = {
+VARIANTS = {
     "per-row": False,
     "condensed": True,
 }
@@ -101,7 +101,7 @@ def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
             way: partial(
                 _laps, partial(run, condense=c, solve=solve if c else baseline)
             )
-            for way, c in WAYS.items()
+            for way, c in VARIANTS.items()
         }
         size = {
             "Nr": Nr,

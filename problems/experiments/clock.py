@@ -56,7 +56,8 @@ def race(
 ) -> list[dict[str, str | int | float]]:
     """Time methods alternately; return one row per method, timed part and repeat.
 
-    warm : True to run each method once before timing, to exclude cold caches
+    warm : True to run each method once before timing, to exclude the effect of cold
+        caches
 
     """
     if warm:

@@ -42,8 +42,8 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
     inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
-    ways = [(s, r) for r in plan.relin for s in plan.stepping]
-    for steps, relin in (*ways, CONVERGED):
+    variants = [(s, r) for r in plan.relin for s in plan.stepping]
+    for steps, relin in (*variants, CONVERGED):
         path = load_path(bodies, linearise, lambda: inverse, solve, steps, relin)
         yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
 

@@ -48,7 +48,7 @@ class Cantilever(DeclaredFamily):
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; by default, nx = 2·ny·slenderness and step = steps."""
         params: dict[str, Any] = {**self.defaults, **given}
-        # the number is limited before it is rounded: slenderness may be up to 1e30
+        # limit the number before rounding it, because slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)
         derived = {"nx": round(cells), "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}
@@ -60,12 +60,12 @@ class Cantilever(DeclaredFamily):
         if not MIN_LOAD <= p["load"] <= MAX_LOAD:
             raise InputError(
                 f"{self.name}: load={p['load']:g} must be between {MIN_LOAD:g} and "
-                f"{MAX_LOAD:g}: it is PL²/EI"
+                f"{MAX_LOAD:g} (the load is PL²/EI)"
             )
         if p["slenderness"] < MIN_SLENDERNESS:
             raise InputError(
                 f"{self.name}: slenderness={p['slenderness']:g} must be at least "
-                f"{MIN_SLENDERNESS:g}: it is the length over the thickness"
+                f"{MIN_SLENDERNESS:g} (ratio of length to thickness)"
             )
         if not 0 <= p["nu"] <= MAX_NU:
             raise InputError(

@@ -108,7 +108,7 @@ class DeclaredFamily(Family):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return the local part of the dual on this rank; collective."""
+        """Return the local part of the dual on this rank (collective call)."""
         from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
         del reference
@@ -166,7 +166,7 @@ class ContactFamily(DeclaredFamily):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> DistributedQP:
-        """Return the local part of the dual on this rank; collective."""
+        """Return the local part of the dual on this rank (collective call)."""
         from mortarbench.problems.duality.decomposed import distributed_qp_of
         from mortarbench.problems.duality.problem import qp_choice
 

@@ -64,8 +64,8 @@ class HalfSpace(DeclaredFamily):
                 )
         if not 0 < p["Q"] < 1:
             raise InputError(
-                f"{self.name}: Q={p['Q']} must be between 0 and 1, a part of the limit "
-                "of friction"
+                f"{self.name}: Q={p['Q']} must be between 0 and 1, a fraction of the "
+                "limit of friction"
             )
         self._check_law(p)
         needed, limit = _CELL_BYTES * p["n"] ** 2 / 2**20, case_limit_mib()
@@ -93,7 +93,7 @@ class HalfSpace(DeclaredFamily):
         if law == "rough" and p["n"] < MIN_ROUGH:
             raise InputError(
                 f"{self.name}: n={p['n']} must be at least {MIN_ROUGH} for law=rough, "
-                "two cells in its shortest wave"
+                "two cells per shortest wave"
             )
         coulomb = law == "mindlin" or friction == "coulomb"
         users = {

@@ -111,6 +111,6 @@ class HertzCylinder(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; refuse cases with friction."""
+        """Return the keys with half the mesh size; reject cases with friction."""
         refuse_friction(self.name, params)
         return super().refined(params)

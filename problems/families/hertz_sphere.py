@@ -54,8 +54,8 @@ class HertzSphere(ContactFamily):
                     )
         if not 0 <= float(params["Q"]) < 1:
             raise InputError(
-                f"{self.name}: Q={params['Q']} must be at least 0 and below 1, a part "
-                "of μP"
+                f"{self.name}: Q={params['Q']} must be at least 0 and below 1, a "
+                "fraction of μP"
             )
         if params["Q"] and params["against"] == "plane":
             raise InputError(

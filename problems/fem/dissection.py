@@ -73,7 +73,7 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
 
 
 def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:
-    """Replace each position i by the positions ends[i] … ends[i + 1] − 1, if any."""
+    """Replace each position i by the positions ends[i] … ends[i + 1] − 1, or none."""
     count = np.diff(ends)[fronts.border]
     above = np.append(0, np.cumsum(count))
     each = np.arange(above[-1]) - np.repeat(above[:-1], count)

@@ -109,7 +109,7 @@ def stiffness(
     ----------
     D : (v, v) elasticity matrix, or (k, v, v) for k materials
     material : (E,) index of the material of each cell; default: 0 for all cells
-    pattern : sparsity pattern of the mesh; default: compute it
+    pattern : sparsity pattern of the mesh; computed by default
 
     """
     pattern = pattern or sparsity(mesh)
@@ -134,7 +134,7 @@ class Pattern:
 
     cells: NDArray[np.int32]  #: (E, c) nodes of each cell
     ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
-    #: (E, c, c) index of the node of corner b among the neighbours of that of corner a
+    #: (E, c, c) index of corner b in the list of neighbours of corner a
     slot: NDArray[np.int32]
     indptr: NDArray[np.int32]  #: (n + 1,) column pointers of K in CSC
     indices: NDArray[np.int32]  #: row indices of K in CSC

@@ -44,7 +44,7 @@ class Element:
 
     kind: str  #: meshio's name for cells of this kind
     simplices: tuple[Ints, ...]  #: vertices (d + 1, d) of each simplex (factor)
-    vertices: Ints  #: (n, factors) for each corner, its vertex of each factor
+    vertices: Ints  #: (n, factors) index of the vertex of each factor at a corner
 
     @property
     def dim(self) -> int:

@@ -50,11 +50,11 @@ from mortarbench.problems.fem.mesh import Mesh, is_triangle
 #: stiff at ν = 0.45, and 21 times as stiff as it should be at ν = 0.4999
 NEARLY_INCOMPRESSIBLE = 0.4
 #: a negative eigenvalue of a cell tangent counts as zero if its magnitude is at most
-#: this share of the largest magnitude: rounding may make the zero eigenvalues of
+#: this fraction of the largest magnitude: rounding may make the zero eigenvalues of
 #: translations negative
 EIGENVALUE_ROUNDING = 1e-12
-#: positive replacement of negative eigenvalues of a cell tangent, as a share of its
-#: largest eigenvalue in magnitude
+#: positive value that replaces negative eigenvalues of a cell tangent, as a fraction of
+#: the largest magnitude of its eigenvalues
 CLIPPED_EIGENVALUE = 1e-6
 
 
@@ -141,7 +141,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     Raises
     ------
     InvertedCellError
-        If J ≤ 0 at a Gauss point. The error states the cell with the smallest J.
+        If J ≤ 0 at a Gauss point. The error names the cell with the smallest J.
 
     """
     F = deformation_gradients(cells, u)
@@ -186,12 +186,13 @@ def assemble(cells: Cells, tangents: Floats) -> csc_array:
 def convex_tangent(
     cells: Cells, tangents: Floats, positive: Callable[[csc_array], bool]
 ) -> tuple[csc_array, int]:
-    """Assemble K_t; if it is not positive definite, modify the tangents of its cells.
+    """Assemble K_t; if it is not positive definite, modify the tangents of cells.
 
-    Negative eigenvalues of a cell tangent are replaced by a small positive share of its
-    largest eigenvalue (in Teran, Sifakis, Irving and Fedkiw 2005, "Robust quasistatic
-    finite elements and flesh simulation", they are replaced by 0). Zero eigenvalues are
-    kept, so that translations remain in the kernel of each cell tangent.
+    Negative eigenvalues of a cell tangent are replaced by a small positive fraction of
+    its largest eigenvalue (in Teran, Sifakis, Irving and Fedkiw 2005, "Robust
+    quasistatic finite elements and flesh simulation", they are replaced by 0). Zero
+    eigenvalues are kept, so that translations remain in the kernel of each cell
+    tangent.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Fixing nodes of a floating body: if they are fixed, no rigid motion is possible.
 
 The farther apart the fixing nodes are, the better K is conditioned without their rows
-and columns: fixing two neighbouring corners costs three digits of accuracy, whereas
-fixing the central nodes of four parts of the body costs hardly any. In space the fixing
+and columns. Fixing two neighbouring corners costs three digits of accuracy; fixing the
+central nodes of four parts of the body costs hardly any accuracy. In space the fixing
 nodes must not be collinear, because the body could rotate about their line.
 """
 

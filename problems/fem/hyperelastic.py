@@ -1,8 +1,8 @@
 """Hyperelastic materials in plane strain: energy, stress and tangent from F.
 
 A material is defined by its strain energy W per reference area, a function of the
-deformation gradient F = ∂x/∂X (plane strain: F₃₃ = 1). It is split into a shear and a
-dilatational part,
+deformation gradient F = ∂x/∂X (plane strain: F₃₃ = 1). The energy is split into a shear
+and a dilatational part,
 
     W(F) = w(F) + U(θ(F)),        P = ∂W/∂F  (first Piola-Kirchhoff),  A = ∂P/∂F
 

@@ -8,9 +8,9 @@ With ρ > 0,
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
 hence K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that requires one sparse Cholesky
-factor. K⁺ is not the Moore-Penrose inverse, but if the load is balanced (Rᵀf = 0), the
-solutions K⁺f of the two inverses differ only by a rigid motion. For supported bodies,
-K⁺ is K_ff⁻¹ on the free components f and zero on the prescribed ones.
+factor. K⁺ is not the Moore-Penrose inverse. If the load is balanced (Rᵀf = 0), however,
+the solutions computed with both inverses differ only by a rigid motion. For supported
+bodies, K⁺ is K_ff⁻¹ on the free components f and zero on the prescribed ones.
 
 B has entries only in its columns c, the components of contact sides and supports. If
 these components are eliminated last, the trailing block L_cc of the factor yields
@@ -152,7 +152,7 @@ def floating_inverse(
     fixing: Sequence[Nodes],
     interface: Interface | None = None,
 ) -> GeneralisedInverse:
-    """Factorise the stiffness of floating bodies with consecutive numbers.
+    """Factorise the stiffness of floating bodies that are numbered one after another.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def supported_inverse(
 
     For each rigid motion that the supports allow, one further component is fixed. These
     components are selected by a QR factorisation of the motions with pivoting. Balanced
-    loads cause no reactions at them.
+    loads cause no reactions at these components.
 
     Parameters
     ----------

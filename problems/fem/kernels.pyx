@@ -135,7 +135,7 @@ def add_stiffness(
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
     cdef double[::1] sums = values
     if gradients.shape[1] != dim or gradients.shape[2] != n or n > 8 or dim not in (2, 3):
-        raise ValueError(f"cells of {n} nodes with {dim} coordinates: not this element")
+        raise ValueError(f"cells of {n} nodes in {dim} dimensions do not fit the element")
     if cells.shape[0]:
         data.points, data.pairs = gradients.shape[0], edges.shape[1]
         data.gradients, data.weights = &gradients[0, 0, 0], &weights[0]

@@ -1,4 +1,4 @@
-"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes of unit tension on uniform grids."""
+"""Stiffness ∫ ∇N_a·∇N_b of strings and membranes at unit tension on uniform grids."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
     Parameters
     ----------
     cells : number of cells along each of one or two directions
-    h : length of a cell in all directions; in two directions, K is independent of h
+    h : length of a cell in all directions; in two dimensions, K is independent of h
 
     """
     # stiffness of a tensor product grid: K ⊗ M + M ⊗ K

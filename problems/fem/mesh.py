@@ -31,8 +31,8 @@ from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Elemen
 
 Nodes = NDArray[np.int64]
 
-#: eight corners of a degenerate hexahedron as indices into those of a tetrahedron or
-#: wedge, by kind of cell
+#: corners of a tetrahedron or wedge (by kind of cell) that form the eight corners of a
+#: degenerate hexahedron
 REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]}
 
 
@@ -155,9 +155,9 @@ class StructuredGrid:
 class HalfDisc:
     """Half disc divided into rings of cells, with triangles at its centre.
 
-    If a is the number of angles and r that of radii, the node on ring j at angle i has
-    the number j·a + i, and the centre is the last node, a·r. Cells are numbered ring by
-    ring, and the triangles last.
+    Let a and r be the numbers of angles and radii. The node on ring j at angle i has
+    the number j·a + i, and the centre is the last node, with the number a·r. Cells are
+    numbered ring by ring; the triangles come last.
     """
 
     centre: tuple[float, float]
@@ -403,7 +403,8 @@ def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mes
     Parameters
     ----------
     angles : angles of the nodes, increasing by π from the first to the last
-    radii : radii of the rings of nodes, positive and decreasing from that of the arc
+    radii : radii of the rings of nodes, positive and decreasing from the radius of the
+        arc
 
     """
     return HalfDisc(centre, angles, radii).mesh()

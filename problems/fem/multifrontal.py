@@ -66,8 +66,9 @@ def multifrontal(
     ----------
     K : (n, n) symmetric, CSC
     free : components f in K_ff
-    points : (N, dim) positions of the nodes; node i has the n/N components from i·n/N
-    last : components whose nodes are eliminated last. If K couples distant nodes, these
+    points : (N, dim) positions of the nodes; node i has n/N components, the first of
+        which is i·n/N
+    last : components whose nodes are eliminated last. Distant nodes that K couples
         should belong to `last`, to limit fill-in
 
     Raises

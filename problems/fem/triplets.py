@@ -1,4 +1,4 @@
-"""Assembly of the stiffness by triplets, vectorised as in the paper's library [6].
+"""Assembly of the stiffness by triplets, vectorised as in library [6] of the paper.
 
 All element matrices are computed at once, and their entries are summed into a sparse
 matrix. This method is the baseline against which benchmarks and experiments compare

@@ -1,9 +1,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 """Products of dense blocks with the columns of all subdomains of a class.
 
-BLAS copies (packs) the block in every product, which takes a third of the time of a
-product with two dozen columns; this module avoids that copy. The module is compiled
-when the package is installed; `blocks.pyi` declares its types.
+BLAS copies (packs) the block in every product. With two dozen columns, the copy takes a
+third of the time of a product. This module avoids the copy. The module is compiled when
+the package is installed; `blocks.pyi` declares its types.
 """
 
 from libc.stdlib cimport calloc, free
@@ -67,7 +67,7 @@ cdef class BlockDiagonal(LinearMap):
             self.at[i].is_triangle = M.ndim == 1
             fits = M.shape == ((rows, n) if M.ndim == 2 else (n * (n + 1) // 2,))
             if not fits or (M.ndim == 1 and w != 1):
-                raise ValueError(f"{M.shape} times ({n}, {w})")
+                raise ValueError(f"a block {M.shape} cannot multiply a ({n}, {w}) array")
             self.blocks[i] = np.ascontiguousarray(M, dtype=np.float64)
             entries = self.blocks[i].reshape(-1)
             self.at[i].entries = &entries[0] if entries.shape[0] else NULL

@@ -1,18 +1,20 @@
 """The dual of decomposed bodies, distributed over MPI ranks.
 
-Each rank p stores some of the subdomains, with stiffness K_p and columns B_p of B, and
-for every vector of multipliers the entries of the rows that it *owns*. A row of B that
-touches subdomains of several ranks is owned by one of these ranks, chosen round-robin,
-and is a *ghost* row of the others. Before a product with B_pᵀ, the owner sends the
-multiplier of the row to the other ranks; afterwards, these ranks send back their
-contributions to
+Each rank p stores some of the subdomains, with their stiffness K_p and their columns
+B_p of B. Of each vector of multipliers, a rank stores the entries for the rows of B
+that it *owns*. A row of B that touches subdomains of several ranks is owned by one of
+these ranks, chosen round-robin, and is a *ghost* row on all others. Before a product
+with B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
+ghost row. After the product with B_p, these ranks send their contributions back to the
+owner, so that the result is
 
     F λ = Σ_p B_p K_p⁺ B_pᵀ λ
 
-No rank stores an array of global size, only the columns of B and the rows of vectors
-that its subdomains touch. Graph partitioning (METIS) distributes the subdomains so
-that the work is balanced and few rows are shared. If a class occurs on several ranks,
-one of these ranks computes the explicit blocks and sends them to the other ranks.
+No rank stores a vector of global size: each rank stores only the columns of B for its
+subdomains, and the entries of vectors for the rows that touch these subdomains. Graph
+partitioning (METIS) distributes the subdomains so that the work is balanced and few
+rows are shared. If a class of congruent subdomains occurs on several ranks, one of
+these ranks computes the explicit blocks of the class and sends them to the other ranks.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ from mortarbench.problems.feti.subdomain_classes import (
     Subdomains,
 )
 
-#: estimated share of the work on a class that follows the factorisation of its
+#: estimated fraction of the work on a class that remains after the factorisation of its
 #: stiffness matrix; used only to balance the load of the ranks
 BLOCK_SHARE = 0.25
 
@@ -88,8 +90,8 @@ def partition(
 ) -> Partition:
     """Distribute the subdomains and the rows of B (m, N) over ranks.
 
-    discs : sets of friction multipliers; if a rank touches one row of a disc, all rows
-        of the disc reach this rank
+    discs : sets of friction multipliers; a rank that touches one row of a disc counts
+        as touching all rows of this disc
 
     Raises
     ------
@@ -121,27 +123,27 @@ def partition(
 
 
 def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return the owner (t,) of each row, round-robin among the ranks it touches.
+    """Return the owner (t,) of each row, chosen round-robin among the ranks it touches.
 
-    group : (t,) number of the first row of the disc that contains the row, or of the
-        row itself; all rows of a disc have the same owner, because they reach the same
-        ranks
-    reach : (t, ranks) nonzero where a rank touches a row, with ascending indices
+    group : (t,) for a row of a disc, the number of the first row of this disc; for any
+        other row, its own number. All rows of a disc have the same owner, because they
+        touch the same ranks
+    reach : (t, ranks) nonzero where a row touches a rank, with ascending column indices
     """
     turn = group % np.diff(reach.indptr)
     return np.asarray(reach.indices[reach.indptr[:-1] + turn], dtype=np.int64)
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Return the work (S,) of a product: the entries of each subdomain's block."""
+    """Return the work (S,) of a product with F: the number of entries of each block."""
     sizes = np.array([part.size for part in touched_components(B, domains)])
     return (sizes**2)[domains.class_of]
 
 
 #: largest accepted ratio of the largest to the mean work (or size) of the ranks
 MAX_IMBALANCE = 1.1
-METIS_SEEDS = 12  #: number of seeds to try
-SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
+METIS_SEEDS = 12  #: number of random seeds tried for METIS
+SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: trial weights of the size relative to the work
 
 
 def balanced_partition(
@@ -153,10 +155,10 @@ def balanced_partition(
 ) -> NDArray[np.int64]:
     """Partition subdomains over ranks, balancing both work and size (S,).
 
-    METIS balances a single weight. The work is tried first. If the sizes are then out
-    of balance, as on graded half discs, where few subdomains account for most of the
-    work, several combinations of work and size are tried. Among the partitions that
-    keep the work balanced, the one with the best balance of sizes is returned.
+    METIS balances a single weight. The work is tried first. On graded half discs, where
+    a few subdomains account for most of the work, the sizes are then out of balance. In
+    such cases, several combinations of work and size are tried. Among the partitions
+    that keep the work balanced, the one with the best balance of sizes is returned.
 
     Parameters
     ----------
@@ -210,7 +212,7 @@ def _partitioned(
     graph: csr_array, weight: NDArray[np.int64], ranks: int, seed: int | None = None
 ) -> NDArray[np.int64]:
     """Partition a graph with vertex weights (S,); return the rank of each vertex."""
-    from pymetis import CSRAdjacency, Options, part_graph  # not needed on one rank
+    from pymetis import CSRAdjacency, Options, part_graph  # unused on a single rank
 
     _, labels = part_graph(
         ranks,
@@ -243,7 +245,7 @@ class Halo:
     exported: Nodes
     #: (t − o,) indices in `rows` of the ghost rows, ordered by their owners
     ghosts: Nodes
-    #: (ranks,) number of values sent to each rank by `start_gather`, l in all
+    #: (ranks,) number of values sent to each rank by `start_gather`, l in total
     export_counts: NDArray[np.int64]
     #: (ranks,) number of values received from each rank by `start_gather`
     ghost_counts: NDArray[np.int64]
@@ -295,7 +297,7 @@ class Halo:
         return values
 
     def accumulate(self, y: Vector) -> Vector:
-        """Sum the contributions (t,) of all ranks; return the owned rows (o,)."""
+        """Sum the contributions (t,) of all ranks; return the owned entries (o,)."""
         return self.start_accumulate(y[self.ghosts])(y[self.owned])
 
 
@@ -349,7 +351,7 @@ class RowsOverRanks:
 
     @classmethod
     def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
-        """Split B (t, M), all rows that a rank touches, into owned and ghost rows."""
+        """Split the rows B (t, M) that a rank touches into owned and ghost rows."""
         owned, ghosts = csr_array(B[at.owned]), csr_array(B[at.ghosts])
         columns = np.unique(ghosts.indices)
         return cls(
@@ -419,8 +421,9 @@ class RankOperator:
     def average_forces(self) -> DistributedColumns:
         """Return a basis of the multipliers with Fλ = 0 as rows (c, o).
 
-        These multipliers satisfy Bᵀλ = Cᵀμ for some μ, with C of `Clusters`: the forces
-        Bᵀλ do no work on displacements v with Cv = 0. Without clusters, c = 0.
+        These multipliers satisfy Bᵀλ = Cᵀμ for some μ, where C is the matrix of
+        `Clusters`. Hence the forces Bᵀλ do no work on displacements v with Cv = 0.
+        Without clusters, c = 0.
         """
         halo, packed, clusters = self.halo, self.local.packed, self.local.clusters
         touched = csr_array((0, halo.rows.size))
@@ -458,9 +461,9 @@ class RankOperator:
 
         Most equality rows (all of them if gluing is orthonormal) are uncoupled and only
         require a division. The system of the coupled equality rows is solved
-        redundantly on all ranks. Contact rows are coupled along the contact sides:
-        their system is factorised in distributed form, or redundantly if ranks share
-        many of these rows.
+        redundantly on all ranks. Contact rows are coupled along the contact sides. The
+        system of these rows is factorised in distributed form, or redundantly if ranks
+        share many of the rows.
 
         part : (t, t) contribution of the local subdomains to B W Bᵀ, which is the sum
             of the contributions of all ranks
@@ -504,7 +507,7 @@ def _coupled(
     share = part.data[beside] / (size[row] * size[column])
     between = halo.is_shared[row] & halo.is_shared[column]
     inside = halo.rows[row[~between & (np.abs(share) > COUPLING_ROUNDING)]]
-    # entries between shared rows are complete only once summed over ranks
+    # an entry that couples two shared rows is a sum of contributions of several ranks
     between &= share != 0
     message = [v[between] for v in (halo.rows[row], halo.rows[column], share)]
     rows, columns, shares = map(
@@ -518,11 +521,11 @@ def _coupled(
 def _distributed_inverse(
     part: csc_array, rows: Touched, halo: Halo, diagonal: Vector
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Factorise the sum over ranks of parts (k, k) of B W Bᵀ, in distributed form.
+    """Factorise B W Bᵀ, the sum of contributions of all ranks, in distributed form.
 
     Parameters
     ----------
-    part, rows : contribution of this rank, and the rows that it touches
+    part, rows : contribution (k, k) of this rank, and the rows that the rank touches
     diagonal : (o,) diagonal of the sum at owned rows
 
     Returns
@@ -549,7 +552,7 @@ def _distributed_inverse(
 def _replicated_inverse(
     part: csr_array, selected: NDArray[np.bool_], halo: Halo, equalities: int
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Invert the sum over ranks of B W Bᵀ on selected rows, redundantly on all ranks.
+    """Invert B W Bᵀ on selected rows, redundantly on every rank.
 
     selected : (t,) mask of the touched rows
 
@@ -585,7 +588,7 @@ def _replicated_inverse(
 class Assignment(NamedTuple):
     """Ranks that factorise and condense a class of congruent subdomains."""
 
-    work: int  #: estimated work, in one arbitrary unit for all classes
+    work: int  #: estimated work in an arbitrary unit, which is the same for all classes
     ranks: list[int]  #: ranks with subdomains of the class
     factor_rank: int  #: rank that factorises the stiffness matrix
     block_rank: int  #: rank that computes the blocks and sends them to other ranks
@@ -595,8 +598,8 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
     """Assign the factorisation and the blocks of each class to one rank each.
 
     In order of decreasing work, each class is assigned to the rank with the smallest
-    load so far (longest processing time first, Graham 1969). The computation of blocks,
-    which follows the factorisation, is then reassigned from ranks with high loads to
+    load so far (longest processing time first, Graham 1969). Then the computation of
+    blocks, which follows the factorisation, is reassigned from ranks with high loads to
     ranks with low loads.
 
     work : for each rank, a map from the names of its classes to their work
@@ -624,9 +627,9 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
 def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
     """Return the number of blocks that a rank computes before factors are exchanged.
 
-    Such blocks only require factors of this rank, and are computed while slower ranks
-    are still factorising. If no factors are exchanged, the result is the number of all
-    blocks of the rank.
+    These blocks require only factors of this rank. They are computed while slower ranks
+    are still factorising. If no factors are exchanged, the result is the total number
+    of blocks of the rank.
     """
     factors: dict[int, float] = {}
     for task in tasks.values():
@@ -649,10 +652,11 @@ def condense_over_ranks(
 ) -> Iterator[tuple[int, Condensed]]:
     """Yield the blocks of all groups; equal groups are condensed on one rank only.
 
-    For classes that occur on several ranks, each rank computes the factors assigned to
-    it, then some blocks while slower ranks are still factorising. Next, factors are
-    exchanged, the remaining blocks are computed, and blocks are exchanged. Blocks of a
-    class that occurs on this rank alone are yielded immediately and not stored.
+    For classes that occur on several ranks, each rank first computes the factors
+    assigned to it, then some blocks while slower ranks are still factorising. Next, the
+    ranks exchange factors, compute the remaining blocks, and exchange the blocks.
+    Blocks of a class that occurs on this rank alone are yielded immediately and not
+    stored.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     groups_by_name = dict(zip(names, groups, strict=True))
@@ -708,7 +712,7 @@ def condense_over_ranks(
         ],
     )
     blocks |= dict(zip(foreign, arrays, strict=True))
-    del arrays  # so that each full block is released as the caller packs it
+    del arrays  # so that each full block is released once the caller has packed it
     for n in list(blocks):
         condensed = Condensed(*blocks.pop(n))
         yield from ((i, condensed) for i in positions[n])

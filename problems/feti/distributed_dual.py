@@ -63,7 +63,7 @@ from mortarbench.problems.feti.subdomains import (
 class LocalDual:
     """Dual QP on the rows owned by one rank.
 
-    All ranks must evaluate each member together.
+    The members communicate; all ranks must evaluate each member together.
     """
 
     subdomains: LocalSubdomains
@@ -176,10 +176,10 @@ def distributed_qp(
 ) -> DistributedQP:
     """Return the distributed dual QP; all ranks must call this function together.
 
-    If the QP depends on solutions of previous problems, the rounding errors in its data
-    depend on the number of ranks. In this case, the digest of the QP is computed from
-    the first of these problems and their number, so that it is independent of the
-    number of ranks.
+    If the QP depends on solutions of previous problems, the rounding errors in the data
+    of the QP depend on the number of ranks. In this case, the digest of the QP is
+    computed from the first previous problem and the number of previous problems, so
+    that the digest is independent of the number of ranks.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def distributed_qp(
     """
     local = dual.subdomains
     for part in ("explicit", "q", "G", "b"):
-        getattr(dual, part)  # computed here to exclude it from the time of `prepare`
+        getattr(dual, part)  # so that it does not count towards `prepare`
 
     def digest() -> str:
         names = others * [_digest(first.subdomains)] if first else [_digest(local)]
@@ -219,8 +219,8 @@ def _decomposition(
     """Return the quantities of the decomposition for all ranks together.
 
     The keys are those of `problems.duality.feti_dual.decomposition_quantities`.
-    `explicit_mib` is the sum over ranks: if a class occurs on several ranks, each of
-    these ranks stores its blocks.
+    `explicit_mib` is the sum over ranks: each rank on which a class occurs stores the
+    blocks of this class.
     """
     domains, rows, ranks = local.domains, local.rows, local.ranks
     sizes = np.array([part.size for part in touched_components(rows.B, domains)])
@@ -242,8 +242,8 @@ def _decomposition(
 def _digest(local: LocalSubdomains) -> str:
     """Return a digest of the QP that does not depend on the distribution over ranks.
 
-    It is computed from three digests for every subdomain, in the order of the
-    subdomains (class, load and columns of B), and from the contact data and clusters,
+    It is computed from the digests of the class, the load and the columns of B of each
+    subdomain, in the order of the subdomains, and from the contact data and clusters,
     which are equal on all ranks.
     """
     domains, rows, contact = local.domains, local.rows, local.problem.contact

@@ -41,7 +41,8 @@ class LocalSolution:
 
     subdomains: LocalSubdomains
     bodies: LocalBodies
-    u: Vector  #: (n,) at `bodies.components`; equal on ranks that store a component
+    #: (n,) at `bodies.components`; equal on all ranks that share a component
+    u: Vector
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
@@ -226,7 +227,8 @@ class _Extent(NamedTuple):
     centre: Vector  #: (dim,)
     radius: float  #: root mean square distance of the nodes from the centre
     size: float  #: √N
-    #: (k, k) orthonormal combinations of the rotations; None for at most one rotation
+    #: (k, k) matrix that combines the rotations into orthonormal ones; None in the
+    #: plane
     turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:

@@ -1,17 +1,18 @@
 """The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners.
 
 Only the components b with nonzero columns in B contribute. Let B_b be these columns,
-packed group by group. A product with F consists of a sparse, a dense and another sparse
-product:
+packed group by group. A product with F consists of a sparse, a dense and a second
+sparse product:
 
     F λ = B_b diag((K⁺)_bb) B_bᵀ λ
 
 A group is the set of subdomains that share a dense block. Their components form the
-columns of one matrix, so that each group requires one product of two dense matrices.
-For a single subdomain only one triangle of the block is stored, because memory
-bandwidth limits the product. As many blocks (K⁺)_bb and S_bb as fit into memory are
-computed in advance (*explicit*), which pays off after about ten products. For all other
-classes, each product requires a solve with the factor of the class.
+columns of one matrix, so that each group requires one product of two dense matrices. If
+a group consists of a single subdomain, only one triangle of the block is stored,
+because memory bandwidth limits the speed of the product. The blocks (K⁺)_bb, and S_bb
+for preconditioners, are computed in advance (*explicit*) for as many classes as fit
+into memory, which pays off after about ten products. For all other classes, each
+product requires a solve with the factor of the class.
 
 Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel and Roux
 1994, Dirichlet; Rixen and Farhat 1999, scaling):
@@ -24,12 +25,12 @@ or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its
 block for the equality rows is itself block diagonal, with one block per node. The
 Moore-Penrose inverse of this block keeps λ free of components in ker Bᵀ.
 
-Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
-only where contact touches supports. There they would adapt the weights of the equality
+Entries of B W Bᵀ that couple contact rows with equality rows are dropped. Such entries
+exist only where contact touches supports. They would adapt the weights of the equality
 rows to contact rows that are mostly inactive. The final face consists of the
 multipliers that are free at the solution. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
-condition number on this face is 58 with these entries and 3.7 without them. It is also
-3.7 if B contains only the rows of the face.
+condition number on this face is 58 with the coupling entries and 3.7 without them. It
+is also 3.7 if B contains only the rows of the face.
 """
 
 from __future__ import annotations
@@ -79,13 +80,14 @@ STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
 #: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
 #: singular where contact rows are linearly dependent
 CONTACT_SHIFT = 1e-8
-#: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
+#: eigenvalues of a block of B W Bᵀ below this fraction of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
 #: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
 #: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
 #: amplified to at most 1e5·2⁻⁵³, far below any tolerance
 LEAST_DIAGONAL = 1e-10
-#: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding errors
+#: off-diagonal entries of B W Bᵀ below this fraction of the diagonal are rounding
+#: errors
 COUPLING_ROUNDING = 1e-12
 
 
@@ -109,9 +111,8 @@ def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
 class Packed:
     """Rows of B on the components that they touch, numbered group by group.
 
-    Within a group, numbers increase with the subdomain first and then with the
-    component, so that the packed vector of a group is a matrix (n_g, S_g) stored by
-    rows.
+    Within a group, the subdomain index varies fastest, so that the packed vector of a
+    group is a matrix (n_g, S_g) stored by rows.
     """
 
     groups: tuple[Group, ...]
@@ -123,7 +124,7 @@ class Packed:
         return Composition(CompressedRows(self.B), blocks, CompressedRows(self.BT))
 
     def block_diagonal(self, blocks: Sequence[Any]) -> BlockDiagonal:
-        """Return the block diagonal map of packed components (M,), a block per group.
+        """Return the block diagonal map of packed components (M,), one block per group.
 
         blocks : block of each group, as for `BlockDiagonal`
         """
@@ -142,7 +143,7 @@ class Packed:
         within = B.indices - (np.cumsum(sizes) - sizes)[group]
         component, subdomain = np.divmod(within, np.array(members)[group])
 
-        # first all pairs of entries in the same row, then only those in one subdomain
+        # form all pairs of entries in the same row, then select those in one subdomain
         entries = np.diff(B.indptr)
         row = np.repeat(np.arange(entries.size), entries)
         left = np.repeat(np.arange(B.nnz), entries[row])
@@ -181,7 +182,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
 
 
 def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """Return, per class, the components that B touches in any of its subdomains."""
+    """Return for each class the components that B touches in any of its subdomains."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)
@@ -205,8 +206,8 @@ class DualOperator:
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (classes,) True for classes with explicit blocks
     equalities: int  #: number of equality rows, which come first; contact rows follow
-    #: yields (K⁺)_bb and S_bb of explicit groups in any order, each with the index of
-    #: its group in the argument
+    #: yields (K⁺)_bb and S_bb of explicit groups in any order, together with the index
+    #: of the group in the argument
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
@@ -324,7 +325,8 @@ class DualOperator:
         if joints is None:
             return diagonal
         # if Cv = 0 implies that a row of Bv is zero, the diagonal entry of F for this
-        # row is a mere rounding error, and residuals scaled by it would be of order one
+        # row is only a rounding error, and residuals scaled by this entry would be of
+        # order one
         joined = diagonal + joints.diagonal(self.packed.B)
         return np.maximum(joined, LEAST_DIAGONAL * diagonal)
 
@@ -365,15 +367,15 @@ class _Joints:
 
     groups: tuple[Group, ...]
     columns: list[Dense]  #: [(K⁺Φ)_b, R_b] (n_g, p_g) of each group
-    #: (k, p) combinations for the unknowns (μ_1, α_1, μ_2, α_2, …) of clusters; columns
-    #: are packed like components
+    #: (k, p) coefficients of V, one row for each of the unknowns (μ_1, α_1, μ_2, α_2,
+    #: …) of clusters; the columns are packed like components
     combine: csr_array
     saddle_inverses: list[Vector]  #: upper triangle of M⁺ for each cluster
     sizes: list[int]  #: number of unknowns of each cluster
 
     @property
     def linear_map(self) -> Composition:
-        """The term as a map on packed components."""
+        """The term −V M⁺Vᵀ as a map on packed components."""
         members = [group.members.size for group in self.groups]
         sizes = [group.touched.size for group in self.groups]
         rows = [np.ascontiguousarray(block.T) for block in self.columns]
@@ -455,7 +457,7 @@ def _column_places(
 ) -> NDArray[np.int64]:
     """Return the indices (Σq,) of the coordinates of `Clusters`, packed by groups.
 
-    sizes : number of columns of each group; those of the coordinates come first
+    sizes : number of columns of each group; the columns of the coordinates come first
     """
     first = clusters.coordinates
     place, end = np.empty(first[-1], dtype=np.int64), 0
@@ -555,11 +557,12 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
 
 
 def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
-    """Drop rounding errors and couplings of contact with equality rows in B W Bᵀ."""
+    """Drop rounding errors, and coupling of contact with equality rows, from B W Bᵀ."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])
-    # rounding would join the small blocks that `block_pseudoinverse` separates
+    # rounding errors would connect the small blocks that `block_pseudoinverse`
+    # separates
     kept = (np.abs(gram.data) > COUPLING_ROUNDING * size) & (
         (rows < equalities) == (columns < equalities)
     )

@@ -85,9 +85,9 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     """Return the graph of cells (E, E), with an integer weight for each shared facet.
 
     Let d be the distance between the centres of the two cells. The weight is
-    `UNIT_WEIGHT` times √(L/d) for an edge of length L, or times (L/d)^⅔ for a face of
-    area L². Between rectangles of unit area the factor is the length of the edge;
-    between boxes of unit volume, the area of the face.
+    `UNIT_WEIGHT` times √(L/d) for an edge of length L, or `UNIT_WEIGHT` times (L/d)^⅔
+    for a face of area L². The second factor is the length of the edge if the cells are
+    rectangles of unit area, and the area of the face if they are boxes of unit volume.
     """
     dim = points.shape[1]
     facets, names, cell = cell_facets(cells, dim)
@@ -120,11 +120,12 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
     if connected_components(graph)[0] > 1:
         raise InputError(
             "the cells of a body are not all connected by edges (faces in space); "
-            "expected each connected piece to be a body of its own"
+            "expected a separate body for each connected piece"
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    from pymetis import CSRAdjacency, Options, part_graph  # rarely needed
+    # rarely needed, hence local
+    from pymetis import CSRAdjacency, Options, part_graph
 
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
     # k-way partitions are better, but may have empty parts if there are few cells per
@@ -146,8 +147,8 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
 def _reconnect(graph: csr_array, label: Labels) -> Labels:
     """Merge all but the largest piece of each part into adjacent parts.
 
-    A piece is a connected component of a part. It is merged into the part with which
-    it shares most facets.
+    A piece is a connected component of a part. It is merged into the part with which it
+    shares the most facets.
     """
     cell, other = graph.nonzero()
     while True:

@@ -11,8 +11,8 @@ spectra are those of
 without and with a preconditioner M ≈ F⁻¹. Both operators are self-adjoint on the range
 of P, and the same Lanczos process applies to both (Parlett 1998, Chapter 13). Each new
 vector is orthogonalised against its two predecessors, as in the recurrence, then
-against all previous vectors, which excludes spurious copies of eigenvalues. It is also
-projected by P, because components in ker P due to rounding would grow.
+against all previous vectors, which excludes spurious copies of eigenvalues. Each new
+vector is also projected by P, because components in ker P due to rounding would grow.
 
 The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue.
 The norm ‖r‖ is computed from the last component of the eigenvector of the tridiagonal
@@ -90,7 +90,7 @@ def spectrum(
     M : preconditioner, symmetric positive semidefinite
     tol : bound of the relative error of both extreme eigenvalues
     rows : components on this rank; None for all n components
-    total : sums arrays (k,) over all ranks and returns the sum on each rank
+    total : returns the sum over all ranks of arrays (k,), on each rank
 
     """
     local = np.arange(n) if rows is None else rows
@@ -98,8 +98,8 @@ def spectrum(
     def dot(x: Vector, y: Vector) -> float:
         return float(total(np.atleast_1d(x @ y))[0])
 
-    # with the inner product xᵀWy: `metric` maps x to Wx, and `image` maps Wx to the
-    # image of x under the operator
+    # the inner product is xᵀWy; `metric` maps x to Wx, and `image` maps Wx to the image
+    # of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
     v = P(np.sin(1.0 + local**2))  # arbitrary; rarely orthogonal to eigenvectors

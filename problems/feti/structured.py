@@ -1,9 +1,9 @@
 """Structured grids cut into blocks, numbered without a global mesh.
 
-All global numbers of torn nodes and of gluing rows are computed from tables as long as
-the sides of the grids. Let aᵢ = 2 if column i of nodes separates two blocks and aᵢ = 1
-otherwise, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ copies, which are
-numbered like their blocks, from left to right and from bottom to top.
+All global numbers of torn nodes and of gluing rows are computed from tables with one
+entry per row, or per column, of nodes. Let aᵢ = 2 if column i of nodes separates two
+blocks and aᵢ = 1 otherwise, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ
+copies, which are numbered like their blocks, from left to right and from bottom to top.
 
 The stiffest mode of an interface is a saw tooth along it, that is, alternating tension
 and compression, and its stiffness increases as the cells become thinner. Between half
@@ -14,9 +14,9 @@ planes of cells with sides hₜ along the interface and hₙ across it, this sti
 relative to square cells, with the entries C₁₁ and C₆₆ of the elasticity matrix.
 Derivation: the energy of a saw tooth along rows of cells is a quadratic form in its
 amplitudes on successive rows of nodes. The matrix of this form is 4C₁₁/hₜ times the
-mass matrix plus hₜC₆₆/3 times the stiffness matrix of linear elements on a half line;
-s is its Schur complement on the interface. If rows of B are scaled by
-√s, the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
+mass matrix plus hₜC₆₆/3 times the stiffness matrix of linear elements on a half line; s
+is the Schur complement of this matrix on the interface. If rows of B are scaled by √s,
+the smallest eigenvalue of the dual is that for square cells (`shape_factors`).
 """
 
 from __future__ import annotations
@@ -138,9 +138,10 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return first column, first row, and numbers of columns and rows, of blocks.
+        """Return the first column and row of nodes of each block, and their numbers.
 
-        Columns and rows are those of nodes; each result is (k,).
+        The four results (k,) are the first column, the first row, the number of columns
+        and the number of rows.
 
         block : (k,) numbers of blocks
         """
@@ -404,12 +405,12 @@ def shape_factors(
 class _Lines(NamedTuple):
     """Tables for the columns, or the rows, of all grids."""
 
-    start: NDArray[
-        np.int64
-    ]  #: (grids + 1,) first line of each grid, then the number k of lines
-    multiplicity: NDArray[np.int64]  #: (k,) number of blocks that meet there, 1 or 2
+    #: (grids + 1,) first line of each grid, then the number k of lines
+    start: NDArray[np.int64]
+    #: (k,) number of blocks that meet at each line, 1 or 2
+    multiplicity: NDArray[np.int64]
     first: NDArray[np.int64]  #: (k,) first block that contains the line
-    #: (2, k) numbers of preceding lines of multiplicity 1 and 2 in the same grid
+    #: (2, k) numbers of preceding lines in the same grid, of multiplicity 1 and of 2
     before: NDArray[np.int64]
     cut: NDArray[np.int64]  #: (c,) lines where blocks begin and end
     cut_start: NDArray[np.int64]  #: (grids + 1,) first cut of each grid, then c

@@ -2,9 +2,9 @@
 
 The global numbers of torn nodes and of gluing rows are determined by the subdomains
 that contain each node. For blocks of structured grids, these subdomains are computed
-from tables as long as the sides of the grids (`problems.feti.structured.Layout`).
-Otherwise the interface nodes, which belong to several subdomains, are listed
-(`ListedSubdivision`).
+from tables with one entry per row, or per column, of nodes
+(`problems.feti.structured.Layout`). For all other bodies, the interface nodes, which
+belong to several subdomains, are listed (`ListedSubdivision`).
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class ListedSubdivision:
     body: Integers  #: (S,) body of each subdomain
     sizes: NDArray[np.int64]  #: (S,) number of nodes of each subdomain
     node: Nodes  #: (k,) listed nodes, ascending
-    #: (k + 1,) index of the first holder of each node, followed by l
+    #: (k + 1,) index in `holders` of the first holder of each node, followed by l
     start: NDArray[np.int64]
     holders: Nodes  #: (l,) subdomains that contain each node, ascending
     #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, corners) as

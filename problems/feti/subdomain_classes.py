@@ -56,9 +56,8 @@ class SubdomainClass:
     #: ascending components of all nodes, glued or free, on the boundary of the
     #: subdomain, onto which Dirichlet preconditioners condense
     boundary: Nodes
-    stiffness: (
-        Vector  #: (n_k,) mean modulus of the cells around each component, in units of K
-    )
+    #: (n_k,) mean modulus of the cells around each component, in units of K
+    stiffness: Vector
 
     @cached_property
     def name(self) -> str:
@@ -73,7 +72,7 @@ class SubdomainClass:
         )
 
     def without_factor(self, name: str = "") -> SubdomainClass:
-        """Return a copy without cached factors; an empty `name` keeps the name."""
+        """Return a copy without cached factors; an empty `name` keeps the old name."""
         copy = replace(self)
         vars(copy)["name"] = name or self.name
         return copy
@@ -110,7 +109,7 @@ class SubdomainClass:
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         if (
             i.size
-        ):  # order i to reduce fill; h stays last, so that its block is trailing
+        ):  # order i to reduce fill; h stays last, so that L is the trailing block
             i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
         order = np.concatenate([i, h])
         K_rho = with_int32(self._fixed[order][:, order])
@@ -245,15 +244,15 @@ class Subdomains:
         return v
 
 
-#: eigenvalues of C_cC_cᵀ below this share of the largest indicate dependent rows, where
-#: C_c are the rows of C of one cluster. The modes of faces are orthonormal, so that all
-#: other eigenvalues are much larger
+#: eigenvalues of C_cC_cᵀ below this fraction of the largest indicate dependent rows,
+#: where C_c are the rows of C of one cluster. The modes of faces are orthonormal, so
+#: that all other eigenvalues are much larger
 DEPENDENT_SHARE = 1e-10
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Clusters:
-    """Subdomains whose averages over common faces are equal within each cluster.
+    """Clusters of subdomains; averages over common faces are equal within a cluster.
 
     ::
 

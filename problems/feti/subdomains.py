@@ -3,10 +3,10 @@
 Each rank assembles only its local subdomains: their meshes, stiffness matrices and
 loads, and the rows of B with entries at their nodes (the rows that *touch* them). A
 single process assembles all subdomains. Global numbers are determined by the
-subdivision (`problems.feti.subdivision`), which is replicated on all ranks: tables as
-long as the sides of structured grids, or a list of the nodes on interfaces. In
-addition, each rank stores a few numbers for every subdomain of every rank; these data
-are of about the same size as a vector of the coarse problem.
+subdivision (`problems.feti.subdivision`), which is replicated on all ranks. It consists
+of tables for the rows and columns of structured grids, or of a list of the nodes on
+interfaces. In addition, each rank stores a few numbers for every subdomain of every
+rank. These numbers require about as much memory as a vector of the coarse problem.
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
 and Kučera 2006). Every copy of a fixed component has a support row. The m copies
@@ -16,9 +16,9 @@ v_1 … v_m of a free component are glued by one of
 * ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
-Contact rows act on the average of the copies, which are all equal at the solution.
-Therefore a contact condition at a node of several subdomains is a single row. This row
-is orthogonal to the gluing rows.
+Contact rows act on the average of the copies, because all copies are equal at the
+solution. Therefore a contact condition at a node of several subdomains is a single row.
+This row is orthogonal to the gluing rows.
 
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
@@ -81,7 +81,7 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: by name of the gluing, functions that return the weights (rows, m) of m copies
+#: functions that return the weights (rows, m) of m copies, by the name of the gluing
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
@@ -114,13 +114,13 @@ class DecomposedProblem:
     layout: Subdivision  #: the S subdomains
     components: int  #: number of components per node; 1 for a scalar field
     material: Integers  #: (S,) material of each subdomain
-    assemble_class: Callable[
-        [SubdomainMesh], SubdomainClass
-    ]  #: assembles the class of a floating subdomain
+    #: assembles the class of a floating subdomain
+    assemble_class: Callable[[SubdomainMesh], SubdomainClass]
     E: Vector  #: (bodies,) moduli for the scaling of rows
     names: tuple[str, ...]  #: names of the bodies
     #: maps numbers of subdomains to a function that evaluates the factors of E at their
-    #: torn nodes, see `problems.feti.structured.Layout.shaping`; None for the factor 1
+    #: torn nodes, see `problems.feti.structured.Layout.shaping`; None if all factors
+    #: are 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
     load: Callable[[Nodes], Vector]  #: maps global components (k,) to forces (k,)
     fixed: Nodes  #: global components that are zero, in the order of their rows
@@ -178,7 +178,8 @@ class DecomposedProblem:
             return np.zeros(0)
         node = rows.indices // self.components
         E = self.E[of.body[of.holder(node)]]
-        # an entry b at a node with m copies becomes m entries b/m of B: m(b/m)² = b²/m
+        # an entry b at a node with m copies becomes m entries b/m of B; the sum of the
+        # squares of these entries is b²/m
         norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
         scale = np.sqrt(softest / norm2)
@@ -540,8 +541,9 @@ class _Rows(NamedTuple):
 
     number: Nodes  #: (t,) global numbers, ascending
     B: csr_array  #: (t, N_p) in local torn unknowns
-    #: (t,) number of the first row of the tangential vector that contains the row, or
-    #: of the row itself; all rows of such a group have the same owner
+    #: (t,) for a row of a tangential vector, the number of the first row of this
+    #: vector; for any other row, its own number. All rows of a vector have the same
+    #: owner
     group: Nodes
     reach: csr_array  #: (t, ranks) nonzero where a rank touches a row of the group
     c: Vector  #: (t,) right-hand side
@@ -670,8 +672,8 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
         np.concatenate(p) for p in list(zip(*entries, strict=True))[:3]
     )
     pairs = np.concatenate([part.reached for part in entries])
-    # a row is listed if any row of its tangential vector touches this rank; it may have
-    # no entries here
+    # a row is listed if any row of its tangential vector touches this rank; the listed
+    # row itself may have no entries on this rank
     number = np.unique(pairs[pairs[:, 1] == ranks.rank, 0])
     place = np.searchsorted(number, row)
     unknowns = problem.components * local.nodes.number.size
@@ -725,7 +727,7 @@ class _Copies(NamedTuple):
     node: NDArray[np.int64]  #: (k,) index in the list of nodes
     copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
     rank: NDArray[np.int64]  #: (k,) rank of the copy
-    local: NDArray[np.int64]  #: (l,) indices of those of the k copies on this rank
+    local: NDArray[np.int64]  #: (l,) indices of the copies on this rank
     local_node: NDArray[np.int64]  #: (l,) local torn node of each of these copies
 
 
@@ -793,7 +795,8 @@ def _contact_rows(local: LocalSubdomains) -> Entries:
     copies = _local_copies(local, node)
     E, group = _equality_count(problem), problem.contact.groups
     row = E + entries.row.astype(np.int64)
-    # all rows of a disc have one owner: a rank that one of them touches stores them all
+    # all rows of a disc have the same owner: a rank that one row touches stores all
+    # rows
     pairs = np.stack([group[entries.row][copies.node], copies.rank], axis=1)
     pairs = np.unique(pairs, axis=0)
     members = np.bincount(group, minlength=1)[pairs[:, 0]]

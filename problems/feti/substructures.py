@@ -93,7 +93,7 @@ class LocalProblems:
         for (template, place), members in zip(
             self._classes(), domains.members, strict=True
         ):
-            place = place[:, acting[members]]  # if b = 0, so is the solution
+            place = place[:, acting[members]]  # the solution is zero where b = 0
             columns, R = b[place], template.R
             columns -= R @ (R.T @ columns)
             image = template.inverse(columns)

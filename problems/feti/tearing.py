@@ -5,8 +5,8 @@ mesh or a part from graph partitioning. A node on the boundary of several subdom
 a copy in each of these subdomains (tearing).
 
 Subdomains that are images of one another under rigid motions form a class. Their cells
-are numbered equally, their materials are equal and their points are congruent. The
-rotations are fitted by least squares (Kabsch 1976, Acta Cryst. A32).
+have the same node numbers, their materials are equal and their points are congruent.
+The rotations are fitted by least squares (Kabsch 1976, Acta Cryst. A32).
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def grid_positions(
     starts = np.unravel_index(first, divisions[::-1])
     along = [np.unique(start, return_inverse=True)[1] for start in starts[::-1]]
     positions = np.stack(along, axis=1)
-    # if rows of blocks are cut at different places, some places in the grid are empty
+    # if rows of blocks are cut at different lines, some positions in the grid are empty
     return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
 
 
@@ -211,7 +211,7 @@ def classify(
     for group in alike.values():
         remaining = np.array(group)
         spread = np.array([spread_of(points[s]) for s in group])
-        # necessary condition that saves most comparisons: the norms ‖x − x̄‖ of two
+        # this necessary condition avoids most comparisons: the norms ‖x − x̄‖ of two
         # images differ by at most √size times the largest distance of their points
         off = 2 * CONGRUENCE_TOL * np.sqrt(points[group[0]].size)
         while remaining.size:

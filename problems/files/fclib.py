@@ -11,11 +11,12 @@ bodies as unknowns::
 In both forms, r is in the friction cone K, û = u + (μ‖u_T‖, 0) is in the dual cone of
 K, and r is orthogonal to û.
 
-A matrix is a group with the members nzmax, m, n, nz, p, i and x. It is stored by
-columns if nz = −1, by rows if nz = −2, and as nz triplets otherwise. According to the
-documentation of FCLIB, p contains the row indices of triplets, but files written by
-Siconos follow CSparse, where p contains the column indices. Both conventions are read;
-if the indices fit the shape of the matrix under both, the second is used.
+A matrix is a group with the members nzmax, m, n, nz, p, i and x. The matrix is stored
+by columns if nz = −1, by rows if nz = −2, and as nz triplets otherwise. According to
+the documentation of FCLIB, p contains the row indices of triplets, but files written by
+Siconos follow CSparse, where p contains the column indices. Both conventions are read.
+If the indices fit the shape of the matrix under both conventions, the second one is
+used.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.
@@ -306,8 +307,9 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
         or qp.h.size
     ):
         raise InputError(
-            "FCLIB holds friction cones of all variables and equality rows; expected a "
-            "QP whose sets are Cones of 2 or 3 variables each, without inequality rows"
+            "FCLIB files store only friction cones of all variables, and equality "
+            "rows; expected a QP whose sets are Cones of 2 or 3 variables each, "
+            "without inequality rows"
         )
     if not qp.is_explicit:
         raise InputError(

@@ -36,10 +36,10 @@ def format_of(path: Path) -> str:
     raise unknown("format", path.suffix, (*FORMATS, ".gz"), where=str(path))
 
 
-def check_digest(path: Value, asked: Value, found: str) -> None:
-    """Raise InputError if the digest `found` of a file is not that in its case name."""
-    if asked != found:
+def check_digest(path: Value, expected: Value, actual: str) -> None:
+    """Raise InputError if the digest of a file differs from that in its case name."""
+    if expected != actual:
         raise InputError(
-            f"{path}: its content has the digest {found}, not {asked}; "
+            f"{path}: its content has the digest {actual}, not {expected}; "
             "the file changed, or a different file was meant"
         )

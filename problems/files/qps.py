@@ -5,7 +5,8 @@ fixed columns can be read if their names contain no spaces. Sections follow Maro
 Mészáros (1999), "A repository of convex quadratic programming problems", Optim. Methods
 Softw. 11/12:
 
-* N rows after the first are ignored; the RHS of the objective is minus its constant.
+* N rows after the first are ignored; the RHS of the objective is the negative of the
+  constant in the objective.
 * A number R in RANGES changes  ≤ b  to [b − |R|, b],  ≥ b  to [b, b + |R|],  and  = b
   to [b, b + R] or, if R < 0, to [b + R, b].
 * BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in

@@ -2,7 +2,7 @@
 
 A beam of length L and thickness t = L/slenderness, clamped at its left end, carries the
 dead load P per width at its right end, distributed uniformly over the end face. In the
-slender limit, it is an inextensible elastica with the bending stiffness of plane
+slender limit, the beam is an inextensible elastica with the bending stiffness of plane
 strain,
 
     EI θ″ = −P cos θ,    EI = E t³ / (12(1 − ν²)),    θ(0) = θ′(L) = 0,

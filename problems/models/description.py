@@ -49,8 +49,8 @@ all components fixed have no contact row. Contact with a rigid body has nodal ro
 if ``contact = "mortar"``.
 
 In .inp files, bodies are element sets, boundaries are surfaces, element sets of facets
-or node sets, and points are node sets. In .med files, these are groups of cells, groups
-of facets or nodes, and groups of nodes.
+or node sets, and points are node sets. In .med files, bodies are groups of cells,
+boundaries are groups of facets or nodes, and points are groups of nodes.
 
 If the mesh has physical volumes, these are the bodies, and boundaries are physical
 surfaces. Vectors then have three components, forces are in N, and a force on a boundary
@@ -138,8 +138,8 @@ LENGTH_UNITS = {
     "in": 0.0254,
     "ft": 0.3048,
 }
-#: smallest modulus without a remark, Pa. A smaller modulus belongs to a material softer
-#: than rubber, or was mistakenly entered in MPa
+#: smallest modulus without a remark, Pa. A smaller modulus indicates a material softer
+#: than rubber, or a value that was mistakenly entered in MPa
 MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
     "mesh",
@@ -250,16 +250,16 @@ def remarks(path: Path) -> tuple[str, ...]:
     """
     table = read_description(path)
     soft = (
-        f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
-        f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
+        f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa for any "
+        f"length_unit: if {E:g} MPa is meant, write {1e6 * E:g}"
         for i, E in enumerate(body["E"] for body in table["bodies"])
         if E < MIN_PLAUSIBLE_E
     )
     sides = _sides(table["contacts"])
     two_passes = (
         f"{path}: contacts[{i}] is contacts[{sides.index((master, slave))}] "
-        "with slave and master exchanged: the force is shared among the two, "
-        "so that neither pressure is that between the bodies; leave one of them out"
+        "with slave and master exchanged: both contacts share the force between the "
+        "bodies, so that neither pressure is correct; remove one of the two contacts"
         for i, (slave, master) in enumerate(sides)
         if (master, slave) in sides[:i]
     )
@@ -355,8 +355,8 @@ def _check_loads_act(
             where = entry.get("boundary", entry.get("point"))
             raise InputError(
                 f"loads[{i}] acts on {where!r} in {' and '.join(without_effect)}, "
-                "which fix holds there: it has no effect; load another side, or hold "
-                "other components"
+                "where a support fixes the displacement; expected a load on another "
+                "side, or other fixed components"
             )
 
 
@@ -478,14 +478,14 @@ def _check_faces(
     if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
         raise InputError(
             f"no part of slave {name!r} faces the rigid body; expected a plane whose "
-            "normal points towards the slave, or a centre on its other side"
+            "normal points towards the slave, or a centre beyond the facing side"
         )
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     if gap.min() > extent:
         raise InputError(
             f"the rigid body is {gap.min():.3g} m from slave {name!r}, farther than "
-            f"the size {extent:.3g} m of the mesh; expected lengths in m, whatever "
-            "length_unit is"
+            f"the size {extent:.3g} m of the mesh; expected lengths in m for any "
+            "length_unit"
         )
 
 
@@ -503,7 +503,7 @@ def _check_unique(entries: list[dict[str, str]]) -> None:
     for i, (slave, master) in enumerate(sides):
         if (first := sides.index((slave, master))) < i:
             raise InputError(
-                f"contacts[{i}]: slave {slave!r} and master {master!r} are those of "
+                f"contacts[{i}] has the slave {slave!r} and the master {master!r} of "
                 f"contacts[{first}]; expected every contact once"
             )
 

@@ -36,13 +36,13 @@ from mortarbench.problems.models.description import (
 )
 from mortarbench.problems.ranges import check_plane_only
 
-#: largest angle in rad between edges of a straight side, to allow for rounded
-#: coordinates
+#: largest angle in rad between consecutive edges that count as straight; positive,
+#: because coordinates may be rounded
 MAX_STRAIGHT_ANGLE = 1e-6
-#: largest angle in rad between the chords of an arc; larger angles are corners
+#: largest angle in rad between consecutive chords of an arc; larger angles are corners
 MAX_ARC_ANGLE = np.pi / 4
 
-#: largest overlap of contact sides without a remark, relative to the extent of the
+#: largest overlap of contact sides that causes no remark, relative to the extent of the
 #: smallest body. The chords of touching arcs overlap by up to 5R/n² with n edges per
 #: circle, which is 0.4 % of R for n = 36
 MAX_OVERLAP = 0.01
@@ -65,8 +65,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return contact_problem
     whole = elastic.whole
     rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(whole.mesh.dofs))
-    # if a rigid motion along frictionless contact is possible, displacements are not
-    # unique, and hence neither is the next linearisation
+    # if a rigid motion along frictionless contact is possible, the displacements, and
+    # hence the next linearisation, are not unique
     if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
             f"{p['path']}: supports and friction allow a rigid motion of some body, "

@@ -114,9 +114,8 @@ def _hertz_case(n: int) -> Case:
     def quantities(s: Solution) -> dict[str, Any]:
         """Compare with Hertz's solution.
 
-        Errors are relative; that of p is in the l² norm.
-        `energy` is the elastic energy minus P·approach in J/m; the approach is measured
-        from the level u = 0.
+        Errors are relative; the error of p is in the l² norm. `energy` is the elastic
+        energy minus P·approach in J/m; the approach is measured from the level u = 0.
         """
         force = s.x * EXACT.P
         p, hertz = force / width, EXACT.pressure(x)
@@ -177,11 +176,11 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     def quantities(s: Solution) -> dict[str, Any]:
         """Compare with Cattaneo and Mindlin's solution.
 
-        Errors are relative; that of q is in the l² norm.
-        `energy` is the elastic energy minus Q·displacement in J/m; `dissipation` is
-        Σg|slip| of this loading or unloading in J/m, with the slip bounds g;
-        `stick_half_width` is that of the exact traction with the same ∫x²q;
-        `shear_centre` is the mean of q over the one or two elements next to x = 0.
+        Errors are relative; the error of q is in the l² norm. `energy` is the elastic
+        energy minus Q·displacement in J/m; `dissipation` is Σg|slip| of this loading or
+        unloading in J/m, with the slip bounds g; `stick_half_width` is the half width
+        of the stick zone for which the exact traction has the same ∫x²q; `shear_centre`
+        is the mean of q over the one or two elements next to x = 0.
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)

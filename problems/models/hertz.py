@@ -11,8 +11,8 @@ prescribed, since the theory does not determine the approach. Contact alone supp
 upper body vertically; hence the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
-Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. Each of the
-`halvings` bisects all cells along both directions.
+Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
+`halvings` is the number of bisections of all cells along both directions.
 
 R = 8, E = 200, ν = 0.3 and P = 10 are a benchmark in the literature, which states no
 units. Here the units are mm, GPa and MN/m, so that a = 0.68078 mm and p₀ = 9.3514 GPa.
@@ -32,8 +32,9 @@ the lower body have no reactions. Exact tractions are those of
 
 Two errors do not vanish with the mesh size: the bodies are finite (0.1 %), and a/R is
 not zero. Contact of two cylinders is linearised at the undeformed state, along normals
-that differ from the vertical by up to a/R. The difference from Hertz is of order
-a²/R² ∝ P, 1 % at P = 10; the default load of two cylinders is therefore smaller.
+that differ from the vertical by up to a/R. The deviation from Hertz's solution is of
+order a²/R² ∝ P, and 1 % at P = 10; the default load of two cylinders is therefore
+smaller.
 """
 
 from __future__ import annotations
@@ -417,8 +418,8 @@ def pressure_quantities(
     """Compare the pressure on the slave side with Hertz's pressure.
 
     The nodal pressure is the vertical contact force divided by ∫N_j dx. Errors are
-    relative. The half width is √(4∫px² dx/P), which is exact for Hertz's pressure,
-    whereas the position of the last active node would have an error of ±h.
+    relative. The half width is √(4∫px² dx/P), which is exact for Hertz's pressure. The
+    position of the last active node would have an error of ±h.
     """
     slave = bodies.pairs[0].slave
     x = bodies.mesh.points[slave, 0]
@@ -452,10 +453,11 @@ def shear_quantities(
 
     The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
     relative; the error of the force is relative to the peak of the force.
-    `shear_centre` is the traction at x = 0. `stick_half_width` is that of the exact
-    traction with the same ratio of ∫x²q to ∫x²p; in this ratio, the effects of the
-    finite bodies on the two moments cancel. This half width is absent for proportional
-    quasi-static steps, where nothing slips.
+    `shear_centre` is the traction at x = 0. `stick_half_width` is the half width of the
+    stick zone for which the exact tractions have the same ratio of ∫x²q to ∫x²p. In
+    this ratio, the effects of the finite bodies on the two moments cancel.
+    `stick_half_width` is absent for proportional quasi-static steps, where nothing
+    slips.
     """
     p: Any = params
     slave, upper = bodies.pairs[0].slave, p["slave"] == "upper"

@@ -16,8 +16,8 @@ Q < μP applied after P, the zone c ≤ |x| ≤ a slips and the zone |x| < c sti
 
 where square roots of negative numbers count as zero. If the force decreases from Q* to
 Q, |Q| ≤ Q*, reverse slip spreads from the edge of the contact. The traction is then
-q = q* − 2q′, where q* is the traction under Q* and q′ that under the force (Q* − Q)/2,
-with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
+q = q* − 2q′, where q* is the traction under Q*, and q′ is the traction under the force
+(Q* − Q)/2, with c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ class TangentialContact:
 
         The pairs of the loading come before those of the unloading.
         """
-        stuck = 1 - self.peak  # (c/a)², equal to the force of its semicircle
+        # (c/a)², also the force of the semicircle of half width c
+        stuck = 1 - self.peak
         loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
         if self.Q == self.peak:
             return loading

@@ -163,7 +163,7 @@ class Membranes:
     def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
         """Return the decomposed problem of both membranes.
 
-        rows : kind of the rows that join copies of a node, the key `glue`
+        rows : type of the rows that join copies of a node, the value of the key `glue`
         cluster : number of subdomains per side of a cluster; 0 for no clusters
         """
         layout = Layout.of(self.grids, self.n)
@@ -202,7 +202,7 @@ class Membranes:
         return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
 
     def results(self, answer: LocalSolution) -> dict[str, Any]:
-        """Return the values of `quantities`, reduced over all ranks; collective."""
+        """Return the values of `quantities`, reduced over all ranks (collective)."""
         lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
         return self._quantities(answer.z, answer.energy, lowest)
 

@@ -188,7 +188,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
 def _rank_quantities(
     grid: StructuredGrid, shape: str, answer: LocalSolution
 ) -> Mapping[str, Any]:
-    """Return `obstacle_quantities` from the solutions of all ranks; collective.
+    """Return `obstacle_quantities` from the solutions of all ranks (collective call).
 
     The energy includes the constant qᵀw − ½wᵀKw of `Problem.energy`, with the lift w.
     """
@@ -297,7 +297,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     if dim == 2:
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
-    # half a cell is subtracted because coordinates are rounded
+    # subtract half a cell, because coordinates are rounded
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
@@ -380,9 +380,9 @@ def exact_height(x: Vector, shape: str = "flat") -> Vector:
 def exact_energy(dim: int, shape: str = "flat") -> float:
     """Return ∫ ½|∇u|² + q u of the exact solution, which is ⅓ for the string.
 
-    For the membrane, the integral over r is evaluated in closed form, and that over the
-    angle φ numerically. With the distance ρ of the boundary in the direction φ, the
-    energy is
+    For the membrane, the integral over r is evaluated in closed form, and the integral
+    over the angle φ numerically. With the distance ρ of the boundary in the direction
+    φ, the energy is
 
         8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
 

@@ -1,9 +1,9 @@
 """Contact patch test: transfer of a uniform pressure across a non-matching interface.
 
 Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both have
-rollers on their left sides, and the lower one also on its bottom; the pressure p acts
-on the top of the upper one. The exact displacement is linear in each block;
-bilinear elements therefore represent it exactly:
+rollers on their left sides; the lower block also has rollers on its bottom. The
+pressure p acts on the top of the upper block. The exact displacement is linear in each
+block; bilinear elements therefore represent it exactly:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
@@ -18,8 +18,8 @@ In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, 
 −p. Hexahedra represent linear displacements exactly even if they are distorted (key
 `distort`).
 
-At finite strain (kinematics=finite) the pressure is a dead load, a nominal stress, and
-the exact solution is homogeneous: with the stretches λ₁ along x and λ₂ along y
+At finite strain (kinematics=finite) the pressure is a dead load (a nominal stress). The
+exact solution is homogeneous, with the stretches λ₁ along x and λ₂ along y,
 
     F = diag(λ₁, λ₂),   P₁₁(λ₁, λ₂) = 0,   P₂₂(λ₁, λ₂) = −p,   σ_y = P₂₂/λ₁
 

@@ -152,7 +152,7 @@ class Plate:
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
-    moduli: Vector  #: (k,) moduli of the materials, that of steel first
+    moduli: Vector  #: (k,) moduli of the materials, the modulus of steel first
     plane: Plane | None  #: None in space
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
@@ -199,7 +199,7 @@ class Plate:
 
 
 def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
-    """Compute the spectra named in `PRECONDITIONERS`; collective over ranks."""
+    """Compute the spectra named in `PRECONDITIONERS` (collective call)."""
     qp = dual.share().qp
     names = dict(PRECONDITIONERS)
     uniform = moduli[0] == moduli[1]  # both scalings are then equal
@@ -277,7 +277,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
 def _rank_quantities(
     elements: int, moduli: Vector, dual: LocalDual, answer: LocalSolution
 ) -> dict[str, Any]:
-    """Return `quantities` and condition numbers over all ranks; collective."""
+    """Return `quantities` and condition numbers over all ranks (collective call)."""
     problem = answer.subdomains.problem
     nodes, dim = problem.layout.nodes, problem.components
     values = {

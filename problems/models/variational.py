@@ -34,7 +34,7 @@ def string(n: int) -> Case:
 
 
 def journal_bearing(n: int, eccentricity: float) -> Case:
-    """Return the problem of the pressure v ≥ 0 in a journal bearing, n² inner nodes.
+    """Return the problem of the pressure v ≥ 0 in a journal bearing (n² inner nodes).
 
     The pressure minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b),
     with v = 0 on the boundary. Node i + n·j has the i-th ξ and the j-th height.
@@ -53,7 +53,7 @@ def journal_bearing(n: int, eccentricity: float) -> Case:
 
 
 def torsion(n: int, twist: float) -> Case:
-    """Return the problem of the stress function v of a twisted bar, n² inner nodes.
+    """Return the problem of the stress function v of a twisted bar (n² inner nodes).
 
     The stress function minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 on the
     boundary and |v| bounded by the distance from the boundary; c is the twist per

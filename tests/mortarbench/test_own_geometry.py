@@ -87,7 +87,7 @@ def test_what_the_page_says_of_refusals_is_what_is_said(solved):
         "cells of type", "cells without a name", "share nodes", "closes on itself",
         "nothing balances", "the supports allow a rigid motion of some body",
         "Pa is softer than rubber", "with slave and master exchanged",
-        "it has no effect", "a drawing, not a mesh",
+        "where a support fixes the displacement", "a drawing, not a mesh",
     ):  # fmt: skip
         assert words in PAGE
         assert words in code

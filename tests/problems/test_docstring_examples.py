@@ -1,4 +1,4 @@
-"""Examples in docstrings of what users and plug-ins call."""
+"""Examples in docstrings of functions that users and plug-ins call."""
 
 import doctest
 from importlib import import_module

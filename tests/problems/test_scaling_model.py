@@ -18,7 +18,7 @@ from mortarbench.problems.experiments.scaling_model import (
 )
 from tests.support import ROOT
 
-#: ms per product times √m of a prototype, by cores; m = 1, 2, 4, 8
+#: √m times ms per product of a prototype, by cores, for m = 1, 2, 4, 8
 PROTOTYPE = {
     128: (15,), 1024: (18, 21), 10240: (92, 27, 29), 102400: (1835, 168, 41.5, 41.1),
 }  # fmt: skip
@@ -33,7 +33,7 @@ def without_joints(one):
 
 @pytest.mark.parametrize(("cores", "m", "milliseconds"), CELLS)
 def test_the_model_agrees_with_an_independent_prototype(cores, m, milliseconds):
-    """It counted neither the sparse rows nor the joints of clusters."""
+    """The prototype omits the sparse rows and the joints of clusters."""
     one = predict(Distribution(cores=cores, cluster=m), PAPER)
     assert 1e3 * without_joints(one) == pytest.approx(milliseconds, rel=0.05)
 
@@ -55,7 +55,8 @@ def test_the_page_contains_the_predictions_of_the_code():
 
 
 def test_the_entries_of_a_coarse_factor_follow_the_measured_law():
-    """8 × 8 × 8 subdomains, each coupled with its 26 neighbours by 6 × 6 blocks."""
+    """There are 8 × 8 × 8 subdomains, each coupled with its 26 neighbours by 6 × 6
+    blocks."""
     S = 8
     line = sparse.diags_array(
         [np.ones(S - 1), np.ones(S), np.ones(S - 1)], offsets=[-1, 0, 1]
@@ -69,7 +70,11 @@ def test_the_entries_of_a_coarse_factor_follow_the_measured_law():
 
 
 def traffic(side, cells, grid):
-    """Count by nodes what ranks send: c copies of a node and the k ranks of these."""
+    """Return the number of values that each rank sends, counted node by node.
+
+    A node with c copies on k ranks causes 2(1 − 1/k)(c − 1) values per component and
+    rank.
+    """
     ends = [[side * rank // p for rank in range(p + 1)] for p in grid]
     sent = np.zeros(grid)
     nodes = range(side * cells + 1)
@@ -101,7 +106,8 @@ def test_an_inner_core_has_26_neighbours_and_sends_most():
     ("cores", "counted"), [(1, (0, 0)), (2, (35.4e3, 49.8e3)), (4, (36.7e3, 52.5e3))]
 )
 def test_bytes_and_messages_agree_with_ranks(cores, counted):
-    """Counted on cube-wall/n=32, feti=8 and 4; supported nodes are not glued."""
+    """The numbers were counted for cube-wall/n=32 with feti=8 and 4; supported nodes
+    are not glued."""
     for (side, cells), value in zip([(4, 8), (8, 4)], counted, strict=True):
         run = Distribution(cores=cores, per_core=side**3 / cores, cells=cells)
         assert 8 * run.sent == pytest.approx(value, rel=0.02)
@@ -109,7 +115,7 @@ def test_bytes_and_messages_agree_with_ranks(cores, counted):
 
 
 def test_the_entries_of_rows_are_those_of_the_case():
-    """The case has rows of supports and contact as well."""
+    """In contrast to the model, the case also has rows of supports and contact."""
     B = mb.build("cube-wall/n=8/feti=2/dual").qp.P.build().packed.B
     entries = Distribution(cores=1, per_core=64, cells=2).entries
     assert entries == pytest.approx(B.nnz, rel=0.1)
@@ -129,6 +135,4 @@ def test_one_core_sends_nothing_and_congruent_subdomains_share_a_block():
 
 
 def test_a_block_contains_the_surface_of_a_subdomain():
-    assert (
-        Distribution(cores=1, cells=2).block == 3 * 26
-    )  # 27 nodes, one of them inside
+    assert Distribution(cores=1, cells=2).block == 3 * 26  # one of 27 nodes is inside

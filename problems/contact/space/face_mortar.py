@@ -53,24 +53,25 @@ from mortarbench.problems.contact.space.triangles import FaceTriangles, triangul
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
-#: overlaps below this share of the area of the slave face are due to rounding of the
+#: overlaps below this fraction of the area of the slave face are due to rounding of the
 #: projection and are dropped
 MIN_OVERLAP = 1e-12
-#: eigenvalues of M_e below this share of the largest count as zero
+#: eigenvalues of M_e below this fraction of the largest count as zero
 SINGULAR = 1e-10
-#: distances from a line below this share of the size of a triangle count as zero
+#: distances from a line below this fraction of the size of a triangle count as zero
 ON_LINE = 1e-14
-#: pairs of triangles clipped at a time; limits memory to about 100 MB
+#: number of pairs of triangles clipped at a time; limits the memory to about 100 MB
 CHUNK = 2**16
 #: distance from a master face at which the search along a ray ends, in units of the sum
 #: of the radii of both faces. Smaller values require more steps, larger values yield
 #: more candidate faces
 CLOSE = 1.5
-#: largest number of steps of this search. Each step covers at least half the remaining
-#: distance to a side that is inclined by at most 60° (`Reach.cosine`)
+#: largest number of steps of the search along a ray. Each step covers at least half of
+#: the remaining distance to a side that is inclined by at most 60° (`Reach.cosine`)
 MAX_STEPS = 64
-#: radius, in the same units, of a ball about the end of the search that contains all
-#: faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60° across it
+#: radius, in the units of CLOSE, of a ball about the end of the search that contains
+#: all faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60°
+#: across it
 MAX_SPREAD = 5.0
 #: largest number of corners of a triangle clipped by a triangle
 MAX_CORNERS = 6
@@ -298,7 +299,7 @@ def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
         A, B = window[:, k], window[:, (k + 1) % 3]
         edge = B - A
         offset = polygon - A[:, None]
-        # positive on the inner side, the left of AB
+        # d is positive on the inner side, to the left of AB
         d = edge[:, None, 0] * offset[..., 1] - edge[:, None, 1] * offset[..., 0]
         # corners on the line up to rounding count as inside: signs of rounding errors
         # could cause more than two crossings of a convex polygon

@@ -88,8 +88,9 @@ def node_to_face(
 def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     """Return the closest points of x (s, 3) on faces, with outward normals."""
     tree = KDTree(faces.centre)
-    # faces contain their centres, so the closest point is at most `nearest` away, and
-    # the centre of its face is at most the radius of this face farther away
+    # faces contain their centres, so the closest point is at most `nearest` away; the
+    # centre of the face with this point is farther away by at most the radius of the
+    # face
     nearest, _ = tree.query(x)
     found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
     candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
@@ -118,8 +119,8 @@ def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
 def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
     """Return barycentric coordinates (p, 3) of the closest points of x (p, 3).
 
-    The closest point is the foot of the perpendicular if this is inside the triangle,
-    and otherwise the closest point of the nearest edge.
+    The closest point is the foot of the perpendicular if the foot is inside the
+    triangle, and otherwise the closest point of the nearest edge.
 
     triangle : (p, 3, 3) vertices
     """

@@ -38,9 +38,9 @@ class FaceTriangles(NamedTuple):
     vertices: Points  #: (t, 3, 3) positions of the vertices, m
 
     def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:
-        """Return the triangles (k,) of faces (p,), and the index (k,) of their face.
+        """Return the triangles (k,) of the given faces (p,).
 
-        The index refers to the list `faces`.
+        The second result (k,) is the index in `faces` of the face of each triangle.
         """
         count = self.number[faces]
         place = np.repeat(np.arange(len(faces)), count)

@@ -107,7 +107,7 @@ def _read(path: Path) -> Any:
     if numbers is not None and (numbers < 1).any():
         raise InputError(f"{path}: cells with node numbers below 1; expected 1 or more")
     if tags and not tagged:
-        raise InputError(f"{path}: not every cell has a tag; expected one for each")
+        raise InputError(f"{path}: not every cell has a tag; expected a tag for each")
     return mesh
 
 

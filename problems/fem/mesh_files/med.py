@@ -7,8 +7,9 @@ The reader uses these groups and datasets::
     …/FAM                               family of each node or cell; 0: no family
     FAS/MESH/(NOEUD|ELEME)/FAMILY       attribute NUM, GRO/NOM: groups of the family
 
-meshio's reader is not used, because it fails if a kind of cells has no families (as
-edges in Salome's files), reads results with the mesh, and follows links to other files.
+meshio's reader is not used, because it fails if cells of some kind have no families
+(such as edges in Salome's files), reads results in addition to the mesh, and follows
+links to other files.
 
 Reference: EDF, CEA, Open Cascade, MED-file 4.1, https://docs.salome-platform.org.
 """

@@ -23,7 +23,7 @@ DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
 #: bound on the magnitude of coordinates; products of larger ones could overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items()}
-#: order of the corners that mirrors a cell, by kind
+#: permutation of the corners that mirrors a cell, by kind of cell
 _MIRRORED = {
     "tetra": [1, 0, 2, 3], "wedge": [3, 4, 5, 0, 1, 2],
     "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],
@@ -141,10 +141,10 @@ def check_numbers(file: FileMesh) -> None:
 def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     """Select bodies and boundaries by name.
 
-    Sets of cells may overlap. The sets in `bodies` become bodies first. Each other set
-    becomes a body of those of its cells that belong to no body yet, if there are any.
-    Boundaries are sets of facets, and sets of nodes that contain all corners of a facet
-    on the boundary of the bodies.
+    Sets of cells may overlap. The sets in `bodies` become bodies first. Then each other
+    set becomes a body, which consists of the cells of the set that belong to no body
+    yet; sets without such cells are skipped. Boundaries are sets of facets, and sets of
+    nodes that contain all corners of a facet on the boundary of the bodies.
 
     Nodes and cells are numbered body by body, as generalised inverses require. Within a
     body, they keep the order of the file, where cells are grouped by kind. Nodes
@@ -308,7 +308,10 @@ def _bodies(
 
 
 def _dimension(kind: str) -> int:
-    """Return the dimension of a kind of cells; if unsupported, 3 for solids, else 0."""
+    """Return the dimension of a kind of cells.
+
+    The dimension of unsupported kinds is 3 for solids and 0 for all others.
+    """
     spatial = ("pyramid", "tetra", "wedge", "hexahedron")
     return DIMENSION.get(kind, 3 if kind.startswith(spatial) else 0)
 

@@ -54,9 +54,10 @@ from mortarbench.problems.models.half_space.point_contact import (
 from mortarbench.problems.models.half_space.rough_surface import rough_surface
 
 CONTACT_SHARE = 0.9  #: ratio of Hertz's contact radius to the half width of the grid
-#: the same ratio for rough spheres, which also touch outside this radius. With the
-#: default roughness, contact reached the border of the grid for 6 of 8 seeds if the
-#: ratio was 0.9, and for none of these seeds if the ratio was 0.6
+#: ratio of Hertz's contact radius to the half width of the grid for rough spheres,
+#: which also touch outside this radius. With the default roughness, contact reached the
+#: border of the grid for 6 of 8 seeds if the ratio was 0.9, and for none of these seeds
+#: if the ratio was 0.6
 ROUGH_SHARE = 0.6
 SIDE = "sphere on sphere"
 YOUNG = 200e9  #: modulus of both spheres, Pa
@@ -148,9 +149,9 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
     def quantities(s: Solution) -> dict[str, Any]:
         """Evaluate radius, force and pressure; compare smooth spheres with Hertz.
 
-        `contact_radius` is that of a disc with the area of the cells in contact;
-        `energy` is the elastic energy in J, whose exact value is 2/5·P·approach. Errors
-        are relative; that of the pressure p is in the l² norm.
+        `contact_radius` is the radius of a disc with the area of the cells in contact.
+        `energy` is the elastic energy in J; its exact value is 2/5·P·approach. Errors
+        are relative; the error of the pressure p is in the l² norm.
         """
         p, hertz = s.x * exact.P / area, exact.pressure(exact.a * cells.r)
         active = int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum())
@@ -268,11 +269,11 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
     def quantities(s: Solution) -> dict[str, Any]:
         """Evaluate stick area, resultant and energies; compare with the exact solution.
 
-        Radii are those of discs with the area of the cells. `c_over_a` is the stick
-        radius over the exact contact radius; `energy` is the elastic energy and
-        `dissipation` is Σ bound·|slip|, both in J. Errors are relative; that of the
-        shear traction is in the l² norm over the centres of the cells. Cattaneo and
-        Mindlin's solution is exact only for nu = 0.
+        A radius is that of a disc with the same area as the cells in the zone.
+        `c_over_a` is the stick radius over the exact contact radius; `energy` is the
+        elastic energy and `dissipation` is Σ bound·|slip|, both in J. Errors are
+        relative; the error of the shear traction is in the l² norm over the centres of
+        the cells. Cattaneo and Mindlin's solution is exact only for nu = 0.
         """
         force, slip = s.x.reshape(k, 2), slipping(s)
         stick_radius = cells.radius_of(int((~slip).sum()))

@@ -3,8 +3,8 @@
 A force on a cell of side h is distributed as a uniform traction. The relative
 displacement of the surfaces of two half-spaces of the same material, at the centre of a
 cell at distance (x, y), is twice the displacement of one surface. For a unit normal
-force and unit tangential forces it is (Boussinesq and Cerruti; Johnson 1985, "Contact
-mechanics", Sections 3.2 and 3.6)
+force and unit tangential forces, the relative displacement is (Boussinesq and Cerruti;
+Johnson 1985, "Contact mechanics", Sections 3.2 and 3.6)
 
     F_n = I₀/(πE*h²)
     F_t = 1/(πGh²) · [[(1 − ν)I₀ + νI_xx, νI_xy], [νI_xy, (1 − ν)I₀ + νI_yy]]
@@ -19,8 +19,8 @@ The antiderivatives are Y ln(X + r) for I_xx, X ln(Y + r) for I_yy and −r for 
 1929).
 
 An entry depends only on the distance between two cells. Therefore F is a principal
-submatrix of the circulant matrix C of a periodic grid of about twice the size, which
-the FFT diagonalises: Fx = RᵀCRx, where R extends x by zeros. Hence
+submatrix of the circulant matrix C of a periodic grid of about twice the size:
+Fx = RᵀCRx, where R extends x by zeros. The FFT diagonalises C. Hence
 λ_min(F) ≥ λ_min(C); see docs/mathematics.md.
 """
 
@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 
 
 class CellIntegrals(NamedTuple):
-    """Integrals (m0, m1) over a unit cell, by distances i along x and j along y.
+    """Integrals (m0, m1) over a unit cell, indexed by distances along x and along y.
 
     I_xy is odd in x and in y; I_xx and I_yy are even.
     """
@@ -119,7 +119,7 @@ class Influence:
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
         # transform along y in strips that stay in the cache. The padded rows are never
-        # stored as a whole: half of their input is zero, half of their output is unused
+        # stored as a whole: half of the input is zero, and half of the output is unused
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
@@ -166,8 +166,8 @@ class Influence:
 class NormalInfluence(Influence):
     """The product for normal forces, with a preconditioner M.
 
-    The product for shear has no preconditioner: on discs, solvers take so few CG steps
-    that preconditioning would save no products.
+    The product for shear has no preconditioner. In problems over discs, solvers take so
+    few CG steps that preconditioning would save no products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
@@ -205,8 +205,8 @@ def _kernels(
     I_0 = I_xx + I_yy
     if nu is None:
         return [_extended(I_0, period)]
-    # an odd function jumps at half a period; any value is admissible there, because no
-    # two cells are that far apart
+    # an odd function jumps at half a period; its value at the jump is arbitrary,
+    # because no two cells are that far apart
     for axis, M in enumerate(period):
         if M % 2 == 0:
             np.moveaxis(I_xy, axis, 0)[M // 2] = 0

@@ -81,8 +81,8 @@ from mortarbench.problems.models.hertz import graded_points
 #: computed contact radius and p₀ by 0.1 %
 EXTENT = 4.0
 UNIFORM = 1.25  #: half width of the uniformly meshed part, in units of a
-#: largest a/R, for which the corner of the block is at a distance of 0.71 R from the
-#: axis
+#: largest accepted a/R; at this value, the corner of the block is at a distance of 0.71
+#: R from the axis
 MAX_RATIO = 1 / 8
 GROUND = RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 #: names of the bodies by the key `against`
@@ -186,7 +186,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         stages = _programme(pressing, force, held, blocks[0].axis, p["mu"])
 
     def results(solution: ContactSolution) -> dict[str, Any]:
-        """Compare with the exact solution; approach is that of distant points, m."""
+        """Compare with the exact solution; `approach` is that of distant points, m."""
         approach = sum(
             _approach(block, solution, start, exact.P, material, p["R"])
             for block, start in parts
@@ -274,7 +274,7 @@ def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
 
 
 def _near(block: _Block, half_width: float) -> Nodes:
-    """Return the contact faces all of whose nodes have |x|, |y| ≤ half_width.
+    """Return the contact faces whose nodes all have |x|, |y| ≤ half_width.
 
     On the lower body, faces with only some of their nodes in this region are included.
     """
@@ -409,7 +409,7 @@ def _quantities(
     points, force = bodies.mesh.points[side.nodes], copies * side.force
     normal = force[:, 2]
     a = np.sqrt(2.5 * (normal @ (points[:, :2] ** 2).sum(axis=1)) / exact.P)
-    # the images of a block cancel components normal to planes of symmetry
+    # normal to planes of symmetry, the forces on mirror-image blocks cancel
     on_slave = force.sum(axis=0) * [copies == 2, 0, 1] + 0.0
     largest = float((normal / (copies * side.length)).max())
     both = on_slave.tolist(), (0.0 - on_slave).tolist()

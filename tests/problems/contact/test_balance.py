@@ -1,4 +1,4 @@
-"""Unbalanced loads, compared with statics and with a linear program."""
+"""Check of unbalanced loads, compared with statics and with a linear program."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,9 @@ from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 
 
 def blocks(*, fixed, forces, gap=0.0):
-    """A block of 2 m × 1 m on one of 4 m × 1 m, which is (−2, −1) … (2, 0).
+    """Return a block of 2 m × 1 m on a block of 4 m × 1 m, and their contact rows.
+
+    The lower block covers (−2, −1) … (2, 0).
 
     fixed : (body, side or corner, "x" or "xy")
     forces : (body, corner, [x, y]) in N/m
@@ -49,7 +51,7 @@ DOWN = [("upper", "top left", [0, -1e6]), ("upper", "top right", [0, -1e6])]
 
 
 def test_loads_that_press_down_within_the_support_are_balanced():
-    for share in (0.5, 0.01, 0.99, 1.0):  # up to its very edge
+    for share in (0.5, 0.01, 0.99, 1.0):  # up to the edge of the support
         forces = [
             ("upper", "top left", [0, -2e6 * share]),
             ("upper", "top right", [0, -2e6 * (1 - share)]),
@@ -87,7 +89,7 @@ def test_an_unbalanced_load_is_refused_by_name(fixed, forces, message):
 
 
 def test_bodies_that_can_only_move_together_are_both_named():
-    """The lower block is pushed up against the upper one, which is not supported."""
+    """The lower block is pushed up against the upper block, which has no support."""
     fixed = [("lower", "left", "x"), ("upper", "left", "x")]
     forces = [("lower", "bottom left", [0, 4]), ("lower", "bottom right", [0, 4])]
     with pytest.raises(InputError) as e:
@@ -119,7 +121,8 @@ def test_bodies_that_supports_hold_need_no_contact():
 
 @pytest.mark.parametrize("seed", range(40))
 def test_loads_are_refused_where_a_linear_program_has_a_free_motion(seed):
-    """max fᵀr over rigid r with B_D r = 0, B r ≤ 0 and components of at most 1."""
+    """The linear program maximises fᵀr over rigid motions r with B_D r = 0 and B r ≤ 0
+    whose components are at most 1 in magnitude."""
     rng = np.random.default_rng(seed)
     places = ("left", "bottom", "top", "right", "top left", "bottom right")
     fixed = [

@@ -8,11 +8,11 @@ from mortarbench.problems.contact import node_to_segment as contact
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.surface import surface
 
-#: a master below the slave: body under the chain means the chain runs right to left
+#: master below the slave; its chain runs from right to left, so that the body is below
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
 
 
-#: above MASTER, its body on the left: it runs from left to right
+#: chain above MASTER from left to right, so that the body is above
 FLAT = np.array([[0.5, 0.25], [1.5, 0.25], [2.5, 0.25]])
 ROOF = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
 
@@ -69,7 +69,7 @@ def test_beyond_the_end_of_the_chain_the_last_node_is_the_closest_point():
 
 
 def test_the_constraint_is_on_the_total_displacement():
-    """Moving everything by u changes the gap by exactly −B u for flat masters."""
+    """For a flat master, a displacement u changes neither B nor c."""
     slave = np.array([[1.0, 0.25], [3.0, 0.5]])
     u = np.zeros((5, 2))
     u[:2, 1] = [-0.2, 0.3]
@@ -82,8 +82,11 @@ def test_the_constraint_is_on_the_total_displacement():
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 def test_rows_are_invariant_under_translations_and_forces_balance(seed):
-    """The forces Bᵀλ of one row sum to zero; where the closest point is inside a
-    segment they also have no moment about any point of the current configuration."""
+    """The forces Bᵀλ of each row sum to zero.
+
+    Where the closest point is inside a segment, their moment about any point of the
+    current configuration also vanishes.
+    """
     rng = np.random.default_rng(seed)
     master = np.column_stack([np.linspace(4, 0, 9), 0.1 * rng.standard_normal(9)])
     slave = np.column_stack([rng.uniform(0.3, 3.7, 12), rng.uniform(0.3, 0.6, 12)])
@@ -102,7 +105,7 @@ def test_rows_are_invariant_under_translations_and_forces_balance(seed):
 
 
 def test_the_linearised_gap_is_exact_to_first_order():
-    """Small random motions change the true gap by −B du up to O(|du|²)."""
+    """A small random displacement du changes the true gap by −B du + O(|du|²)."""
     rng = np.random.default_rng(20110228)
     master = np.column_stack([np.linspace(4, 0, 5), [0.0, 0.05, 0.1, 0.05, 0.0]])
     slave = np.array([[0.7, 0.075 + 1e-9], [2.6, 0.07 + 1e-9]])  # nearly touching
@@ -151,7 +154,8 @@ def test_a_master_of_one_segment_has_an_inside_and_two_ends():
 
 
 def test_segments_of_zero_length_have_no_effect():
-    """Every node of the roof occurs twice; forces go to one node of each place."""
+    """Each node of the roof is duplicated; forces act on one of the two nodes at a
+    point."""
     slave = np.array([[0.2, 0.5], [0.6, 1.1], [1.0, 1.2], [1.0, 1.2], [2.5, 0.0]])
     once = rows(slave, ROOF)
     twice = rows(slave, np.repeat(ROOF, 2, axis=0))
@@ -186,7 +190,7 @@ def test_a_slave_that_has_flown_away_is_refused():
 
 
 def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
-    """Self-contact: the closest point of a master node is that node."""
+    """In self-contact, the closest point of a node on the master is the node itself."""
     points = np.concatenate([MASTER, [[1.0, 0.25]]])
     B, c, *_ = node_to_segment(points, np.zeros(8), np.array([1, 3]), np.arange(3))
 

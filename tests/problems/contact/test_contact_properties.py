@@ -1,4 +1,4 @@
-"""Properties of contact rows for random shapes and motions of two sides."""
+"""Properties of contact rows for random shapes and displacements of two sides."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,8 @@ def numbers(shape, low, high):
 
 @st.composite
 def sides(draw):
-    """Wavy slave above a wavy master, which may be longer, shorter or penetrated."""
+    """Draw a wavy slave above a wavy master; the slave may be longer, shorter or
+    lower."""
     s, m = draw(st.integers(2, 9)), draw(st.integers(2, 9))
     left, width = draw(st.floats(-0.4, 0.4)), draw(st.floats(0.5, 1.5))
     distance = draw(st.floats(-0.1, 0.4))
@@ -47,7 +48,7 @@ def test_rows_are_blind_to_translations(side):
         forces = B.toarray().reshape(len(c), len(side[0]), 2)
 
         assert np.isfinite(c).all(), name
-        # a sliver of cover extrapolates with large entries that cancel
+        # if a small part of a segment is covered, entries are large and cancel
         size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
         assert (abs(forces.sum(axis=1) / size) <= 1e-14).all(), name
 
@@ -79,7 +80,7 @@ def test_forces_of_a_mortar_row_have_no_moment(side):
             [-x[:, 1], x[:, 0]]
         )
 
-        # terms of the integrals: with a sliver of cover ∫|Φ_j| is large beside ∫N_j
+        # if a small part of a segment is covered, ∫|Φ_j| is large compared with ∫N_j
         terms = 1 + np.abs(moments).sum(axis=(1, 2))
         if phi is not None:
             sums = np.zeros(len(slave))
@@ -137,7 +138,8 @@ def test_the_order_of_the_slave_nodes_only_orders_the_rows(side, seed):
 @quick
 @given(side=sides())
 def test_the_gap_is_the_slack_of_the_row_at_the_linearisation_point(side):
-    """c − B u is the signed distance where the closest point is inside a segment."""
+    """Where the closest point is inside a segment, |c − B u| is the distance to the
+    master."""
     points, u, slave, master = side
     B, c, *_ = node_to_segment(*side)
     x = points + u.reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Face mortar in space, against exact clipping, the patch test and balance."""
+"""Mortar contact between faces: exact clipping, patch test and equilibrium."""
 
 from fractions import Fraction
 
@@ -58,7 +58,7 @@ def test_areas_of_overlaps_are_those_of_exact_clipping():
     count = 400
     first = anticlockwise(RNG.random((count, 3, 2)))
     other = anticlockwise(RNG.random((count, 3, 2)))
-    # also common corners, common edges and equal triangles
+    # include triangles with common corners or edges, and equal triangles
     other[:50, 0] = first[:50, 0]
     other[50:100, :2] = first[50:100, 1::-1]
     other[100:150] = first[100:150]
@@ -103,7 +103,7 @@ def grid(counts, z, *, kind, up, distort=0.0):
 
 
 def stacked(lower, upper, *, gap=0.0):
-    """Return points, slave faces (the upper side of a lower body) and master faces."""
+    """Return points, slave faces (top of the lower body) and master faces."""
     (p, slave), (q, master) = lower, upper
     return np.concatenate([p, q + np.array([0, 0, gap])]), slave, master + len(p)
 
@@ -115,7 +115,7 @@ KINDS = [
 
 
 def nodal_areas(points, faces):
-    """Return ∫N of all nodes, with N of the triangles about the mean of the corners."""
+    """Return ∫N at all nodes; N is linear on the triangles about the mean corner."""
     total = np.zeros(len(points))
     for face in faces:
         corners = list(dict.fromkeys(face))
@@ -180,7 +180,7 @@ def test_the_gap_of_parallel_sides_is_their_distance():
     )  # fmt: skip
     rows = face_mortar(points, np.zeros(points.size), slave, master)
     assert_allclose(rows.c, 0.3, atol=1e-14)
-    # closing by 0.1 leaves 0.2, and c is that of the total displacement
+    # moving down by 0.1 leaves a gap of 0.2; c refers to the total displacement
     u = np.zeros_like(points)
     u[np.unique(master), 2] = -0.1
     moved = face_mortar(points, u.ravel(), slave, master)
@@ -219,7 +219,8 @@ def test_only_covered_nodes_have_rows_and_half_covered_faces_pass_the_patch_test
         grid((3, 3), 0.0, kind="quad", up=False),
     )
     upper = np.unique(master)
-    points[upper, 0] = 0.30 + 0.4 * points[upper, 0]  # cuts through slave faces
+    # the edge of the side cuts slave faces
+    points[upper, 0] = 0.30 + 0.4 * points[upper, 0]
     for basis in ("dual", "standard"):
         rows = face_mortar(points, np.zeros(points.size), slave, master, basis=basis)
         assert 0 < len(rows.c) < 25
@@ -245,7 +246,8 @@ def test_the_overlaps_cover_the_common_part_exactly_once():
 
 
 def test_faces_are_searched_independently_of_each_other():
-    """The side is steep, so that faces take different numbers of search steps."""
+    """The slave side is steep, so that its faces require different numbers of search
+    steps."""
     points, slave, master = stacked(
         grid((8, 8), 0.0, kind="quad", up=True),
         grid((6, 6), 0.0, kind="triangle", up=False),

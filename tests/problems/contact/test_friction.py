@@ -1,4 +1,4 @@
-"""Laws of friction and the fixed point of Coulomb's law, by hand for one node."""
+"""Friction laws and the fixed-point iteration, with results by hand for one node."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -32,13 +32,13 @@ def friction(mu, bound=0.0, cohesion=0.0):
 
 
 def lifted(by):
-    """Return a normal force that decreases by a multiple of the bound of friction."""
+    """Return a function that decreases the normal force by a multiple of the bound."""
     return lambda one: FORCE - by * one.bound
 
 
 @pytest.mark.parametrize("cohesion", [0.0, 0.25])
 def test_the_fixed_point_satisfies_coulombs_law(cohesion):
-    """g = c + μ(6 − g)  with μ = ½: g = (c + 3)/1.5."""
+    """The fixed point of g = c + μ(6 − g) with μ = ½ is g = (c + 3)/1.5."""
     iterates = coulomb_fixed_point(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
 
     assert iterates[-1].bound == pytest.approx((cohesion + 3) / 1.5, rel=1e-10)
@@ -64,7 +64,8 @@ def test_a_coefficient_of_zero_converges_at_once():
 
 
 def test_divergence_is_refused_with_the_smallest_and_the_last_residual():
-    """μ = 1.01: iterates alternate, at distances that grow by the factor 1.01."""
+    """With μ = 1.01, iterates alternate about the fixed point; their distance from it
+    grows by the factor 1.01 per iterate."""
     calls = []
 
     def normal(one):
@@ -83,7 +84,7 @@ def test_divergence_is_refused_with_the_smallest_and_the_last_residual():
 
 
 def test_slow_convergence_ends_after_a_thousand_problems():
-    """The distance to the limit shrinks by a thousandth per iterate."""
+    """The relative change of the bound decreases by 0.1 % per iterate."""
     calls = []
 
     def normal(one):
@@ -104,7 +105,7 @@ def test_a_bound_that_holds_no_equilibrium_is_named():
 
     with pytest.raises(InputError, match=r"step 3: no equilibrium.* bound 2 of") as e:
         coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
-    assert str(e.value).endswith("no optimal point")
+    assert "of Coulomb's law (no optimal point): friction cannot" in str(e.value)
 
 
 def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
@@ -114,7 +115,7 @@ def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
         "third", "first", "second", "third",
     ]  # fmt: skip
     with pytest.raises(
-        PastEndError, match="iterate=4: the fixed point of step 5 has 3"
+        PastEndError, match="iterate=4: the fixed-point iteration of step 5 has 3"
     ):
         select_iterate(problems, 4, 5)
 
@@ -137,7 +138,7 @@ def test_a_law_reads_only_its_own_parameter():
 
 
 def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_force():
-    """Two pairs of two and three slave nodes; rows of the nodes 1, 2 and 4."""
+    """Two pairs have two and three slave nodes; nodes 1, 2 and 4 have contact rows."""
     pairs = [ContactPair(np.arange(k), np.arange(0)) for k in (2, 3)]
     bodies = SimpleNamespace(pairs=pairs, force=10.0)
     rows = SimpleNamespace(

@@ -39,7 +39,7 @@ def flat(n, y, *, rightwards, left=0.0, right=1.0):
 
 
 def along(integrals, n):
-    """Reduce vectors that are multiples of n, (s, 2k), to their factors (s, k)."""
+    """Return the factors (s, k) of vectors (s, 2k) that are multiples of n."""
     vectors = integrals.toarray().reshape(integrals.shape[0], -1, 2)
     factors = vectors @ n
     assert vectors == pytest.approx(factors[..., None] * n, abs=1e-15)
@@ -55,7 +55,10 @@ def turned(x, angle):
 
 
 def arcs(n, master_share=0.9):
-    """A slave bump of radius 1 in a master groove of radius 1.05, 10:9 segments."""
+    """Return a slave arc of radius 1 and a master arc of radius 1.05 around it.
+
+    The numbers of segments are n on the slave and master_share·n on the master.
+    """
 
     def bow(n, radius, start, stop):
         t = np.linspace(start, stop, n + 1)
@@ -84,7 +87,8 @@ def test_a_master_node_is_projected_along_the_normal_field():
 
 
 def test_a_ray_meets_the_master_where_the_lines_cross():
-    """From the middle of (0,0)-(2,0) down to the line through (0,-1) and (2,-3)."""
+    """The ray from the middle of (0, 0)-(2, 0) meets the line through (0, −1) and (2,
+    −3)."""
     s, m = sides([[0, 0], [2, 0]], [[2, -3], [0, -1]])
     at = cast_rays(s, m, overlaps(s, m), Reach())
 
@@ -124,7 +128,8 @@ def test_the_gap_of_parallel_sides_is_their_distance_in_every_row(basis):
 
 @pytest.mark.parametrize("basis", BASES)
 def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
-    """For biorthogonal Φ, ∫Φ_j g/∫N_j is g_j; for N it is an average."""
+    """With the dual basis, ∫Φ_j g/∫N_j equals g_j; with the standard basis, it is an
+    average of g."""
     slave, master = flat(4, 0.5, rightwards=True), np.array([[2.0, 0.2], [-1.0, -0.1]])
     gap = 0.5 - 0.1 * slave[:, 0]
     _, c, *_ = rows(slave, master, basis=basis)
@@ -138,7 +143,7 @@ def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
 
 @pytest.mark.parametrize("basis", BASES)
 def test_the_constraint_is_on_the_total_displacement(basis):
-    """Moving a flat slave down by u changes the gap, but not the inequality."""
+    """If a flat slave moves down by u, the gap changes but the inequality does not."""
     slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
     u = np.zeros((14, 2))
     u[:8, 1] = -0.3
@@ -157,7 +162,8 @@ def test_the_constraint_is_on_the_total_displacement(basis):
     "right", [0.5, 0.2, 0.05, 1e-6], ids=lambda r: f"to {r} of the last"
 )
 def test_the_dual_basis_is_biorthogonal_on_the_covered_part(right):
-    """∫Φ_j N_k = δ_jk ∫N_k per segment, the last of four covered in part."""
+    """On each of four segments, ∫Φ_j N_k = δ_jk ∫N_k; the last segment is only partly
+    covered."""
     slave = flat(4, 0.0, rightwards=True, right=4.0)
     s, m = sides(slave, flat(7, -0.1, rightwards=False, left=-1.0, right=3 + right))
     at = cast_rays(s, m, overlaps(s, m), Reach())
@@ -196,7 +202,7 @@ def test_D_of_the_dual_basis_is_diagonal_on_straight_sides_and_equals_the_cover(
 
 
 def test_a_row_of_the_dual_basis_pulls_the_slave_along_the_normal_of_its_node():
-    """For any master mesh, ∫Φ_j ν = n_j ∫N_j: the quadrature is exact."""
+    """For any master mesh, ∫Φ_j ν = n_j ∫N_j, because the quadrature is exact."""
     s, m = sides(*arcs(20))
     edge = np.linalg.norm(np.diff(s.x, axis=0), axis=1)
     share = (np.append(0, edge) + np.append(edge, 0)) / 2
@@ -278,7 +284,7 @@ def test_the_forces_of_a_row_are_in_equilibrium(basis):
 @pytest.mark.parametrize("basis", BASES)
 @pytest.mark.parametrize("n", [5, 40])
 def test_on_curved_sides_the_forces_of_a_row_have_no_moment(n, basis):
-    """A circular slave over a parabolic master that covers its ends in part."""
+    """A parabolic master covers a part of each end segment of a circular slave."""
     t, x = np.linspace(-0.6, 0.5, n + 1), np.linspace(0.5, -0.55, 9 * n // 10 + 1)
     slave = np.column_stack([np.sin(t), -np.cos(t)])
     master = np.column_stack([x, 0.1 * x**2 - 1.05])
@@ -296,7 +302,8 @@ def test_on_curved_sides_the_forces_of_a_row_have_no_moment(n, basis):
 def test_on_straight_sides_rows_are_those_with_the_normal_outside_of_the_integrals(
     basis,
 ):
-    """n_jᵀ[(D u_s)_j − (M u_m)_j] with scalar D and M, as in Popp, Gee and Wall."""
+    """The expected rows are n_jᵀ[(D u_s)_j − (M u_m)_j] with scalar D and M, as in
+    Popp, Gee and Wall."""
     slave = turned(flat(7, 0.05, rightwards=True), 0.3)
     master = turned(flat(5, 0.0, rightwards=False, left=-0.1, right=0.93), 0.3)
     s, m = sides(slave, master)
@@ -317,7 +324,7 @@ def test_on_straight_sides_rows_are_those_with_the_normal_outside_of_the_integra
     assert c == pytest.approx(np.full(8, 0.05), abs=1e-15)
 
 
-# the paper's geometry and reach -------------------------------------------------------
+# geometry and reach of the benchmark --------------------------------------------------
 
 
 @pytest.mark.parametrize("basis", BASES)
@@ -327,7 +334,8 @@ def test_on_straight_sides_rows_are_those_with_the_normal_outside_of_the_integra
      *((Nr, Nh, 1) for Nr in (1, 2, 5, 8) for Nh in (1, 2, 3, 7))],
 )  # fmt: skip
 def test_before_loading_no_weighted_gap_of_the_paper_is_negative(mesh, basis):
-    """Beam and ring are 0.01 m apart; a chord of the arc is farther, never nearer."""
+    """Beam and ring are 0.01 m apart, and chords of the arc are farther from the beam
+    than the arc."""
     bodies = model(*mesh, "strain")
     points, (pair,) = bodies.mesh.points, bodies.pairs
     B, c, *_ = mortar(points, np.zeros(points.size), *pair.sides, basis=basis)
@@ -337,7 +345,7 @@ def test_before_loading_no_weighted_gap_of_the_paper_is_negative(mesh, basis):
 
 
 def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
-    """Three quarters of a circle 1 cm above a plate that ends 100 km away."""
+    """The slave is three quarters of a circle, 1 cm above a plate of 200 km length."""
     theta = np.linspace(-0.75 * np.pi, 0.75 * np.pi, 61)
     arc = np.column_stack([np.sin(theta), -np.cos(theta)])
     plate = np.array([[1e5, -1.01], [-1e5, -1.01]])
@@ -352,7 +360,7 @@ def test_rays_that_graze_a_far_master_would_give_negative_weighted_gaps():
 
 @pytest.mark.parametrize(("distance", "kept"), [(0.2, 0), (0.35, 1)])
 def test_a_segment_that_is_partly_out_of_reach_does_not_count(distance, kept):
-    """A slave from 0 to 1, and a master above it that rises from 0.1 to 0.3."""
+    """The slave extends from 0 to 1; the master above it rises from 0.1 to 0.3."""
     s, m = sides([[1, 0], [0, 0]], [[0, 0.1], [1, 0.3]])
     at = cast_rays(s, m, overlaps(s, m), Reach(distance=distance, cosine=1.0))
 
@@ -370,7 +378,8 @@ def test_segments_farther_than_the_reach_do_not_count(distance, kept, height):
 
 
 def test_only_covered_nodes_get_a_row():
-    """The master ends in the fifth of ten segments: nodes 0 to 5 are covered."""
+    """The master ends within the fifth of ten segments, so that nodes 0 to 5 are
+    covered."""
     B, *_ = rows(flat(10, 0.1, rightwards=True),
                 flat(3, 0.0, rightwards=False, right=0.45))  # fmt: skip
 
@@ -422,7 +431,7 @@ def test_odd_shapes_give_finite_rows(shape, basis):
         "zigzag": ([[0, 0], [1, 0], [0.5, 0], [1.5, 0]],
                    [[2, -1], [1, -1], [1.5, -1], [-1, -1]]),
         "touching": ([[0, 0], [1, 0], [2, 0]], [[2, 0], [1, 0], [0, 0]]),
-        # beyond the point where the normals of a convex slave meet, inside its body
+        # the master is beyond the point where the normals of the slave meet
         "focus": ([[-1, 0.2], [0, 0], [1, 0.2]], [[2, 9], [-2, 9]]),
     }[shape]  # fmt: skip
     B, c, *_ = rows(np.array(slave, float), np.array(master, float), basis=basis,
@@ -442,7 +451,8 @@ def test_a_master_deeper_than_the_focus_of_the_normals_is_not_met():
 @pytest.mark.parametrize("across", [-0.1, 0.1])
 @pytest.mark.parametrize("downwards", [True, False])
 def test_a_master_through_the_focus_of_the_normals_is_met_below_it(across, downwards):
-    """The normals of the middle segment lean by 22.5° and meet at (0, 1 + √2)."""
+    """The normals of the middle segment are inclined by 22.5° and meet at (0,
+    1 + √2)."""
     master = np.array([[across, 9.0], [across, -1.0]])
     s, m = sides([[-2, 1], [-1, 0], [1, 0], [2, 1]],
                  master if downwards else master[::-1])  # fmt: skip

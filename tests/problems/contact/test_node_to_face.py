@@ -1,4 +1,4 @@
-"""Node-to-face contact, against the plane, brute force and rigid motions."""
+"""Node-to-face contact, compared with plane contact, brute force and rigid motions."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,8 @@ def test_closest_points_of_triangles_are_those_of_a_fine_search():
 
 
 def extruded(chain, layers, width):
-    """Return points (v·layers, 3) and faces of a chain (v, 2) in x and z, along y."""
+    """Return points (v·layers, 3) and faces of a chain (v, 2) in x and z, extruded
+    along y."""
     v = len(chain)
     y = np.linspace(0, width, layers)
     points = np.array([[x, depth, z] for depth in y for x, z in chain])
@@ -63,7 +64,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
         tangential=tangential,
     )  # fmt: skip
 
-    # the displacement of the plane in every layer
+    # every layer has the displacement of the plane problem
     motion = RNG.standard_normal(flat.shape)
     in_space = np.zeros_like(points)
     in_space[:, [0, 2]] = np.concatenate(

@@ -1,4 +1,4 @@
-"""Contact with rigid bodies: gaps, normals, derivatives; surfaces in space."""
+"""Contact with rigid bodies (gaps, normals, derivatives), and surfaces in space."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ BLOCK = box((0.0, 0.0, 0.0), (1.0, 1.5, 0.5), (2, 3, 1))
 
 
 def closest(body, x):
-    """Return the closest point of the surface to x."""
+    """Return the point on the surface of a rigid body that is closest to x."""
     if isinstance(body, RigidPlane):
         n = np.array(body.normal)
         return x - n * ((x - body.point) @ n)
@@ -56,7 +56,7 @@ def test_gaps_are_signed_distances_and_normals_their_gradients(name):
 
 @pytest.mark.parametrize("name", BODIES)
 def test_rows_are_the_gap_to_first_order(name):
-    """c − B(u + h) = g(x + h) + O(h²), where the rest of a plane is rounding."""
+    """c − B(u + h) = g(x + h) + O(h²); for planes, only rounding errors remain."""
     body, rng = BODIES[name], np.random.default_rng(17)
     u, h = 0.1 * rng.standard_normal((2, BLOCK.dofs))
     side = BLOCK.boundaries["bottom"]
@@ -100,7 +100,8 @@ def test_tangents_in_space_are_orthonormal_and_right_handed():
 
 
 def test_slip_over_a_plane_is_the_motion_along_it():
-    """The slip is u_x over y = 0 in the plane, and (u_x, u_y) over z = 0 in space."""
+    """The slip is u_x on the plane y = 0 in two dimensions, and (u_x, u_y) on z = 0 in
+    space."""
     for mesh, ground in (
         (rectangle((0, 0), (1, 1), (3, 1)), RigidPlane((0.0, 0.0), (0.0, 1.0))),
         (BLOCK, RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))),
@@ -129,7 +130,7 @@ def test_normals_and_areas_of_a_side_in_space_follow_its_rotation():
         assert side.normal == pytest.approx(np.tile(turn[:, 2], (len(facets), 1)))
         assert side.node_normal == pytest.approx(np.tile(turn[:, 2], (12, 1)))
         assert side.areas.sum() == pytest.approx(1.5)
-    # an edge of a body, where two sides meet, has the mean of their normals
+    # nodes on the edge between two sides have the mean of both normals
     corner = np.concatenate([BLOCK.boundaries["top"], BLOCK.boundaries["right"]])
     side = current_surface(BLOCK.points, np.zeros(BLOCK.dofs), corner, "slave")
     on_edge = (side.x[:, 0] == 1) & (side.x[:, 2] == 0.5)

@@ -1,4 +1,4 @@
-"""Closest-point search, compared with all pairs, and its number of visits."""
+"""Closest-point search: comparison with all pairs, and number of visited chords."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from mortarbench.problems.contact.surface import surface
 
 
 def all_pairs(x, chain):
-    """Return the distance of each point from each segment, (s, e)."""
+    """Return the distances (s, e) of all points from all segments."""
     edge = np.diff(chain, axis=0)
     offset = x[:, None] - chain[:-1]
     xi = np.einsum("sex,ex->se", offset, edge) / (edge**2).sum(axis=1)
@@ -58,7 +58,7 @@ def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
 
 
 def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
-    """Every four segments return to their start: their chord has no direction."""
+    """Sub-chains of four segments are closed, so that their chords have length zero."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])
     closest = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), surface(loops, "m"))
@@ -76,7 +76,7 @@ def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
 
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_far_queries_visit_few_chords_each(segments, monkeypatch):
-    """The flanks of the ring are 0.5 m from a beam of segments of 1 mm."""
+    """The flanks of the ring are 0.5 m from a beam with segments of 1 mm."""
     visited = []
     distances = search._to_chords
 
@@ -92,7 +92,8 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
 
 @pytest.mark.parametrize("segments", SIZES)
 def test_facing_segments_are_found_among_all_pairs(segments):
-    """Pairs with a point on the inner side of each of the normals, by (x − p) × n."""
+    """A pair faces each other if it has points on the inner side of both end normals,
+    according to the sign of (x − p) × n."""
     rng = np.random.default_rng(577215)
     bent = arc(40) + 0.002 * rng.standard_normal((41, 2))
     slave, master = surface(bent, "s"), surface(bent_beam(segments), "m")
@@ -130,7 +131,7 @@ def test_an_invalid_reach_is_refused(wrong, message):
 def test_by_default_the_larger_side_bounds_the_distance():
     small, large = surface(arc(4, 0.1), "s"), surface(arc(4, 2.0), "m")
 
-    expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
+    expected = 2 * np.sqrt(5)  # the bounding box of a half circle is 2r × r
     assert Reach().max_distance(small, large) == pytest.approx(expected)
     assert Reach().max_distance(large, small) == pytest.approx(expected)
     assert Reach(distance=0.25).max_distance(small, large) == 0.25

@@ -1,4 +1,4 @@
-"""Results per contact pair, compared with equilibrium and Hertz."""
+"""Results of contact pairs, compared with equilibrium and Hertz's solution."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
 
 
 def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
-    """The force of a row of the dual basis is slightly negative beside its node."""
+    """Rows of the dual basis exert slightly negative forces on neighbouring nodes."""
     case = disc_between_plates(8, contact="mortar", basis="dual", rollers=True)
     s = Clarabel().prepare(case.qp, 1e-10)()
     active = np.split(s.z > 1e-6 * s.z.max(), 2)
@@ -88,7 +88,8 @@ def test_the_pressure_along_the_side_is_that_of_hertz():
 
 
 def test_a_node_without_a_row_has_no_gap_and_no_pressure():
-    """Blocks displaced by half their width: half of the slave side faces no master."""
+    """The upper block is shifted by half its width, so that half of the slave side
+    faces no master."""
     bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
     bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
     rows = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))

@@ -1,4 +1,4 @@
-"""The dual of torn bodies has the solution of the whole body for every gluing."""
+"""For every gluing, the dual of torn bodies has the solution of the whole body."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Newton's method at finite strain with contact: orders, convexity, load steps."""
+"""Newton's method at finite strain with contact: convergence, convexity, load steps."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -42,7 +42,7 @@ def residuals(path, k=1):
 
 
 def settled(path, k=1):
-    """Residuals after the last change of the active rows."""
+    """Return the residuals after the last change of the set of active rows."""
     active = [i.answer.z > 1e-6 * i.answer.z.max() for i in path.iterations(k)]
     last = max(
         (j for j in range(1, len(active)) if (active[j] != active[j - 1]).any()),
@@ -52,7 +52,7 @@ def settled(path, k=1):
 
 
 def test_the_geometric_stiffness_is_the_derivative_of_the_contact_forces():
-    """Against central differences of Bᵀλ, with gaps of either sign."""
+    """Blocks are compared with central differences of Bᵀλ; gaps have either sign."""
     points = np.array(
         [[0, 0], [1, 0.1], [2, 0], [3, -0.2], [0.5, -0.2], [1.4, 0.3], [2.6, -0.05]]
     )
@@ -128,7 +128,8 @@ def test_the_equilibrium_does_not_depend_on_how_it_is_found():
     ],
 )
 def test_no_emitted_qp_has_negative_curvature(path):
-    """By all eigenvalues; two of these paths have tangents that are not definite."""
+    """All eigenvalues are computed; on two of the paths, some exact tangents are
+    indefinite."""
     path = path()
     for k in range(1, path.steps + 1):
         for step in path.iterations(k):
@@ -139,7 +140,8 @@ def test_no_emitted_qp_has_negative_curvature(path):
 
 
 def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
-    """Without the contact below them, pressed blocks would rotate."""
+    """The tangent of compressed blocks is indefinite, because it does not include the
+    contact that prevents rotations."""
     clipped = [i.clipped for i in patch_path(stretch=0.6).iterations(1)]
 
     assert clipped[0] == 0
@@ -148,7 +150,8 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
 
 @pytest.fixture(scope="module")
 def equilibrium():
-    """A path, its last configuration and the multipliers (places,) there."""
+    """Return a path, its last configuration and the multipliers (places,) of the
+    latter."""
     path = patch_path(contact="nts")
     last = path.iterations(1)[-1]
     lam = path._at_places(last)
@@ -164,7 +167,8 @@ def test_the_residual_holds_the_largest_penetration(equilibrium):
     open_row = int(np.argmin(lam[at.rows.place]))
     gap[open_row] = -0.25
     free = lam.copy()
-    free[at.rows.place[open_row]] = 0.0  # no multiplier: it is no gap under one
+    # without a multiplier, only the penetration counts
+    free[at.rows.place[open_row]] = 0.0
     balanced = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
     assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
 
@@ -185,7 +189,7 @@ def test_the_residual_holds_gaps_under_multipliers_by_their_share(equilibrium):
 
 
 def test_the_residual_without_contact_forces_is_that_of_the_load(equilibrium):
-    """‖r‖ over the load; r on supports does not count."""
+    """The residual is ‖r‖/‖load‖, and components of r at supports do not count."""
     path, at, lam = equilibrium
     load, held = path.bodies.f, path.bodies.B_D.indices
     r = 0.125 * load
@@ -199,7 +203,7 @@ def test_the_residual_without_contact_forces_is_that_of_the_load(equilibrium):
 
 
 class OneUnknown(newton.NewtonPath):
-    """A line search whose energies and gaps are tables over u."""
+    """Path with one unknown u, whose energies and gaps are tabulated."""
 
     def _configuration(self, u, load_factor, gaps):
         energy, gap = self.reference[float(u[0])]
@@ -219,14 +223,14 @@ def configuration(u, energy, gap, r=-1.0, strain_energy=0.0):
 @pytest.mark.parametrize(
     ("table", "length"),
     [
-        # slope −1 − 2·½ = −2 from a merit of 0 + 2·½: 1 − 2e-4 is enough at length 1
+        # slope −1 − 2·½ = −2, merit 0 + 2·½ = 1: 1 − 2e-4 suffices at length 1
         ({1.0: (-2.1e-4, -0.5)}, 1.0),
         ({1.0: (-1.9e-4, -0.5), 0.5: (-1.1e-4, -0.5)}, 0.5),
         ({1.0: (-1.9e-4, -0.5), 0.5: (-0.9e-4, -0.5), 0.25: (-1e-4, -0.5)}, 0.25),
-        # energy may grow where penetration, times its weight, falls by more
+        # energy may increase by less than the weighted decrease of the penetration
         ({1.0: (0.9, 0.0)}, 1.0),
         ({1.0: (0.9, -0.1), 0.5: (0.5, -0.2)}, 0.5),
-        # a gap that opens gains nothing
+        # an open gap does not reduce the merit function
         ({1.0: (1.1, 5.0), 0.5: (0.9, 0.5)}, 0.5),
     ],
 )
@@ -256,7 +260,7 @@ def test_a_full_step_that_halves_the_least_residual_is_taken_whatever_it_costs()
 
 
 def searched(table, start, best=1.5, weight=2.0, steps=1):
-    """Return the length of a step from u = 0 to 1."""
+    """Return the step length of a line search from u = 0 towards u = 1."""
     path = OneUnknown(bodies=None, cells=None, gaps=None, reference=table, steps=steps)
     posed = SimpleNamespace(
         load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
@@ -265,13 +269,13 @@ def searched(table, start, best=1.5, weight=2.0, steps=1):
 
 
 def test_only_a_full_step_may_halve_the_residual_instead():
-    """After half a step the residual is 1 of 4, but the merit function grows."""
+    """Half a step reduces the residual from 4 to 1 but increases the merit function."""
     table = {1.0: (9.0, 0.0), 0.5: (1.0, 0.0), 0.25: (-1.0, 0.0)}
     assert searched(table, configuration(0.0, 0.0, 0.0), best=4.0, steps=2) == 0.25
 
 
 def test_a_direction_uphill_may_not_raise_the_merit_function():
-    """Its slope of +1 would allow 1e-4."""
+    """With the slope +1, Armijo's condition alone would admit an increase of 1e-4."""
     table = {1.0: (5e-5, 0.0), 0.5: (-1e-9, 0.0)}
     assert searched(table, configuration(0.0, 0.0, 0.0, r=1.0)) == 0.5
 
@@ -279,7 +283,8 @@ def test_a_direction_uphill_may_not_raise_the_merit_function():
 @pytest.mark.parametrize("strain", [-1.0, 1.0])
 @pytest.mark.parametrize("potential", [-1.0, 1.0])
 def test_rounding_of_the_energies_does_not_shorten_a_step(strain, potential):
-    """At energies of 1, an increase by 12 eps is rounding, by 1000 eps it is not."""
+    """If energies are of order 1, an increase of 12 eps counts as rounding, but an
+    increase of 1000 eps does not."""
     start = configuration(0.0, potential, 0.0, r=0.0, strain_energy=strain)
     eps = np.finfo(float).eps
     for more, length in ((12 * eps, 1.0), (1000 * eps, 0.5)):
@@ -288,7 +293,7 @@ def test_rounding_of_the_energies_does_not_shorten_a_step(strain, potential):
 
 
 class Loaded(newton.NewtonPath):
-    """Load path on which only steps up to `reference` reach an equilibrium."""
+    """Load path on which increments of at most `reference` reach an equilibrium."""
 
     _kernel_defect = ""
 
@@ -315,9 +320,9 @@ def loaded(largest, k=1, steps=1):
 
 
 def test_a_load_step_is_halved_until_its_parts_are_small_enough():
-    """Step 3 of 4 goes from ½ to ¾."""
+    """Step 3 of 4 increases the load factor from ½ to ¾."""
     path = Loaded(bodies=None, cells=[], gaps=None, reference=2.0)
-    assert path._load_step(1) == (1.0, 1)  # one step unless told
+    assert path._load_step(1) == (1.0, 1)  # `steps` is 1 by default
     assert loaded(0.3, k=3, steps=4) == (1, [0.75])
     assert loaded(0.07, k=3, steps=4) == (
         4, [0.75, 0.625, 0.5625, 0.625, 0.6875, 0.75],
@@ -326,7 +331,7 @@ def test_a_load_step_is_halved_until_its_parts_are_small_enough():
 
 @pytest.mark.parametrize(("k", "steps"), [(1, 1), (2, 3), (3, 7)])
 def test_the_smallest_part_of_a_load_step_is_its_256th(k, steps):
-    """The last part ends exactly at the load of the step, despite rounding."""
+    """Despite rounding, the last increment ends exactly at the load of the step."""
     parts, asked = loaded(1.01 / 256 / steps, k, steps)
     assert parts == 256
     assert asked[-1] == k / steps
@@ -338,7 +343,7 @@ def test_the_smallest_part_of_a_load_step_is_its_256th(k, steps):
 def test_a_step_that_fails_is_tried_down_to_its_256th():
     asked = []
     path = Loaded(bodies=None, cells=asked, gaps=None, reference=0.0)
-    with pytest.raises(InputError, match="the load factor 0; beyond it, no; expected"):
+    with pytest.raises(InputError, match="an equilibrium was 0; no; expected"):
         path._load_step(1)
     assert asked == [2.0**-i for i in range(9)]
 
@@ -398,7 +403,7 @@ class Iterated(newton.NewtonPath):
 
 
 def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
-    """Return the result of one load, and the arguments of its iterations."""
+    """Return the result of `_solve_load` at one load, and a log of the iterations."""
     log = {"posed": [], "weights": [], "moves": moves, "lam": lam}
     gaps = newton.Gaps(linearise=None, keep_segments=keep_segments)
     bodies = SimpleNamespace(length=2.0)
@@ -412,7 +417,7 @@ def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
 @pytest.mark.parametrize(
     ("length", "residual", "settled"),
     [
-        (1.0, 1.9e-9, True),  # 1e-9 for the problem and as much for rounding
+        (1.0, 1.9e-9, True),  # 1e-9 is the tolerance, and 1e-9 the rounding
         (1.0, 2.1e-9, False),
         (0.5, 0.0, False),
     ],
@@ -428,7 +433,7 @@ def test_full_steps_settle_to_the_tolerance_and_rounding(length, residual, settl
 def test_a_load_has_a_number_of_iterations():
     message, log = iterated(lambda n: (1.0, 1.0))
     assert len(log["posed"]) == newton.MAX_ITERATIONS
-    assert message == "at 1, 60 iterations left a residual of 1.0e+00"
+    assert message == "at the load factor 1, 60 iterations left a residual of 1.0e+00"
 
 
 def test_weights_are_above_all_multipliers_so_far_however_small():
@@ -441,7 +446,8 @@ def test_weights_are_above_all_multipliers_so_far_however_small():
 
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e3])
 def test_pressing_nodes_keep_their_segments_if_the_iteration_stalls(size):
-    """After 20 iterations, with the displacement in m, scaled by the length 2."""
+    """After 20 iterations, `keep_segments` is called with the displacement in m, that
+    is, multiplied by the length 2."""
     kept = []
 
     def keep_segments(u, pressing):
@@ -479,7 +485,7 @@ def test_shares_of_multipliers_do_not_depend_on_their_size(equilibrium):
 
 
 def small_bodies(K, f):
-    """Bodies with supports at the last component."""
+    """Return bodies with stiffness K and load f, supported at the last component."""
     return SimpleNamespace(
         K=csr_array(K), f=np.array(f), mesh=SimpleNamespace(dofs=len(K)),
         B_D=csr_array(np.eye(len(K))[-1:]),
@@ -487,7 +493,10 @@ def small_bodies(K, f):
 
 
 def test_rounding_is_bounded_by_that_of_forces_within_cells(equilibrium):
-    """2 eps |K||u| relative to the load; here |K||u| = (8, 8), the second fixed."""
+    """The bound is 2 eps |K|·|u| relative to the load, with |K|·|u| = (8, 8).
+
+    The second component is fixed, so that it does not count.
+    """
     K = np.array([[2.0, -2.0], [-2.0, 2.0]])
     bodies = small_bodies(K, [0.25, 7.0])
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
@@ -502,7 +511,7 @@ def test_rounding_is_bounded_by_that_of_forces_within_cells(equilibrium):
     ("load", "factor", "share"), [(1e-7, 0.5, 16 / 0.5e-7), (0.0, 0.5, 16)]
 )
 def test_advice_states_rounding_relative_to_the_load(load, factor, share, monkeypatch):
-    """Cells of size 2 and |K|·1 = (8, 8), the second component fixed."""
+    """Cells have the size 2, |K|e is (8, 8), and the second component is fixed."""
     monkeypatch.setattr(newton, "TOLERANCE", 1e-16)
     bodies = small_bodies(np.array([[4.0, -4.0], [-4.0, 4.0]]), [load, 7.0])
     cells = SimpleNamespace(volumes=np.array([[3.0, 1.0], [2.0, 2.0]]))
@@ -514,7 +523,7 @@ def test_advice_states_rounding_relative_to_the_load(load, factor, share, monkey
 
 
 def test_the_qp_of_an_iteration_models_the_potential():
-    """At u^j the objective and its constant are Π, and so is the gradient."""
+    """At u^j, the quadratic model and Π have equal values and gradients."""
     path = plane_path()
     for i in path.iterations(1):
         at = path._configuration(i.u, i.load_factor, i.gaps)
@@ -525,7 +534,7 @@ def test_the_qp_of_an_iteration_models_the_potential():
 
 
 def curved(path, size):
-    """A path whose contact has a stiffness of this size at two components."""
+    """Return the path with a contact stiffness `size` at two components, and these."""
     dofs = np.setdiff1d(np.arange(path.bodies.mesh.dofs), path.bodies.B_D.indices)
 
     def curvature(u, lam):
@@ -541,14 +550,14 @@ def test_contact_stiffness_that_leaves_the_tangent_definite_is_part_of_it():
     lam = np.zeros(path._places)
     plain, _, clipped = path._convex(at, lam, None)
     assert clipped == 0
-    unit = path.bodies.force / path.bodies.length  # Pa·m of stiffness one
-    # the last one alone is raised, to a millionth of its size
+    unit = path.bodies.force / path.bodies.length  # stiffness 1 in Pa·m
+    # only the last one is indefinite; it is raised to a millionth of its magnitude
     for size, expected in ((-1e-3, -1e-3), (1.0, 1.0), (-1e9, 1e3)):
         bent, (i, j) = curved(path, size * unit)
         K, _, clipped = bent._convex(at, lam, bent.gaps.curvature)
-        assert clipped == 0  # no cell has to give for contact
+        assert clipped == 0  # cell tangents are unchanged
         difference = (K - plain).toarray()
-        held = path.bodies.B_D.indices  # ρ goes with the largest diagonal entry
+        held = path.bodies.B_D.indices  # ρ is the largest diagonal entry
         difference[held, held] = 0
         difference[[i, j], [i, j]] -= expected
         assert abs(difference).max() <= 1e-12 * abs(K).max()
@@ -645,7 +654,7 @@ def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
         return move(self, at, posed, lam, weight, best)
 
     monkeypatch.setattr(newton.NewtonPath, "_line_search", spied)
-    hertz._newton_path.cache_clear()  # another test may have solved it
+    hertz._newton_path.cache_clear()  # another test may have cached it
     plane_path().iterations(1)
     assert len(seen) >= 3
     largest = np.maximum.accumulate([most for most, _ in seen])
@@ -677,7 +686,7 @@ def test_a_load_step_that_fails_comes_in_parts(monkeypatch):
 
 
 def test_the_line_search_decreases_the_penalty_function():
-    """At one load step the first full step lengthens the beam."""
+    """In a single load step, some step lengths are below 1."""
     path = ring_path(steps=1, size=4)
     steps = path.iterations(1)
     weight = 2 * max(i.answer.z.max() for i in steps)
@@ -696,9 +705,9 @@ def test_an_impossible_load_says_where_it_stopped(monkeypatch):
 
     with pytest.raises(
         InputError,
-        match=r"^load step 1 of 1: the last equilibrium is that at the load factor "
-        r"[\d.]+; beyond it, at [\d.]+, iteration \d+ ended with a residual of .*: "
-        r"cell \d+ is inverted: det F = .*; expected a smaller load",
+        match=r"^load step 1 of 1: the largest load factor with an equilibrium was "
+        r"[\d.]+; at the load factor [\d.]+, iteration \d+ ended with a residual of "
+        r".*: cell \d+ is inverted: det F = .*; expected a smaller load",
     ):
         path.iterations(1)
 
@@ -706,14 +715,15 @@ def test_an_impossible_load_says_where_it_stopped(monkeypatch):
 def test_advice_is_a_larger_load_for_tiny_loads_and_a_smaller_one_otherwise(
     monkeypatch,
 ):
-    """A tiny load has an equilibrium, that of linear elasticity; F does not show it."""
+    """Under a tiny load, the equilibrium of linear elasticity exists, but rounding
+    errors of F exceed the strains."""
     monkeypatch.setattr(newton, "MAX_HALVINGS", 0)
     monkeypatch.setattr(newton, "MAX_ITERATIONS", 5)
     with pytest.raises(InputError, match=r"expected a larger load, or kinematics=lin"):
         plane_path(load=1e-3).iterations(1)
     monkeypatch.setattr(newton, "MAX_ITERATIONS", 1)
     with pytest.raises(InputError, match=r"expected a smaller load"):
-        plane_path(load=9.0).iterations(1)  # no other test has kept its iterations
+        plane_path(load=9.0).iterations(1)  # not cached by another test
 
 
 def test_an_iteration_that_is_not_there_is_refused():
@@ -733,7 +743,7 @@ def test_supports_that_leave_a_rotation_are_refused():
 
 
 def test_paths_are_those_of_the_keys():
-    """The path depends on all keys, and the steps select the load."""
+    """The path depends on all keys, and the key `step` selects the load."""
     case = BeamRing().build(
         "dual",
         BeamRing().complete({
@@ -748,7 +758,8 @@ def test_paths_are_those_of_the_keys():
 
 
 def test_a_node_between_two_segments_keeps_one_of_them():
-    """In step 6 a node of the ring alternates between segments at a vertex."""
+    """In step 6, a node of the ring alternates between two segments that share a
+    vertex."""
     path = beam_ring._newton_path(
         (6, 4, 8, "strain"), ("nts", "dual"), 10, "neo-hooke", "geometric",
         reference_solution,

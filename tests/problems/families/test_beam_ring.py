@@ -1,4 +1,4 @@
-"""The paper's benchmark, compared with its counts, equations and independent codes."""
+"""The benchmark of the paper, compared with its counts and with independent codes."""
 
 from dataclasses import replace
 
@@ -48,7 +48,8 @@ def test_counts_of_table_1():
 
 @pytest.mark.parametrize(("radial", "nodes"), [(6, 424), (3, 313)])
 def test_the_papers_313_nodes_belong_to_half_as_many_radial_layers(radial, nodes):
-    """Erratum: text and Table 1 imply 2·Nh layers, Figure 2 shows Nh."""
+    """The text and Table 1 of the paper imply 2·Nh radial layers; its Figure 2 shows
+    Nh."""
     assert len(model(4, 3, radial, "strain").mesh.points) == nodes
 
 
@@ -64,7 +65,8 @@ ORACLE = {"tip": [0.03884621, -0.29506529], "sum": 1.855250e8, "rows": 37, "acti
 @pytest.mark.parametrize("solver", [SMALBE(), Clarabel(), OSQP(), ProxQP()], ids=repr)
 @pytest.mark.parametrize("form", FAMILY.forms)
 def test_one_linearisation_has_the_digits_of_an_independent_code(form, solver):
-    """The digits are those of nodal contact in GetFEM 5.4 on the same meshes."""
+    """The expected digits are those of nodal contact in GetFEM 5.4 on the same
+    meshes."""
     case = build(form, Nr=4, Nh=3, steps=1)
     if solver.declines(case.qp):
         assert (form, type(solver)) == ("primal", SMALBE)
@@ -82,7 +84,7 @@ def test_one_linearisation_has_the_digits_of_an_independent_code(form, solver):
     [("dual", SMALBE(), 1e-9), ("dual-bounds", SMALBE(), 1e-9),
      ("dual", OSQP(), 1e-9), ("primal", OSQP(), 1e-9),
      ("dual", ProxQP(), 1e-9), ("primal", ProxQP(), 1e-9),
-     # an interior point keeps λ > 10⁻⁶ max λ on nearly touching rows until 1e-10
+     # interior-point methods have λ ≤ 10⁻⁶ max λ on open rows only at 1e-10
      ("dual", Clarabel(), 1e-10), ("primal", Clarabel(), 1e-10)],
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )  # fmt: skip
@@ -97,7 +99,8 @@ def test_ten_steps_on_the_papers_largest_mesh(form, solver, tol):
 
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 def test_every_form_gives_the_same_displacement_energy_and_multipliers(plane):
-    """The recovered points satisfy the KKT conditions of the primal problem (1)."""
+    """The dual forms have equal displacements, energies and contact forces, and the
+    primal objective at their displacement is the same energy."""
     keys = dict(Nr=4, Nh=3, steps=3, step=2, plane=plane)
     cases = {form: build(form, **keys) for form in FAMILY.forms}
     bounds = reference_solution(cases["dual-bounds"].qp)
@@ -183,7 +186,8 @@ def test_sizes_beyond_the_index_type_are_refused_before_any_work(Nr, Nh):
 
 
 def test_forces_are_in_equilibrium():
-    """Load, contact force and the clamp's reaction balance on the beam."""
+    """On the beam, the load, the contact force and the reactions of the clamp
+    balance."""
     case = build("dual", Nr=4, Nh=3, steps=2)
     s = SMALBE().prepare(case.qp, 1e-11)()
     bodies = model(4, 3, 6, "strain")
@@ -196,11 +200,11 @@ def test_forces_are_in_equilibrium():
 
 
 def test_no_contact_no_force():
-    """Under an upward load the beam does not touch the ring: λ_I = 0 exactly."""
+    """Under an upward load, the beam does not touch the ring, and λ_I = 0 exactly."""
     case = build("dual-bounds", Nr=4, Nh=3, steps=1)
     primal = build("primal", Nr=4, Nh=3, steps=1)
     gaps = primal.qp.h
-    lifted = replace(case.qp, q=2 * gaps - case.qp.q)  # load reversed: c − B K⁻¹(−f)
+    lifted = replace(case.qp, q=2 * gaps - case.qp.q)  # reversed load: c − B K⁻¹(−f)
 
     assert (gaps > 0).all()
     assert (reference_solution(lifted).x == 0).all()
@@ -214,7 +218,7 @@ def test_the_load_of_a_step_is_its_share():
 
 
 CONVERGED = [
-    # contact Nr plane: u(2, 0.5), u(1, 0.75) in m; ΣBᵀλ in 10⁷ N/m; active rows
+    # contact, Nr, plane; u(2, 0.5) and u(1, 0.75) in m; ΣBᵀλ in 10⁷ N/m; active rows
     ("nts 10", (-0.03723, -0.29317, 0.01777, -0.04142), (3.0963, 18.0797), 8),
     ("nts 20", (-0.03739, -0.29423, 0.01782, -0.04148), (3.0632, 18.0928), 16),
     ("nts 30", (-0.03742, -0.29446, 0.01783, -0.04151), (3.0771, 18.0904), 24),
@@ -236,7 +240,8 @@ CONVERGED = [
 def test_linearised_to_convergence_it_has_the_reference_values(
     problem, u, force, active
 ):
-    """Computed with an independent prototype of the same discretisation."""
+    """The reference values are those of an independent prototype of the same
+    discretisation."""
     contact, size, plane = (*problem.split(), "strain")[:3]
     Nr = int(size)
     keys = dict(Nr=Nr, Nh=Nr // 2, steps=1, relin=14, plane=plane, contact=contact)
@@ -252,9 +257,11 @@ def test_linearised_to_convergence_it_has_the_reference_values(
 
 
 def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
-    """Tip deflection against that of the converged linearisation: halving the load step
-    halves the error; three linearisations of one full load step leave less than ten
-    steps do."""
+    """The tip deflection is compared with that of the converged linearisation.
+
+    Halving the load step halves the error. Three linearisations of a single load step
+    have a smaller error than ten load steps.
+    """
 
     def tip(**keys):
         case = build("dual-bounds", Nr=10, Nh=5, **keys)
@@ -302,7 +309,7 @@ def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
 
 
 def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
-    """Verified at tol 1e-8, to 1e-6 relative; primal and dual."""
+    """Primal and dual solutions, verified at tol 1e-8, agree to 1e-6."""
     suite = load_suite(suites_folder() / "demo.toml", PROBLEMS, SOLVERS)
     energies = {}
     for name in (case for case in suite.cases if case.family.name == FAMILY.name):
@@ -315,12 +322,12 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
 
     assert len(energies) == 6
     for values in energies.values():
-        assert len(values) == 6  # SMALBE on the dual, Clarabel on both, each two ways
+        assert len(values) == 6  # three solutions, each with two energies
         assert values == pytest.approx(values[:1] * 6, rel=1e-6)
 
 
 def in_space(form="dual", tol=1e-11, **keys):
-    """Return the quantities of a coarse benchmark."""
+    """Return the quantities of a coarse benchmark, in space if `depth` is positive."""
     keys = dict(Nr=2, Nh=2, steps=2) | keys
     params = FAMILY.complete(keys)
     FAMILY.check(params)
@@ -344,7 +351,7 @@ def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
 
 
 def test_the_difference_of_face_mortar_from_the_plane_falls_like_the_square_of_h():
-    """Faces have one normal each, while normals of the plane are interpolated."""
+    """Each face has a single normal, whereas normals in the plane are interpolated."""
     gaps = []
     for n in (2, 4, 8):
         keys = dict(Nr=n, Nh=n, steps=1, contact="mortar", tol=1e-10)

@@ -1,4 +1,4 @@
-"""The cantilever at finite strain: elastica, convergence, refused keys."""
+"""The cantilever at finite strain: elastica, convergence, rejected keys."""
 
 from dataclasses import replace
 
@@ -27,7 +27,8 @@ def test_the_elastica_has_published_digits(load, deflection, shortening):
 
 @pytest.mark.parametrize("load", [0.01, 3.0, 80.0])
 def test_the_elastica_solves_its_differential_equation(load):
-    """EIθ″ = −P cos θ by a Runge-Kutta method: θ′ at the clamp makes θ′(L) vanish."""
+    """EIθ″ = −P cos θ is solved by a Runge-Kutta method; θ′(0) is chosen so that
+    θ′(L) = 0."""
 
     def along(moment):
         return solve_ivp(
@@ -57,7 +58,7 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
     assert values["clipped_in_step"] == 0
     assert values["load_parts"] == 1
     assert values["residual"] < 1e-8
-    # at the end of Newton's method the model of the QP is the potential itself
+    # at convergence, the quadratic model equals the potential
     s = answer.solution
     emitted_case = case.family_case
     objective = emitted_case.scale * case.qp.objective(s.x) + emitted_case.constant
@@ -66,9 +67,10 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
 
 @pytest.mark.parametrize("material", ["neo-hooke", "svk"])
 def test_newton_converges_quadratically(material):
-    """In the energy norm of the solution, each error is below the square of the last.
+    """In the energy norm, each relative error is at most 30 times the square of its
+    predecessor.
 
-    Times a constant, 25 here once steps are whole.
+    This holds in the last iterations, where the step length is 1.
     """
     bodies = beam(4.0, 2.0, (16, 4), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": material}, None)
@@ -96,14 +98,15 @@ def test_deflections_converge_with_the_square_of_the_size_of_cells():
 
 
 def test_nearly_incompressible_beams_do_not_lock():
-    """Four dilatations per cell would increase the stiffness by ν²/(1 − 2ν)/ny²."""
+    """Full integration would increase the stiffness by the fraction ν²/(1 − 2ν)/ny²."""
     _, answer = emitted("cantilever/nu=0.49/ny=3/slenderness=10/load=1/dual")
 
     assert abs(answer.quantities["deflection_error"]) < 0.06
 
 
 def test_every_iteration_is_a_convex_qp_in_the_total_displacement():
-    """Hessians are positive definite; each QP starts at the end of the line search."""
+    """Hessians are positive definite, and each QP is linearised at the end of the
+    preceding line search."""
     bodies = beam(6.0, 5.0, (24, 2), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
 

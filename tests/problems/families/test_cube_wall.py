@@ -13,7 +13,7 @@ from mortarbench.reports.export.vtu import write_vtu
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: cells: rows, active rows, force on the cube in N, energy in J, u_z(1, 1, 1) in m
+#: by cells: rows, active rows, force on cube in N, energy in J, u_z(1, 1, 1) in m
 DIGITS = {
     4: (20, 15, -32.09439112, -5.0918173385, -2.1165548298e-2),
     20: (420, 317, -34.33006686, -5.1612796061, -2.1484044051e-2),
@@ -69,7 +69,7 @@ def test_pressures_on_the_wall_are_forces_over_the_areas_of_their_nodes():
     touching = side.gap < 1e-9
     assert touching.sum() == 15
     expected = -side.force[touching, 0] / side.length[touching]
-    # along the normal of the deformed side, which is turned by some degrees
+    # the normal of the deformed side is rotated by a few degrees
     assert side.pressure[touching] == pytest.approx(expected, rel=1e-2)
     assert case.quantities(s)["contacts"]["cube on rigid"][
         "pressed_area"

@@ -1,4 +1,4 @@
-"""Elastic families of plug-ins, compared with the built-in family."""
+"""Elastic families of plug-ins, compared with built-in families."""
 
 from dataclasses import replace
 
@@ -44,7 +44,7 @@ def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
     [(FrictionLaw("oily"), "friction 'oily' is unknown; expected one of none, tresca"),
      (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
      (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
-     (FrictionLaw("coulomb", mu=0.3), "expected reference=")],
+     (FrictionLaw("coulomb", mu=0.3), "expected the argument `reference`")],
 )  # fmt: skip
 def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:
@@ -55,7 +55,7 @@ def test_invalid_laws_are_refused_in_one_line(law, message):
 
 
 def test_friction_may_hold_a_load_along_the_side():
-    """Without friction, the shear on the upper block is not balanced."""
+    """Without friction, the tangential load on the upper block is not balanced."""
     bodies = model(PATCH.complete(STRETCHED))
     upper = bodies.body_of_node == 1
     free = ~np.isin(bodies.B_D.indices, 2 * np.flatnonzero(upper))

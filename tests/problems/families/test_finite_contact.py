@@ -1,4 +1,4 @@
-"""Families with kinematics=finite: exact states, all forms, refused keys."""
+"""Families with kinematics=finite: exact states, all forms, rejected keys."""
 
 import json
 from functools import cache
@@ -58,7 +58,8 @@ def quantities(name, form="dual", **keys):
 )
 @pytest.mark.parametrize("slave", ["lower", "upper"])
 def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave):
-    """Neo-Hooke between frictionless plates; digits computed by independent code."""
+    """Neo-Hookean blocks between frictionless plates have the digits of an independent
+    code."""
     got = quantities("contact-patch", stretch=stretch, slave=slave)
 
     np.testing.assert_allclose(got["stretches"], [lateral, stretch], atol=1e-9)
@@ -72,7 +73,8 @@ def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave
 
 @pytest.mark.parametrize("stretch", [0.9, 0.65])
 def test_pressed_blocks_of_st_venant_kirchhoff_are_homogeneous(stretch):
-    """Closed form: λ₁² = 1 + ν/(1 − ν)(1 − λ₂²), P₂₂ = λ₂E/(1 − ν²)·½(λ₂² − 1)."""
+    """The exact state is λ₁² = 1 + ν/(1 − ν)(1 − λ₂²), P₂₂ = λ₂E/(1 − ν²)·½(λ₂² −
+    1)."""
     got = quantities("contact-patch", stretch=stretch, material="svk")
     strain = (stretch**2 - 1) / 2
 
@@ -93,7 +95,8 @@ def test_the_pressure_of_the_family_is_a_nominal_stress():
 
 
 def test_small_loads_differ_from_linear_elasticity_by_their_square():
-    """σ_y = −p exactly where strains are small; u of contact-patch with p ∝ 1 − λ₂."""
+    """The difference between the stretch and its value in linear elasticity is of
+    second order in the load."""
     differences = []
     for stretch in (0.99, 0.995):
         exact = homogeneous(hyperelastic("neo-hooke", Material(E_UPPER, NU)), stretch)
@@ -209,7 +212,7 @@ def test_inconsistent_keys_are_refused_in_one_line(name, message):
 
 
 def test_a_material_that_softens_is_refused_where_it_does():
-    """The largest pressure of St. Venant-Kirchhoff is that at the stretch 1/√3."""
+    """The pressure on this material is largest at the stretch 1/√3."""
     with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):
         built("contact-patch", stretch=0.5, material="svk")
 

@@ -1,4 +1,4 @@
-"""Friction: limits, digits of other codes, and the laws themselves."""
+"""Friction: limits, digits of other codes, and the friction laws themselves."""
 
 from functools import cache
 
@@ -38,7 +38,7 @@ def solved(name):
     return case, s, case.quantities(s)
 
 
-# mu: tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows of 8 active ones
+# mu, tip_y in m, vertical force on the beam in 10⁸ N/m, sticking rows (8 are active)
 DIGITS = [
     (0.1, -0.295871, 1.79947, 1),
     (0.3, -0.29546, 1.7963, 1),
@@ -62,7 +62,8 @@ def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force,
 
 
 def test_an_unreachable_bound_makes_open_rows_stick_as_well():
-    """The other code's limit g → ∞ with all rows of the arc."""
+    """The expected digits are the limit g → ∞ of the other code, with all rows of the
+    arc."""
     _, _, values = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
 
     assert values["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
@@ -157,7 +158,7 @@ def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
         "/primal",
         PROBLEMS,
     ).build(reference_solution)
-    share = np.array([1, 2, 2, 2, 1]) / 8  # of a side of 1 m in four cells
+    share = np.array([1, 2, 2, 2, 1]) / 8  # shares of a side of 1 m with four cells
 
     assert case.mechanics.friction.bound * 1e6 == pytest.approx(2e5 * share)
 
@@ -189,7 +190,8 @@ COULOMB = FrictionLaw("coulomb", mu=0.3)
 
 
 def test_a_block_on_an_incline_slips_at_its_limit():
-    """NAFEMS CGS-4: F/G = (tan α + mu)/(1 − mu tan α), tan α = 0.1, mu = 0.3."""
+    """NAFEMS benchmark CGS-4: F/G = (tan α + mu)/(1 − mu tan α), tan α = 0.1,
+    mu = 0.3."""
     limit = 0.412371
     case = block_on_incline(limit - 4e-4, COULOMB)
     values = case.quantities(reference_solution(case.qp))
@@ -203,7 +205,7 @@ def test_a_block_on_an_incline_slips_at_its_limit():
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
-    """A block of length 1 m carries at most the bound times 1 m."""
+    """On a block of 1 m length, friction balances at most the bound times 1 m."""
     across = (0.2 - 0.1) / np.hypot(1, 0.1) * WEIGHT
     law = FrictionLaw("tresca", bound=share * across)
     if share > 1:
@@ -212,7 +214,7 @@ def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
         assert abs(got[0]) == pytest.approx(across, rel=1e-6)
         return
     message = (
-        r"friction cannot hold the load; within .* nothing balances 0\.\d\d% of it"
+        r"friction cannot hold the load: 0\.\d\d% of the load remains unbalanced within"
     )
     with pytest.raises(InputError, match=message):
         block_on_incline(0.2, law)
@@ -226,7 +228,8 @@ def test_the_limit_of_coulomb_is_refused_in_the_same_words():
 
 
 def test_loads_are_balanced_where_friction_may_hold_them():
-    """Check the balance as `bodies:` do; without friction the block slides."""
+    """The balance is checked as for the family `bodies`; without friction, the block
+    slides."""
     bodies = incline(0.3)
     rows = linearisation(bodies, "nts", "dual", (COULOMB,))(np.zeros(bodies.mesh.dofs))
 
@@ -237,7 +240,7 @@ def test_loads_are_balanced_where_friction_may_hold_them():
 
 @pytest.mark.parametrize("push", [0.2, -0.1])
 def test_below_the_limit_forces_do_not_depend_on_the_law(push):
-    """Statics determines the forces, independently of the law."""
+    """The contact forces are statically determinate."""
     normal = (1 + 0.1 * push) / np.hypot(1, 0.1) * WEIGHT
     for law in (COULOMB, FrictionLaw("tresca", bound=0.5 * WEIGHT)):
         case = block_on_incline(push, law)
@@ -250,7 +253,8 @@ def test_below_the_limit_forces_do_not_depend_on_the_law(push):
 
 
 def test_quasi_static_slip_begins_where_the_step_before_ended():
-    """Two proportional steps; the static problem does not depend on the first."""
+    """The load grows in two equal steps; with loading=static, the first step has no
+    effect on the second."""
     name = f"{SMALL.replace('steps=1', 'steps=2')}/friction=tresca/bound=5e7"
     first, _, _ = solved(f"{name}/step=1/primal")
     path, s, _ = solved(f"{name}/primal")
@@ -265,12 +269,13 @@ def test_quasi_static_slip_begins_where_the_step_before_ended():
 
 
 def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
-    """The bound of each iterate is mu times the pressure of its predecessor."""
+    """The bound of each iterate is mu times the normal force of its predecessor."""
     name = f"{SMALL}/friction=coulomb/mu=0.3"
     _, _, first = solved(f"{name}/iterate=1/dual-bounds")
     _, _, smooth = solved(f"{SMALL}/dual-bounds")
     last, _, _ = solved(f"{name}/dual-bounds")
-    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)  # of no bound yet
+    # the first bound is zero
+    assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)
     residuals = []
     for k in (1, 2, 3, 4):
         case, s, values = solved(f"{name}/iterate={k}/dual-bounds")
@@ -316,7 +321,8 @@ def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, message):
     "load", [(0.0, 1.0), pytest.param((1.0, 1.0), marks=pytest.mark.slow)]
 )
 def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(load):
-    """The tip of a slender beam against a wall across it: slip presses far more."""
+    """The tip of a slender beam touches a wall across the beam, where slip causes large
+    changes of the pressure."""
     mesh = rectangle((0.0, 0.0), (4.0, 0.2), (20, 2))
     sides = mesh.boundaries
     tip = np.intersect1d(sides["top"], sides["right"])
@@ -347,5 +353,7 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
 
 def test_an_iterate_beyond_the_last_one_is_refused():
     name = f"{SMALL}/friction=coulomb/mu=0.3/iterate=900/dual-bounds"
-    with pytest.raises(InputError, match="iterate=900: the fixed point of step 1 has"):
+    with pytest.raises(
+        InputError, match="iterate=900: the fixed-point iteration of step 1"
+    ):
         parse(name, PROBLEMS).build(reference_solution)

@@ -1,4 +1,4 @@
-"""Bodies from gmsh files, compared with the family of the paper's benchmark."""
+"""Bodies from gmsh files, compared with the benchmark of the paper."""
 
 import re
 import shutil
@@ -64,7 +64,10 @@ def edges(chain):
 
 
 def parts(flip=False):
-    """Return cells by name as gmsh writes them: unordered, of any orientation."""
+    """Return cells, curves and points by name.
+
+    flip : True for random order and orientation, as in files of gmsh
+    """
     sides, rng = RING.mesh.boundaries, np.random.default_rng(577215)
     curves = {name: edges(sides[name]) for name in ("left", "outer", "bottom", "top")}
     curves["feet"] = np.vstack([edges(sides["left_foot"]), edges(sides["right_foot"])])
@@ -81,7 +84,8 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1 with one entity per physical group, or per set of other cells."""
+    """Write ASCII format 4.1, with one entity per physical group or unnamed set of
+    cells."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
@@ -89,7 +93,7 @@ def msh41(points, quads, curves, spots):
             tag += 1
             groups += [f'{dimension} {tag} "{name}"'] if name else []
             box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 writes these, too
+            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 also writes these
             entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
             blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
             for cell in cells:
@@ -114,7 +118,8 @@ POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
 
 @pytest.fixture
 def described(tmp_path, monkeypatch):
-    """Write a mesh and a TOML file to the working directory; return the case name."""
+    """Return a function that writes a mesh and a TOML file to the working directory and
+    returns the case name."""
     monkeypatch.chdir(tmp_path)
 
     def write(mesh=None, toml=TOML):
@@ -195,7 +200,7 @@ def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
     for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
         one, two = getattr(ours.qp, name), getattr(theirs.qp, name)
         one, two = (M.toarray() if hasattr(M, "toarray") else M for M in (one, two))
-        if name == "A" and len(one):  # the order of the supports is our own
+        if name == "A" and len(one):  # the order of support rows differs
             one, two = (M[np.argsort(M.argmax(axis=1))] for M in (one, two))
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9)
     if form == "dual-bounds":
@@ -332,8 +337,8 @@ master = "table"
 def sheared_blocks(described):
     """Two squares of side 2 in a state of constant pressure and shear stress.
 
-    Their Poisson's ratio is zero, so that their common side stays straight: every load
-    step has the same contact rows. Friction alone holds the upper one sideways.
+    Poisson's ratio is zero, so that the common side stays straight and every load step
+    has the same contact rows. Friction alone supports the upper square horizontally.
     """
     mesh = stacked_mesh(right=[[2, 5], [5, 8], [11, 14], [14, 17]])
     return lambda toml=SHEARED: described(mesh, toml)
@@ -345,7 +350,8 @@ def sheared_blocks(described):
 def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
     sheared_blocks, contact, form, step
 ):
-    """Each step has its share of the stress, and of the displacement (γy, −εy)."""
+    """After step k of 3, stress and displacement (γy, −εy) are k/3 of their final
+    values."""
     text = f"{sheared_blocks()}/contact={contact}/steps=3/step={step}/{form}"
     case = build(text)
     s = reference_solution(case.qp)
@@ -448,13 +454,14 @@ def test_two_passes_are_remarked_upon_and_share_the_force(described):
 
 def test_a_contact_that_is_described_twice_is_refused(described):
     with pytest.raises(
-        InputError, match=r"contacts\[1\]: .* are those of contacts\[0\]"
+        InputError, match=r"contacts\[1\] has the slave .* of contacts\[0\]"
     ):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
 def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
-    """Its top is on rollers: K is singular, but rounding lets it be factorised."""
+    """The top of the body is on rollers, so that K is singular; because of rounding,
+    its factorisation succeeds."""
     there = ROOT / "suites" / "crossval"
     shutil.copy(there / "punch.msh", tmp_path)
     toml = (there / "punch.toml").read_text()
@@ -471,7 +478,8 @@ def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 def test_the_order_of_the_nodes_in_the_file_does_not_matter(described, form):
-    """Gmsh numbers points first, then curves, then surfaces, across the bodies."""
+    """Gmsh numbers the nodes of points first, then of curves, then of surfaces,
+    regardless of the bodies."""
     to = np.random.default_rng(662607).permutation(len(POINTS))
     quads, curves, spots = ({k: to[v] for k, v in named.items()} for named in parts())
     shuffled = POINTS[np.argsort(to)]
@@ -565,33 +573,33 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 @pytest.mark.parametrize(
     ("load", "supports", "message"),
     [
-        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
-        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
-        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, which"),
+        ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, where"),
+        ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, where"),
+        ('boundary = "left"\nforce = [1, 2]', "", "acts on 'left' in x and y, where"),
         (POINT_LOAD, '[[supports]]\npoint = "corner"\nfix = ["y"]\n',
-         "acts on 'corner' in y, which"),
+         "acts on 'corner' in y, where"),
         ('boundary = "top"\nforce = [1e5, -1e8]',
-         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
+         '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, where"),
     ],
 )  # fmt: skip
 def test_a_load_that_its_supports_take_up_is_refused(
     described, load, supports, message
 ):
-    """All displacements at the load are prescribed as zero: it has no effect."""
+    """A load is rejected if supports fix all displacements in its direction."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")
 
     assert str(e.value) == (
-        f"a.toml: loads[0] {message} fix holds there: it has no effect; load another "
-        "side, or hold other components"
+        f"a.toml: loads[0] {message} a support fixes the displacement; expected a load "
+        "on another side, or other fixed components"
     )
 
 
 @pytest.mark.parametrize(
     ("load", "supports"),
     [
-        # one node of the top, at its left end, is held
+        # the left end node of the top is fixed
         ('boundary = "top"\nforce = [0, -1e8]', ""),
         ('boundary = "top"\nforce = [0, -1e8]',
          '[[supports]]\nboundary = "top"\nfix = ["x"]\n'),
@@ -617,7 +625,7 @@ def read(tmp_path, *contents, **kinds):
 
 
 def bent(points):
-    """Move the middle node beyond a corner."""
+    """Return the points of nine nodes with the middle node moved beyond a corner."""
     return np.where(np.arange(9)[:, None] == 4, [-0.5, -0.5, 0.0], points)
 
 
@@ -637,7 +645,7 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected a name "
          'for each: Physical Surface("NAME") in the .geo file'),
-        # the file has no cells of a surface that has no physical name
+        # gmsh omits the cells of surfaces without a physical name
         (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
          "that bounds no body in the file; expected every body to have a name: "
          'Physical Surface("NAME") in the .geo file'),
@@ -660,9 +668,9 @@ def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
 
 
 def untagged(text):
-    """Set the physical tags of format 2.2 to zero where they have no name.
+    """Set physical tags without a name to zero in a file of format 2.2.
 
-    This is what Mesh.SaveAll = 1 writes of entities in no physical group.
+    With Mesh.SaveAll = 1, gmsh writes tag 0 for entities without a physical group.
     """
     named = set(re.findall(r'^\d (\d+) "', text, re.M))
     head, cells = text.split("$Elements\n")
@@ -677,7 +685,7 @@ SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
 
 @pytest.mark.parametrize("writer", SAVED)
 def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
-    """Unnamed curves and points, written with Mesh.SaveAll = 1, change nothing."""
+    """Unnamed curves and points, which Mesh.SaveAll = 1 writes, have no effect."""
     quads, curves, spots = parts()
     more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
     read = []
@@ -708,7 +716,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
 
 def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
-    """Return a binary file whose first curve has no physical tag."""
+    """The first curve of the binary file has no physical tag."""
     text = msh41(POINTS, *parts())
     (tmp_path / "a.msh").write_text(text)
     mesh = meshio.gmsh.read(tmp_path / "a.msh")
@@ -867,7 +875,7 @@ def test_a_surface_that_is_not_plane_is_refused(described):
 
 
 def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
-    """A force of 2 MN/m passes through a disc and acts on both of its contacts."""
+    """A force of 2 MN/m is transferred through a disc and both of its contacts."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
     values = case.quantities(reference_solution(case.qp))
 

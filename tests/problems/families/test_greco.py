@@ -1,4 +1,4 @@
-"""GRECO's plate: published digits, and those of an independent prototype."""
+"""GRECO's plate: published digits, and digits of an independent prototype."""
 
 from functools import cache
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.together
 
 FAMILY = Greco()
 
-#: cells a side: u_x at 0, 1.25, 5, 7.5 and 11.25 mm, normal force at 38.75 mm
+#: by cells per side: u_x at 0, 1.25, 5, 7.5, 11.25 mm, normal force at 38.75 mm
 PROTOTYPE = {
     32: ([2.85944, 2.72168, 2.28500, 1.97963, 1.54056], 1.04823e5),
     128: ([2.86022, 2.72250, 2.28669, 1.98067, 1.54134], 2.62061e4),
@@ -59,7 +59,7 @@ def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
 
 
 def test_forces_are_in_equilibrium():
-    """Friction and reactions on the right balance the horizontal load."""
+    """Friction and the reactions on the right side balance the horizontal load."""
     case, s = solved(8)
     got, reaction = case.quantities(s), case.mechanics.to_primal(s).y * 5e7 * 0.04
     fx, fy = got["contact_force"]
@@ -83,7 +83,7 @@ def test_every_form_has_the_same_answer():
 
 
 def test_the_fixed_point_begins_without_friction_and_contracts():
-    """The key `iterate` selects each of its Tresca problems."""
+    """The key `iterate` selects each Tresca problem of the fixed-point iteration."""
     case, s = solved(8)
     count, residuals = case.quantities(s)["tresca_problems"], []
     for i in range(1, count + 1):
@@ -117,7 +117,9 @@ def test_values_out_of_range_are_refused(name, message):
 
 
 def test_an_iterate_beyond_the_last_is_refused():
-    with pytest.raises(InputError, match="iterate=99: the fixed point of step 1 has"):
+    with pytest.raises(
+        InputError, match="iterate=99: the fixed-point iteration of step"
+    ):
         solved(2, iterate=99)
 
 
@@ -137,14 +139,14 @@ def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
         states.append((side.friction, values))
         u.append(fields.displacement)
     (plane, ground), (space, layers) = points
-    # of each node in space, the plane node below it
+    # for each node in space, the node with equal x and y in the plane
     below = np.array([np.abs(plane - x[:2]).sum(axis=1).argmin() for x in space])
 
     assert abs(u[1][:, :2] - u[0][below]).max() < 1e-8 * abs(u[0]).max()
     assert abs(u[1][:, 2]).max() < 1e-8 * abs(u[0]).max()
     for z in np.unique(layers[:, 2]):
         x = layers[layers[:, 2] == z]
-        order = np.argsort(x[:, 0])[: len(ground)]  # the corner has no row
+        order = np.argsort(x[:, 0])[: len(ground)]  # the corner has no contact row
         layer = states[1][0][layers[:, 2] == z][order]
         assert layer.tolist() == states[0][0][np.argsort(ground[:, 0])].tolist()
     for name in ("normal_force", "tangential_sum", "published_error"):

@@ -1,4 +1,4 @@
-"""Half planes, compared with Hertz, Cattaneo and Mindlin."""
+"""Contact of half planes, compared with Hertz, Cattaneo and Mindlin."""
 
 from itertools import pairwise
 
@@ -78,7 +78,8 @@ def test_full_unloading_to_the_other_side_is_loading_to_the_other_side():
 
 
 def test_the_kernel_displaces_as_the_integral_of_the_logarithm():
-    """F is symmetric, and positive definite on a segment shorter than 4."""
+    """Entries of F are integrals of the logarithm; F is symmetric, and positive
+    definite on an interval shorter than 4."""
     elements = Elements(8, 1.5)
     F, h = elements.F, elements.h
 
@@ -93,7 +94,8 @@ def test_the_kernel_displaces_as_the_integral_of_the_logarithm():
 
 
 def test_exact_energies_are_those_of_integrals():
-    """½∫q Fq by a fine quadrature of the kernel, and u = const − x² under Hertz."""
+    """The energy is compared with ½qᵀFq on a fine grid; under Hertz's pressure,
+    u = const − x²."""
     elements = Elements(1200, 1.0)
     share = np.diff(EXACT.force(EXACT.a * elements.ends)) / EXACT.P
     q = np.diff(tangential(0.5).force(EXACT.a * elements.ends)) / (MU * EXACT.P)
@@ -127,7 +129,8 @@ def test_400_elements_have_the_shear_traction_of_cattaneo_and_mindlin(Q):
     ids=str,
 )  # fmt: skip
 def test_tractions_converge_about_linearly_and_energies_quadratically(keys, error):
-    """Rates over four halvings: c and a lie differently in the elements at each."""
+    """Rates are averages over four halvings, because the positions of c and a within
+    their elements differ between grids."""
     coarse, fine = (result(n=n, **keys) for n in (50, 800))
 
     assert np.log2(coarse[error] / fine[error]) / 4 > 0.8
@@ -148,18 +151,19 @@ def test_400_elements_have_hertz_s_pressure():
 def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
     got = result(n=400, law="cattaneo", Q=Q, peak=peak)
 
-    assert got["shear_l2_error"] < 8e-3  # of a q that is small at the end
+    assert got["shear_l2_error"] < 8e-3  # relative to q, which is small after unloading
     assert abs(got["shear_centre_error"]) < 1e-3
     assert abs(got["stick_half_width_error"]) < 1e-3
     assert got["dissipation"] > 0
 
 
 def test_dissipation_is_the_work_of_the_force_less_the_stored_energy():
-    """∫Q dδ of the closed curve Q(δ) from −peak to peak and back: 2·dissipation."""
+    """The closed curve Q(δ) from −peak to peak and back encloses twice the
+    dissipation."""
     Q = np.linspace(-0.8, 0.8, 201)
     unit = MU * EXACT.P * 2 * MU * EXACT.P / (np.pi * EXACT.E_star)
     moved = [displacement(tangential(q, 0.8).semicircles) for q in Q]
-    back = -np.trapezoid(Q, moved) * unit  # from 0.8 to −0.8, as moved falls
+    back = -np.trapezoid(Q, moved) * unit  # work from 0.8 to −0.8
     got = result(n=200, law="cattaneo", Q=-0.8, peak=0.8)["dissipation"]
 
     assert got == pytest.approx(abs(back), rel=2e-3)
@@ -176,7 +180,7 @@ def test_an_interior_point_method_finds_the_same():
     ("name", "message"),
     [("Q=0.5", "Q=0.5 needs law=cattaneo"), ("peak=0.5", "peak=0.5 needs law=cattaneo"),
      ("law=cattaneo", "Q=0.0 must be between 0 and 1"),
-     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
      ("law=cattaneo/Q=-0.5", "Q=-0.5 must be between 0 and 1"),
      ("law=cattaneo/Q=0.6/peak=0.5", "must be between -peak and peak=0.5"),
      ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),

@@ -60,7 +60,7 @@ def disc(n, share=1.0):
 
 
 def dense(cells, h, nu=None):
-    """Return F entry by entry from the integrals."""
+    """Return F as a dense matrix, assembled from the cell integrals."""
     m = int(cells.max()) + 1
     I = cell_integrals(m, m)
     lag = cells[:, None] - cells[None]
@@ -83,7 +83,8 @@ INTEGRANDS = {
 
 @pytest.mark.parametrize("name", INTEGRANDS)
 def test_the_integrals_over_cells_are_those_of_gauss_quadrature(name):
-    """At distance zero with x²/r³ = f(1, t)/x² on rays y = tx, which is smooth."""
+    """At distance zero, x²/r³ = f(1, t)/x on rays y = tx, so that an integral over t
+    remains."""
     f, I = INTEGRANDS[name], getattr(cell_integrals(300, 300), name)
     t, w = np.polynomial.legendre.leggauss(60)
 
@@ -111,7 +112,8 @@ def test_the_product_by_transforms_is_that_of_the_matrix(cells, nu):
 
 
 def test_no_eigenvalue_is_less_than_the_bound_and_the_bound_is_sharp():
-    """For grids of all shapes with holes, and any Poisson's ratio."""
+    """The grids have random shapes, with and without holes, and various Poisson's
+    ratios."""
     rng, ratios = np.random.default_rng(11), []
     for trial in range(60):
         shape = rng.integers(1, 13, size=2)
@@ -184,7 +186,8 @@ def test_exact_tractions_add_up_to_their_forces():
 
 
 def test_exact_tractions_cause_the_exact_displacements():
-    """Hertz: δ_n − r²/2R in the contact. Mindlin, ν = 0: δ where the bodies stick."""
+    """Hertz's pressure causes δ_n − r²/2R in the contact; Mindlin's traction (ν = 0)
+    causes δ in the stick zone."""
     n, h = 200, 2 / 200
     cells = disc(n)
     r = np.hypot(*((cells - (n - 1) / 2) * h).T)
@@ -224,9 +227,10 @@ def test_mindlin_s_problem_has_one_disc_for_each_cell_in_contact():
 
 
 def prototype(n, nu, Q):
-    """Return F, δ and bounds of Mindlin's problem, entry by entry: R = a = E = 1.
+    """Return F, δ and bounds of Mindlin's problem for R = a = E = 1.
 
-    Written from the published formulas before the family existed.
+    This independent code was written from the published formulas before the family
+    existed.
     """
     h, mu = 2 / 0.9 / n, 0.3
     at = (np.arange(n) + 0.5 - n / 2) * h
@@ -259,7 +263,7 @@ def prototype(n, nu, Q):
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
 def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
-    """With forces over μP and displacements over μP/(πGa)."""
+    """Forces are in units of μP, and displacements in units of μP/(πGa)."""
     F, shift, bound, limit = prototype(12, nu, 0.7)
     qp = built(n=12, law="mindlin", nu=nu, Q=0.7).qp
     length = limit * 2 * (1 + nu) / np.pi
@@ -283,7 +287,8 @@ def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
     ],
 )  # fmt: skip
 def test_the_stick_radius_is_that_of_cattaneo_and_mindlin(n, nu, Q, c_over_a, error):
-    """Their solution is exact for ν = 0; the resultant is off by 3e-4 for ν = 0.3."""
+    """The exact solution is for ν = 0; for ν = 0.3, its resultant has an error of
+    3e-4."""
     got = result(ProjectedGradient(), n=n, law="mindlin", nu=nu, Q=Q)
 
     assert abs(got["c_over_a_error"]) < c_over_a
@@ -308,7 +313,7 @@ def test_coulomb_s_bounds_are_mu_times_the_pressure_of_the_normal_problem():
 
 @pytest.mark.parametrize("nu", [0.0, 0.3])
 def test_a_disc_that_hardly_slips_is_as_stiff_as_a_rigid_punch(nu):
-    """Tresca's law under a small force: δ = Q(2 − ν)/4Ga."""
+    """Under a small force with Tresca's law, δ = Q(2 − ν)/4Ga."""
     keys = dict(friction="tresca", bound=1e8, Q=0.02)
     got = result(Clarabel(), n=16, nu=nu, **keys)
 
@@ -319,7 +324,8 @@ def test_a_disc_that_hardly_slips_is_as_stiff_as_a_rigid_punch(nu):
 
 
 def test_results_of_a_given_point_are_sums_in_newtons_and_metres():
-    """Rigid disc, Johnson 3.7: δ = (2 − ν)Q/(4Ga), with Q a part of the bound·πa²."""
+    """For a rigid disc (Johnson, Section 3.7), δ = (2 − ν)Q/(4Ga); the key Q is the
+    fraction of bound·πa²."""
     case = built(n=12, friction="tresca", bound=2e8, nu=0.2, Q=0.3)
     k, length = case.qp.q.size // 2, np.cbrt(0.75 * 100 * 4e-3 / (100e9 / 0.96))
     unit, G = 2e8 * np.pi * length**2, 200e9 / 2.4
@@ -378,7 +384,8 @@ def test_heights_for_a_seed_are_the_same_on_every_machine():
 
 
 def test_the_spectrum_of_heights_has_the_hurst_exponent():
-    """Waves are orthogonal on a grid that resolves them: A_k ∝ |k|^−(1 + H)."""
+    """On a grid that resolves the waves, they are orthogonal, and A_k ∝
+    |k|^−(1 + H)."""
     n, hurst = 128, 0.7
     z = rough_surface(np.arange(n) / n, hurst, 3)
     amplitudes = np.abs(np.fft.fft2(z)) / n**2

@@ -1,4 +1,4 @@
-"""Pressures between cylinders, compared with Hertz."""
+"""Pressures and shear tractions between cylinders, compared with exact solutions."""
 
 from dataclasses import replace
 from functools import cache
@@ -81,7 +81,7 @@ def test_the_peak_pressure_of_the_benchmark_in_pascal():
 
 @pytest.mark.parametrize("family", [PLANE, CYLINDER], ids=["plane", "cylinder"])
 def test_the_pressure_converges(family):
-    """The order is above one, although the slope is infinite at ±a."""
+    """The order is above one, although the slope of the pressure is infinite at ±a."""
     errors = [
         result(family, n=n, **({"m": n} if family is CYLINDER else {}))[
             "pressure_l2_error"
@@ -98,7 +98,7 @@ def test_the_pressure_is_symmetric_and_none_pulls():
 
     assert force == pytest.approx(force[::-1], abs=1e-8 * force.max())
     assert force.min() >= 0
-    assert abs(s.x[:2]).max() <= 1e-8 * force.max()  # the supports on the axis
+    assert abs(s.x[:2]).max() <= 1e-8 * force.max()  # reactions on the axis
 
 
 @pytest.mark.parametrize(("contact", "basis"), PAIRINGS[:2])
@@ -114,7 +114,7 @@ def test_two_cylinders_are_in_hertz_contact_by_mortar(contact, basis, slave):
 
 @pytest.mark.parametrize(("contact", "basis"), PAIRINGS)
 def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
-    """R = 8 : 16 mm, E = 1 : 10."""
+    """The radii are 8 mm and 16 mm, and the ratio of the moduli is 10."""
     got = result(CYLINDER, contact=contact, basis=basis, radius=2.0, ratio=10.0)
 
     assert abs(got["p_max_error"]) <= 0.01
@@ -123,7 +123,8 @@ def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
 
 
 def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
-    """Equal cylinders have the pressure of one on a plane; softer ones have less."""
+    """Three pairs of cylinders are compared with closed forms, among them a cylinder on
+    a nearly rigid plane."""
     theory = [
         two_cylinders({**CYLINDER.defaults, "load": 10.0, **keys})[1]
         for keys in ({}, {"ratio": 1e9, "radius": 1e9}, {"radius": 3.0, "ratio": 0.5})
@@ -135,7 +136,7 @@ def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
 
 
 def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segment():
-    """The meshes do not match, as in the patch test."""
+    """As in the patch test, the meshes do not match."""
     errors = {
         contact: [
             result(CYLINDER, n=n, m=m, contact=contact)["pressure_l2_error"]
@@ -149,7 +150,8 @@ def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segm
 
 
 def test_the_difference_from_hertz_falls_with_the_load():
-    """The error is O(a²/R²) with a² ∝ P, plus a constant of the finite bodies."""
+    """The error is O(a²/R²) with a² ∝ P, plus a constant due to the finite size of the
+    bodies."""
     errors = np.array([
         result(CYLINDER, n=20, m=20, load=load)["half_width_error"]
         for load in (10.0, 1.0, 0.1)
@@ -207,7 +209,8 @@ def sheared_result(form="dual", **keys):
     ],
 )
 def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
-    """20 cells per a, a/R = 0.027; c from the second moment of the traction."""
+    """There are 20 cells per a, a/R = 0.027, and c is computed from the second moment
+    of the traction."""
     got = sheared_result(Q=Q, contact=contact)
 
     assert abs(got["stick_half_width_error"]) < 0.01
@@ -231,7 +234,7 @@ def test_unloading_lets_it_slip_back_from_the_edge(Q):
 
 
 def test_in_proportion_only_the_last_node_at_each_edge_slips():
-    """A single static load gives the tractions of Q applied last."""
+    """For a single static load, the tractions are as if Q had been applied last."""
     keys = dict(n=6, m=6, Q=0.5)
     got = sheared_result(**keys, steps=6, programme="proportional")
     static = sheared_result(**keys, loading="static")
@@ -244,7 +247,8 @@ def test_in_proportion_only_the_last_node_at_each_edge_slips():
 
 @pytest.mark.slow
 def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
-    """q = (Q/P)p, of about first order in h and the load steps."""
+    """The exact traction is (Q/P)p; the errors are of about first order in h and in the
+    load step."""
     errors = []
     for n in (5, 10, 20):
         got = sheared_result(
@@ -259,7 +263,8 @@ def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
 
 
 def test_the_tangential_force_turns_no_body():
-    """Forces and moments of loads cancel on each body: there are no reactions."""
+    """The loads on each body have no moment and the resultant ±Q, and supports have no
+    reactions."""
     keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
     params = CYLINDER.complete(keys)
     stated = problem(params)
@@ -267,7 +272,7 @@ def test_the_tangential_force_turns_no_body():
     bodies = stated.bodies.assembled
     (x, y), upper = bodies.mesh.points.T, bodies.body_of_node == 0
     load = np.zeros(bodies.mesh.dofs)
-    load[last.component] = last.value / (0.5 * 0.5)  # of Q in units of μP
+    load[last.component] = last.value / (0.5 * 0.5)  # unit of Q is μP
     load[first.component] -= first.value / (0.5 * 0.5)
     load = load.reshape(-1, 2)
     case = CYLINDER.build("dual", params, reference_solution)
@@ -291,7 +296,8 @@ def test_the_slip_begins_where_symmetry_puts_the_cylinders(keys):
 
 
 def test_friction_holds_equal_cylinders_together_without_a_force():
-    """Both deform symmetrically, so that nothing slips and the pressure is Hertz's."""
+    """Equal cylinders deform symmetrically; hence nothing slips, and the pressure is
+    that without friction."""
     keys = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)
     got, smooth = result(CYLINDER, **keys), result(CYLINDER, n=10, m=10, load=0.1)
 
@@ -314,7 +320,7 @@ def test_of_a_fixed_point_every_tresca_problem_can_be_had():
     ("keys", "message"),
     [("Q=0.5", "friction=none with a tangential force; expected friction=coulomb"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
-     ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
+     ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
      ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
      ("friction=coulomb/mu=0.3/Q=0.6/peak=0.4", "must be between -peak and peak=0.4"),
      ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),
@@ -336,7 +342,7 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message)
 
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
 def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(ratio):
-    """The uniform part of the arc must fit the half disc, or K is indefinite."""
+    """If the uniform part of the arc exceeds the half disc, K is indefinite."""
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)
     assert exact.a > 4 * 0.008

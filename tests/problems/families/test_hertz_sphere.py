@@ -25,7 +25,8 @@ def solved(keys, solver="smalbe"):
 
 
 def test_radius_pressure_and_approach_are_those_of_hertz():
-    """R = 8, E = 200, ν = 0.3, P = 10 with eight cells per contact radius."""
+    """The data are R = 8, E = 200, ν = 0.3 and P = 10, with eight cells per contact
+    radius."""
     case, s, found = solved("dual")
 
     assert found["contact_radius"] == pytest.approx(0.648715, rel=5e-3)
@@ -45,7 +46,7 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
     assert r[touching].max() == pytest.approx(0.648715, abs=1.5 * 0.648715 / 8)
 
 
-#: two spheres of steel-like numbers, with which MOOSE is verified: a/R = 0.05
+#: two spheres of the verification of MOOSE, with a/R = 0.05
 MOOSE = "against=sphere/R=2/E=1.40625e7/nu=0.25/load=10000"
 
 
@@ -95,7 +96,8 @@ def test_the_support_of_the_lower_sphere_along_z_has_no_reaction():
 
 
 def test_formulae_have_the_digits_of_two_larger_spheres():
-    """R = 50, E = 2e4, ν = 0.3, approach 4: a = 10 is beyond this family's a/R."""
+    """For R = 50, E = 2e4, ν = 0.3 and an approach of 4, a = 10, which exceeds the
+    limit of a/R of the family."""
     modulus = 2e4 / (1 - 0.3**2) / 2
     exact = PointContact(4 / 3 * modulus * 10**3 / 25, 25, modulus)
 
@@ -135,7 +137,7 @@ def test_errors_fall_with_the_cells():
 
 
 def test_units_do_not_matter():
-    """Lengths in mm instead of m, and E in MPa: forces in N are the same."""
+    """With lengths in mm instead of m and E in MPa, forces in N are unchanged."""
     one, other = solved("n=3/dual")[2], solved("n=3/R=8000/E=200e-6/dual")[2]
 
     assert other["contact_force"] == pytest.approx(one["contact_force"], rel=1e-9)
@@ -158,7 +160,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     assert abs(divergence).max() <= 1e-8
     sigma = stress(x, nu)
     np.testing.assert_allclose(sigma, sigma.transpose(0, 2, 1), atol=1e-16)
-    # no tractions on the free surface, and the opposite total on every half sphere
+    # the free surface has no tractions; on any half sphere, their resultant is −1
     flat = stress(x * [1, 1, 0], nu)
     assert abs(flat[:, 2]).max() <= 1e-15
     z, weights = np.polynomial.legendre.leggauss(20)
@@ -172,7 +174,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     traction = np.einsum("kij,kj->ki", stress(normal, nu), normal)
     total = np.repeat(weights * 2 * np.pi / 16, 16) @ traction
     assert total == pytest.approx([-f for f in force], abs=1e-12)
-    # compatible with Hooke's law: Beltrami's equation, (1 + ν)∇²σ + ∇∇tr σ = 0
+    # compatibility: Beltrami's equation (1 + ν)∇²σ + ∇∇tr σ = 0
     h, axes = 1e-3, np.eye(3)
     at = x[:5] / np.linalg.norm(x[:5], axis=1, keepdims=True)
     laplacian = sum(
@@ -188,7 +190,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
 
 
 def test_a_tangential_force_leaves_the_middle_sticking():
-    """Cattaneo and Mindlin, with two cells along the contact radius."""
+    """The problem of Cattaneo and Mindlin has two cells per contact radius."""
     values = solved(f"n=2/{MOOSE}/Q=0.5/dual")[2]
     pressed = solved(f"n=2/{MOOSE}/dual")[2]
     force = 0.5 * 0.3 * 10_000
@@ -198,7 +200,7 @@ def test_a_tangential_force_leaves_the_middle_sticking():
     assert values["c_over_a"] == pytest.approx(0.5 ** (1 / 3), rel=0.05)
     assert values["c_over_a_moment"] == pytest.approx(0.5 ** (1 / 3), rel=0.05)
     assert values["friction_residual"] <= 1e-9
-    # bodies of one material: Q does not change the pressure
+    # because both bodies have the same material, Q does not change the pressure
     for name in ("contact_radius", "p_max", "approach"):
         assert values[name] == pytest.approx(pressed[name], rel=1e-3)
 
@@ -212,7 +214,7 @@ def test_a_tangential_force_leaves_the_middle_sticking():
         ("contact=nts/dual", "contact=nts is not used by against=plane; expected aga"),
         ("basis=standard/dual", "basis=standard is not used by against=plane"),
         ("Q=0.5/dual", "Q=0.5 with against=plane; expected against=sphere"),
-        ("against=sphere/Q=1/dual", "Q=1.0 must be at least 0 and below 1, a part of"),
+        ("against=sphere/Q=1/dual", "Q=1.0 must be at least 0 and below 1, a fraction"),
         ("against=sphere/mu=0.2/dual", "mu=0.2 is not used without a tangential force"),
         ("dual-bounds", "dual-bounds"),
         ("n=0/dual", "n=0 must be at least 1"),

@@ -16,13 +16,13 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = PROBLEMS["membranes"]
-#: (1/H, H/h) and torn unknowns, multipliers, contact rows, subdomains
+#: by (1/H, H/h): torn unknowns, multipliers, contact rows, subdomains
 TABLE = {
     (1, 8): (162, 18, 9, 2), (2, 4): (200, 56, 9, 8), (2, 8): (648, 104, 17, 8),
     (2, 16): (2312, 200, 33, 8), (4, 4): (800, 256, 17, 32),
     (4, 8): (2592, 480, 33, 32), (8, 4): (3200, 1088, 33, 128),
 }  # fmt: skip
-#: products with F of the best of PERMON 3.25's settings, at its tolerance 1e-6
+#: products with F for the best settings of PERMON 3.25, at its tolerance 1e-6
 PERMON = {
     (1, 8): 59, (2, 4): 56, (2, 8): 57, (2, 16): 66, (4, 4): 89,
     (4, 8): 97, (4, 16): 106, (8, 4): 90, (8, 8): 103, (12, 4): 100,
@@ -54,7 +54,7 @@ def test_sizes_are_those_of_the_table(size):
 
 
 def test_the_stiffness_is_exact_for_functions_of_the_element_space():
-    """∫|∇u|² of u = 1, x, y and xy on the unit square: 0, 1, 1 and 2/3."""
+    """For u = 1, x, y and xy on the unit square, ∫|∇u|² is 0, 1, 1 and 2/3."""
     n = 5
     x = np.tile(np.linspace(0, 1, n + 1), n + 1)
     y = np.repeat(np.linspace(0, 1, n + 1), n + 1)
@@ -67,7 +67,7 @@ def test_the_stiffness_is_exact_for_functions_of_the_element_space():
 
 @pytest.mark.parametrize("n", [3, 4, 8])
 def test_the_load_integrates_polynomials_of_the_first_degree(n):
-    """The edge of the loaded strip may be inside a cell."""
+    """The edge of the loaded strip may lie inside a cell."""
     y = np.linspace(0, 1, n + 1)
     share = hat_integrals(n, 0.75, 1.0)
 
@@ -88,7 +88,8 @@ def test_the_forms_have_one_solution_in_every_gluing(glue):
 
 
 def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
-    """The contact force is the load, ¼; contact covers part of the edge only."""
+    """The contact force equals the load, ¼, and only a part of the edge is in
+    contact."""
     case = built("dual", S=2, n=8)
     s = solution(case)
     values = case.quantities(s)

@@ -41,7 +41,8 @@ def rates(errors):
 
 @pytest.mark.parametrize("dim", [1, 2])
 def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
-    """Within the unit distance, the solution lies on the obstacle with equal slope."""
+    """Δu = 2 for r > 1; for r ≤ 1 the solution is zero, and its slope is continuous at
+    r = 1."""
     rng = np.random.default_rng(20090)
     x, h = rng.uniform(-1.5, 1.5, (400, dim)), 1e-4
     steps = h * np.eye(dim)
@@ -58,7 +59,8 @@ def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
 
 @pytest.mark.parametrize(("dim", "n"), [(1, 2000), (2, 700)])
 def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
-    """Midpoint rule for ½|∇u|² + 2u; |∇u| = 2(r − 1) or r − 1/r."""
+    """The integral of ½|∇u|² + 2u is evaluated by the midpoint rule, with |∇u| = 2(r −
+    1) or r − 1/r."""
     x = -1.5 + 3 * (np.arange(n) + 0.5) / n
     points = np.stack([a.ravel() for a in np.meshgrid(*[x] * dim)], axis=1)
     r = np.maximum(np.linalg.norm(points, axis=1), 1)
@@ -69,21 +71,21 @@ def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
 
 
 def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
-    """Linear elements are exact at nodes between points of known solution."""
+    """Linear elements are exact at nodes if the contact region ends at a node."""
     case, s = solved(SMALBE(), "primal", 1, 12)
     got = case.quantities(s)
 
     assert got["max_error"] <= 1e-14
     assert got["obstacle_force"] == pytest.approx(4, rel=1e-12)
     assert got["active"] == 9
-    # of the interpolant, u″ = 2 over a length of 1: −½|u − u_h|² + ∫2(u_h − u)
+    # error of the interpolant with u″ = 2 over length 1: −½|u − u_h|² + ∫2(u_h − u)
     h = 0.25
     assert got["energy"] - 1 / 3 == pytest.approx(-4 * h**2 / 24 + 4 * h**2 / 12)
 
 
 @pytest.mark.parametrize("phase", [10, 20])
 def test_the_string_converges_with_second_order(phase):
-    """The string lifts off ⅓ or ⅔ of a cell from a node, also for h/4."""
+    """On all grids, the contact region ends ⅓ or ⅔ of a cell from a node."""
     got = [result(1, n) for n in (4 * phase, 16 * phase, 64 * phase)]
 
     for error in ("max_error", "energy_error"):

@@ -1,4 +1,4 @@
-"""Contact patch test: exact linear states, and methods that fail it."""
+"""Contact patch test: exact linear states, and methods that fail the test."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ def test_node_to_segment_passes_on_matching_meshes():
     [((6, 4), "upper", 27.8), ((6, 4), "lower", 8.9), ((24, 20), "upper", 9.8)],
 )
 def test_node_to_segment_has_the_errors_of_an_independent_code(mesh, slave, percent):
-    """The expected errors are those of a prototype with other supports."""
+    """The expected errors are those of a prototype with different supports."""
     lower, upper = mesh
     got = 100 * error(contact="nts", slave=slave, lower=lower, upper=upper)
 
@@ -90,7 +90,8 @@ def test_the_whole_pressure_passes_even_where_its_distribution_is_wrong(contact)
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_the_displacement_is_the_exact_linear_one(form, plane):
-    """ε_y = −p/E′, ε_x = ν′p/E′; in plane strain E′ = E/(1 − ν²), ν′ = ν/(1 − ν)."""
+    """ε_y = −p/E′ and ε_x = ν′p/E′; in plane strain, E′ = E/(1 − ν²) and ν′ = ν/(1 −
+    ν)."""
     keys = {"ratio": 0.25, "plane": plane}
     case, s, _ = solved(form, **keys)
     bodies = model({**FAMILY.defaults, **keys})
@@ -158,7 +159,7 @@ def test_the_displacement_in_space_is_the_exact_linear_one(form):
     case, s, quantities = solved(form, dim=3, distort=0.2, ratio=1.0, lower=4, upper=3)
     points = model(FAMILY.defaults | dict(dim=3, distort=0.2, lower=4, upper=3)).mesh
     u = as_vectors(case.recover(s), 3)
-    # uniaxial stress: strains ν p/E, ν p/E, −p/E
+    # the strains under uniaxial stress are ν p/E, ν p/E and −p/E
     exact = points.points * [0.03, 0.03, -0.1]
     assert u == pytest.approx(exact, abs=1e-9)
     assert quantities["energy"] == pytest.approx(-0.5 * 1e6 * 0.1, rel=1e-8)

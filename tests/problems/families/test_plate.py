@@ -1,4 +1,4 @@
-"""The plate in subdomains: published condition numbers, and agreement of all forms."""
+"""The plate in subdomains: published condition numbers, and agreement of the forms."""
 
 from typing import Any
 
@@ -13,13 +13,13 @@ from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.reference.solve import reference_solution
 
 FAMILY = Plate()
-#: a test of MSolve (Papagiannakis 2011): E of the left column is 1/1000 of the others'
+#: test of MSolve (Papagiannakis 2011); E of the left column is 1/1000 of E elsewhere
 CANTILEVER = (
     "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/load=nodal/"
     "plane=stress/supports=eliminated/glue=redundant"
 )
 CUBES = {"dim": 3, "Sx": 2, "Sy": 2, "Sz": 2}
-#: κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet; n multipliers
+#: keys; number of multipliers; κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet
 PUBLISHED = [
     ({"Sx": 2, "Sy": 2}, 56, (9.9829, 5.63810, 2.9140, 1.8597)),
     ({"Sx": 2, "Sy": 2, "n": 8}, 104, (19.4934, 10.92276, 5.5564, 2.7512)),
@@ -70,11 +70,11 @@ def test_the_cantilever_of_msolve_has_its_sizes():
     keys = {"Sy": 2, "n": 5, "ny": 10, "supports": "eliminated", "glue": "redundant"}
     torn = model(tuple(FAMILY.complete(keys).items())).torn
     rows = model(tuple(FAMILY.complete(keys | {"supports": "rows"}).items())).torn
-    assert torn.c.size == 190  # no gluing of what is held
+    assert torn.c.size == 190  # fixed nodes are not glued
     assert rows.f.size == 1056
     assert torn.f.size == 1056 - 44
     modes = [torn.classes[k].R.shape[1] for k in torn.class_of]
-    assert modes == [0, 3, 3, 3] * 2  # the column at the held edge does not float
+    assert modes == [0, 3, 3, 3] * 2  # the clamped column does not float
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Contact of described bodies with rigid planes, cylinders and spheres."""
+"""Contact of user-defined bodies with rigid planes, cylinders and spheres."""
 
 from dataclasses import replace
 
@@ -56,7 +56,8 @@ DISC = 'shape = "cylinder", centre = [0, -2], radius = 2'
 
 
 def block(folder, toml):
-    """Write a block of 1 m, in space of a depth of 0.5 m, with its foot at zero."""
+    """Write a block of 1 m (in space 0.5 m deep) whose foot is at height zero, and a
+    TOML file; return the path of the latter."""
     if toml.count("traction = [0, -"):
         mesh = rectangle((0, 0), (1, 1), (CELLS[0], CELLS[2]))
         chains = {"left": "left", "foot": "bottom", "top": "top"}
@@ -101,7 +102,8 @@ def test_a_block_on_a_rigid_plane_is_in_uniaxial_stress(tmp_path, contact):
 
 
 def test_a_block_in_plane_strain_on_a_cylinder_is_the_plane_block_on_a_disc(tmp_path):
-    """Both touch on a part of their foot; the cylinder's axis may be of any length."""
+    """Only a part of the foot is in contact, and the vector along the cylinder's axis
+    is not a unit vector."""
     held = 'boundary = "back"\nfix = ["y"]\n[[supports]]\nboundary = "left"'
     toml = TOML.replace(PLANE, CYLINDER).replace('boundary = "left"', held)
     for path in ("relin=1", "steps=2/relin=2"):
@@ -124,7 +126,8 @@ def test_a_block_in_plane_strain_on_a_cylinder_is_the_plane_block_on_a_disc(tmp_
 
 
 def test_forms_and_subdomains_agree_about_a_block_above_a_sphere(tmp_path):
-    """Its clamped edge has no row; deformed nodes touch the sphere to second order."""
+    """The clamped edge has no contact row; after re-linearisation, nodes in contact lie
+    on the sphere to 1e-10."""
     toml = TOML.replace('fix = ["y"]', 'fix = ["x", "y", "z"]').replace("-1e6", "-1e7")
     centre = np.array([0.5, 0.5, -20])
     ball = f'shape = "sphere", centre = {centre.tolist()}, radius = 20'
@@ -147,7 +150,8 @@ def test_forms_and_subdomains_agree_about_a_block_above_a_sphere(tmp_path):
 
 
 def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
-    """A plane, and a sphere that is 0.5 mm above it at one node."""
+    """The bodies are a plane and a sphere whose top is 0.5 mm above the plane at one
+    node."""
     second = '[[contacts]]\nslave = "foot"\nrigid = {{ {} }}\n'
     toml = TOML + second.format(SPHERE.replace("[0, 0, -2]", "[0.5, 0.5, -1.9995]"))
     _, values = solve(block(tmp_path, toml))
@@ -205,7 +209,8 @@ def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, mes
 
 
 def against(problem, rigid):
-    """Return the quantities of a body with one contact pair, on another rigid body."""
+    """Return the quantities of a problem with one contact pair, for another rigid
+    body."""
     (pair,) = problem.bodies.pairs
     pairs = (ContactPair(pair.slave, pair.master, rigid),)
     changed = replace(
@@ -217,7 +222,7 @@ def against(problem, rigid):
 
 
 def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
-    """1/R = 1/8 + 1/24."""
+    """The relative curvature is 1/R = 1/8 + 1/24."""
     family = PROBLEMS["hertz-sphere"]
     problem = family.contact_problem(family.complete({"n": 4}))
     values = against(problem, RigidSphere((0.0, 0.0, -24.0), 24.0))
@@ -230,7 +235,8 @@ def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
 
 
 def test_a_cylinder_on_a_rigid_cylinder_touches_as_hertz_says():
-    """1/R = 1/8 + 1/24 mm; in the plane, a cylinder is a disc."""
+    """The relative curvature is 1/R = 1/8 + 1/24 per mm; in the plane, a cylinder is a
+    disc."""
     family = PROBLEMS["hertz-plane"]
     problem = family.contact_problem(family.complete({"n": 8, "load": 5.0}))
     values = against(problem, RigidSphere((0.0, -24e-3), 24e-3))

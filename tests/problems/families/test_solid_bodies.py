@@ -1,4 +1,4 @@
-"""Bodies in space from gmsh files, compared with exact solutions and cut bodies."""
+"""Bodies in space from gmsh files, compared with exact solutions and divided bodies."""
 
 import meshio
 import numpy as np
@@ -50,7 +50,8 @@ def build(text):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keys", ["primal", "dual", "basis=standard/dual"])
 def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
-    """u = p/E (ν x, ν y, −z) in both blocks, on interfaces that do not match."""
+    """On interfaces that do not match, the displacement is p/E (ν x, ν y, −z) in both
+    blocks."""
     case = build(f"bodies:{solid_blocks(tmp_path, KINDS[kind])}/{keys}")
     s = reference_solution(case.qp)
     fields = case.fields(s)
@@ -61,7 +62,7 @@ def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, key
     assert abs(fields.displacement - exact).max() <= 1e-9 * abs(exact).max()
     assert pair["force"]["upper"] == pytest.approx([0, 0, PRESSURE], abs=1e-9 * 1e6)
     assert pair["largest_pressure"] == pytest.approx(PRESSURE, rel=1e-9)
-    # half the work of the load: area 1, the top moves by −2p/E
+    # half the work of the load on the area 1, whose displacement is −2p/E
     assert values["energy"] == pytest.approx(-(PRESSURE**2) / E, rel=1e-9)
 
 
@@ -88,7 +89,8 @@ def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
 
 
 def test_loads_on_faces_are_spread_by_area(tmp_path):
-    """Both tetrahedra and a total force; the corners' shares differ by triangles."""
+    """Tractions and total forces are tested on tetrahedra, whose numbers of triangles
+    differ from corner to corner."""
     for load in ("traction = [3e5, -2e5, 1e6]", "force = [3e5, -2e5, 1e6]"):
         toml = TOML.replace("traction = [0, 0, -1e6]", load)
         whole = read_bodies(solid_blocks(tmp_path, TETRAHEDRA, toml), "strain")
@@ -142,7 +144,7 @@ def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
         ("[0, 0, -1e6]", "[0, -1e6]", "",
          "traction = [0, -1000000.0]; expected three numbers, [x, y, z]"),
         ('fix = ["z"]', 'fix = ["w"]', "", "unknown component 'w'; known: x, y, z"),
-        ('boundary = "top"', 'boundary = "base"', "", "acts on 'base' in z, which fix"),
+        ('boundary = "top"', 'boundary = "base"', "", "acts on 'base' in z, where a"),
         ('fix = ["y"]', 'fix = ["x"]', "",
          "body 'upper': nothing balances its load in y; expected a support"),
     ],
@@ -161,7 +163,8 @@ def test_what_volumes_do_not_support_is_refused_in_one_line(
 
 
 def test_a_block_that_tips_over_an_edge_is_refused_with_its_axis(tmp_path):
-    """Its resultant acts at x = 1.25, beyond the edge x = 1 of its foot."""
+    """The resultant of the loads acts at x = 1.25, beyond the edge of the foot at
+    x = 1."""
     toml = TOML.replace('boundary = "left"', 'boundary = "foot"')
     toml = toml.replace('boundary = "front"', 'boundary = "foot"')
     toml = toml.replace('fix = ["z"]', 'fix = ["x", "y", "z"]')

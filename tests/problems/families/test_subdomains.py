@@ -100,7 +100,7 @@ def test_bodies_with_friction_are_cut_into_parts(press):
 
 @pytest.mark.parametrize("name", ["obstacle/n=8", "obstacle/dim=1/n=9"])
 def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
-    """The solution is that of the form that eliminates supports."""
+    """The solution equals that of the form in which supports are eliminated."""
     u, _ = in_one_piece(name)
     eliminated = built(f"{name}/dual-bounds")
     exact = eliminated.mechanics.to_primal(reference_solution(eliminated.qp)).x
@@ -146,7 +146,8 @@ def test_keys_that_do_not_fit_are_refused_before_anything_is_built(
 
 @pytest.mark.parametrize(("n", "most"), [(4, 45), (8, 60)])
 def test_subdomains_of_graded_meshes_are_compact(n, most):
-    """Blocks of 8 × 8 cells would require 95 and 359 products."""
+    """With blocks of 8 × 8 cells, 95 (n = 4) and 359 (n = 8) products would be
+    required."""
     case = built(f"hertz-plane/n={n}/feti=8/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
 

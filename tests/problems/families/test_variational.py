@@ -24,14 +24,16 @@ def solved(family, solver=None, **keys):
     [(4, -0.22474), (10, -0.17896), (23, -0.18005), (32, -0.18030), (75, -0.18055)],
 )
 def test_the_journal_bearing_has_its_published_optimum(points, optimum):
-    """JNLBRNG1 of CUTEst, whose sizes include the boundary points."""
+    """The optima are those of JNLBRNG1 of CUTEst, whose sizes include the boundary
+    points."""
     case, s = solved(JournalBearing(), n=points - 2)
 
     assert case.quantities(s)["energy"] == pytest.approx(optimum, abs=6e-6)
 
 
 def test_the_film_is_symmetric_and_carries_where_it_narrows():
-    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −sin ξ pushes up in the first half only."""
+    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −ε sin ξ is negative for ξ < π only, which
+    makes v positive there."""
     n = 31
     _, s = solved(JournalBearing(), n=n, eccentricity=0.6)
     v = s.x.reshape(n, n)
@@ -42,7 +44,8 @@ def test_the_film_is_symmetric_and_carries_where_it_narrows():
 
 
 def test_an_elastic_bar_has_saint_venant_s_stiffness():
-    """No bound is met for c < 2.96: energy −½c² Σ 64/(π⁶i²k²(i² + k²)), i and k odd."""
+    """For c < 2.96 no bound is active, and the energy is −½c² Σ 64/(π⁶i²k²(i² + k²))
+    over odd i and k."""
     odd = np.arange(1, 200, 2.0)
     i, k = np.meshgrid(odd, odd)
     volume = (64 / (np.pi**6 * i**2 * k**2 * (i**2 + k**2))).sum()
@@ -58,7 +61,8 @@ def test_an_elastic_bar_has_saint_venant_s_stiffness():
 
 @pytest.mark.parametrize("twist", [1e4, 1e8])
 def test_a_plastic_bar_is_a_roof(twist):
-    """v is the distance d from the boundary: |∇d| = 1, volume ⅙; ridges are kinks."""
+    """v is the distance from the boundary, with |∇v| = 1 except at the ridges and the
+    volume ⅙."""
     n = 31
     case, s = solved(Torsion(), n=n, twist=twist)
     h, roof = 1 / (n + 1), case.qp.ub
@@ -72,7 +76,7 @@ def test_a_plastic_bar_is_a_roof(twist):
 
 
 def test_a_bar_twisted_back_is_its_mirror_image():
-    """With −c, the other bound is active and v changes its sign."""
+    """If c changes sign, v changes sign, and the opposite bound is active."""
     case, s = solved(Torsion(), n=20)
     qp = case.qp
     back = SMALBE().prepare(type(qp)(
@@ -83,7 +87,8 @@ def test_a_bar_twisted_back_is_its_mirror_image():
 
 
 def test_the_string_bends_by_its_load_or_lies_on_the_obstacle():
-    """Second differences are 30h² off the obstacle, and smaller on it."""
+    """Second differences are 30h² off the obstacle, and at most 30h² on the
+    obstacle."""
     n = 100
     case, s = solved(String(), n=n)
     bend = np.diff(s.x, 2) * (n - 1) ** 2

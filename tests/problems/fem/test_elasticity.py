@@ -36,7 +36,7 @@ STEEL = Material(E=200e9, nu=0.3)
 
 
 def distorted(n, amplitude=0.15):
-    """Unit square of n × n quadrilaterals, smoothly distorted."""
+    """Return the unit square of n × n quadrilaterals, smoothly distorted."""
     mesh = rectangle((0, 0), (1, 1), (n, n))
     x, y = mesh.points.T
     bump = amplitude * np.sin(np.pi * x) * np.sin(np.pi * y)
@@ -70,7 +70,7 @@ def test_plane_strain_stiffness_equals_an_independent_code(mesh):
 
 
 def bricks(n, amplitude=0.05):
-    """Unit cube of n³ hexahedra, smoothly distorted."""
+    """Return the unit cube of n³ hexahedra, smoothly distorted."""
     i = np.arange((n + 1) ** 3).reshape(n + 1, n + 1, n + 1)
     corners = (HEXAHEDRON.corners + 1) // 2
     at = [i[x : x + n, y : y + n, z : z + n].ravel() for x, y, z in corners]
@@ -81,7 +81,7 @@ def bricks(n, amplitude=0.05):
 
 def test_stiffness_of_hexahedra_equals_an_independent_code():
     mesh = bricks(3)
-    theirs = MeshHex().p  # their order of corners, in [0, 1]³
+    theirs = MeshHex().p  # corners of scikit-fem, in [0, 1]³
     ours = (HEXAHEDRON.corners + 1) / 2
     order = [int((ours == corner).all(axis=1).argmax()) for corner in theirs.T]
     reference = Basis(
@@ -105,7 +105,7 @@ def test_stiffness_of_one_hexahedron_equals_quadrature_by_hand():
     D, x = elasticity_matrix(STEEL, None), mesh.points[mesh.cells[0]]
     expected = np.zeros((24, 24))
     for at in HEXAHEDRON.corners / np.sqrt(3):
-        step = 1e-30j  # derivatives to all digits
+        step = 1e-30j  # complex step: no cancellation
         moved = at + step * np.eye(3)
         N = np.prod(1 + HEXAHEDRON.corners * moved[:, None], axis=2) / 8  # (3, 8)
         dN = N.imag / step.imag
@@ -158,7 +158,7 @@ def test_rigid_modes_of_any_dimension_are_orthonormal_rigid_motions(points, mode
 
     assert R.shape == (N * dim, modes)
     np.testing.assert_allclose(R.T @ R, np.eye(modes), atol=1e-14)
-    apart = points[:, None] - points  # no distance changes, to first order
+    apart = points[:, None] - points  # distances are unchanged to first order
     for mode in R.T:
         v = as_vectors(mode, dim)
         change = np.einsum("abx,abx->ab", apart, v[:, None] - v)
@@ -197,7 +197,7 @@ def test_rigid_motions_have_no_energy(plane):
 
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 def test_a_linear_displacement_has_its_exact_stress_and_no_inner_force(plane):
-    """Patch test: ε = (1, −2, 3)·10⁻³ on distorted cells."""
+    """In this patch test, ε = (1, −2, 3)·10⁻³ on distorted cells."""
     mesh = distorted(5)
     x, y = mesh.points.T
     u = np.column_stack([1e-3 * x + 1e-3 * y, 2e-3 * x - 2e-3 * y]).ravel()
@@ -222,7 +222,8 @@ def test_a_linear_displacement_has_its_exact_stress_and_no_inner_force(plane):
 
 
 def test_recovered_stress_converges_with_second_order_up_to_the_boundary():
-    """u = (sin 2x cos y, x² y) interpolated on smooth meshes; exact σ by hand."""
+    """The displacement u = (sin 2x cos y, x² y) is interpolated on smoothly distorted
+    meshes."""
     D = elasticity_matrix(Material(E=1.0, nu=0.3), "strain")
     errors = []
     for n in (16, 32, 64):
@@ -243,8 +244,11 @@ def test_recovered_stress_converges_with_second_order_up_to_the_boundary():
 
 
 def test_recovered_stress_of_a_finite_element_solution_has_rate_two():
-    """Manufactured: u = (sin 2x cos y, x² y) on the boundary and the body force that
-    belongs to it, through its weak form ∫f·v = ∫σ:ε(v); inside and on the boundary."""
+    """The manufactured solution is u = (sin 2x cos y, x² y).
+
+    Its values are prescribed on the boundary, and the body force f follows from
+    ∫f·v = ∫σ:ε(v). The rate is measured at inner nodes and at boundary nodes.
+    """
     D = elasticity_matrix(Material(E=1.0, nu=0.3), "strain")
 
     def exact_stress(x, y):
@@ -300,7 +304,8 @@ def test_von_mises_of_elementary_states(stress, plane, expected):
 
 
 def test_stress_at_the_gauss_points_of_a_bilinear_field():
-    """u = (xy, 0) on a unit square: ε = (y, 0, x), in the order of the corners."""
+    """For u = (xy, 0) on the unit square, ε = (y, 0, x); Gauss points are in the order
+    of the corners."""
     mesh = rectangle((0, 0), (1, 1), (1, 1))
     u = np.zeros(8)
     u[0::2] = mesh.points.prod(axis=1)
@@ -312,7 +317,7 @@ def test_stress_at_the_gauss_points_of_a_bilinear_field():
 
 
 def test_a_half_disc_with_triangles_at_its_centre_stretches_exactly():
-    """Constant strain ε: uᵀKu is ε·Dε times the area, and K has three rigid modes."""
+    """For a constant strain ε, uᵀKu is ε·Dε times the area; K has three rigid modes."""
     mesh = half_disc((0, 1), np.linspace(-np.pi, 0, 9), np.array([1, 0.8, 0.3]))
     D = elasticity_matrix(STEEL, "strain")
     K = stiffness(mesh, D)

@@ -27,7 +27,7 @@ NEARLY = Material(E=1.0, nu=0.49)
 
 
 def stretched(material, lateral_free):
-    """Return the stretch λ₁ with P₁₁ = 0 for a stretch λ₂, and F."""
+    """Return F = diag(λ₁, λ₂) with P₁₁ = 0 for the stretch λ₂ = `lateral_free`."""
     free = brentq(
         lambda l: material.stress(np.diag([l, lateral_free]))[0, 0], 0.7, 1.6,
         xtol=1e-15,
@@ -72,7 +72,8 @@ def test_st_venant_kirchhoff_in_uniaxial_stress_is_a_cubic(stretch):
 
 
 def mixed(nu):
-    """A distorted block of quadrilaterals below a half disc with triangles."""
+    """Return a mesh of a block of quadrilaterals and a half disc with triangles, both
+    distorted, with bodies and materials."""
     block = rectangle((0.0, 0.0), (2.0, 1.0), (4, 3))
     disc = half_disc((0.0, 3.0), np.linspace(0, np.pi, 7), np.array([1.0, 0.5]))
     mesh, body = join((block, disc))
@@ -116,7 +117,8 @@ def test_forces_and_tangent_are_the_derivatives_of_the_energy(name, nu):
 @every_material
 @both_elements
 def test_cells_agree_with_the_sums_over_their_points(name, nu):
-    """Compare the compiled loops with the formulas of the documentation in numpy."""
+    """The compiled loops are compared with the formulas of the documentation in
+    NumPy."""
     c = cells(name, nu)
     u = random_state(c.mesh)
     F = deformation_gradients(c, u)
@@ -175,10 +177,11 @@ def test_a_rotated_state_gives_rotated_forces(name, nu):
 def test_an_independent_code_has_the_same_forces_and_tangent(
     name, size, along, curvature
 ):
-    """FElupe 11.3.0 (FieldPlaneStrain, RegionQuad) on this mesh and displacement.
+    """The digits are from FElupe 11.3.0 (FieldPlaneStrain, RegionQuad) on this mesh.
 
-    Its NeoHookeCompressible and saint_venant_kirchhoff, with our Lamé constants: ‖r‖,
-    rᵀv and vᵀKv. All entries agree with ours to 2e-15; they are not kept here.
+    They are ‖r‖, rᵀv and vᵀKv for NeoHookeCompressible and saint_venant_kirchhoff with
+    equal Lamé constants. All entries of r and K, which are not stored here, agreed to
+    2e-15.
     """
     mesh = rectangle((0.0, 0.0), (2.0, 1.0), (4, 3))
     x, y = mesh.points.T
@@ -209,7 +212,8 @@ def test_the_tangent_without_strain_is_that_of_linear_elasticity(name):
 
 @every_material
 def test_in_homogeneous_states_both_elements_agree_with_the_material(name):
-    """For constant F, the mean dilatation changes neither P nor σ = PFᵀ/J and σ_z."""
+    """For constant F, the mean dilatation changes neither the energy nor the stress
+    σ = PFᵀ/J."""
     mesh, body, _ = mixed(0.3)
     F = np.array([[1.2, 0.3], [-0.1, 0.9]])
     u = (mesh.points @ (F - np.eye(2)).T).ravel()
@@ -227,7 +231,7 @@ def test_in_homogeneous_states_both_elements_agree_with_the_material(name):
 
 
 def test_neo_hooke_stress_out_of_the_plane_is_that_of_a_confined_cube():
-    """σ_z = ΛlnJ/J: μ(B₃₃ − 1) vanishes as F₃₃ = 1."""
+    """σ_z = Λ ln J/J, because μ(B₃₃ − 1) = 0 for F₃₃ = 1."""
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     material = hyperelastic("neo-hooke", SOFT)
     c = cells_of(mesh, [material], np.zeros(4, dtype=np.int64))
@@ -240,7 +244,7 @@ def test_neo_hooke_stress_out_of_the_plane_is_that_of_a_confined_cube():
 
 
 def test_mean_dilatation_does_not_lock_where_four_points_do():
-    """Pure bending of one cell, which leaves its mean dilatation unchanged."""
+    """A single cell is bent, which leaves its mean dilatation unchanged."""
     mesh = rectangle((-1.0, -1.0), (2.0, 2.0), (1, 1))
     bend = (np.prod(mesh.points, axis=1)[:, None] * [0.01, 0.0]).ravel()
     material = hyperelastic("neo-hooke", Material(1.0, 0.4999))
@@ -286,7 +290,7 @@ def test_clipping_leaves_convex_matrices_and_raises_negative_eigenvalues():
 
 
 def test_only_a_tangent_that_is_not_convex_is_changed():
-    """A strip under compression buckles; under tension it does not."""
+    """A strip buckles under compression but not under tension."""
     mesh = rectangle((0.0, 0.0), (10.0, 1.0), (20, 2))
     c = cells_of(
         mesh, [hyperelastic("neo-hooke", SOFT)], np.zeros(40, dtype=np.int64)
@@ -311,7 +315,7 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
 
 
 def test_convex_cells_are_unchanged_also_triangles():
-    """Without strain, no cell is changed, even if K_t counts as indefinite."""
+    """Without strain, no cell tangent is changed, even if K_t counts as indefinite."""
     c = cells("neo-hooke", 0.3)
     tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
     asked = iter([False, True])

@@ -49,7 +49,7 @@ def test_the_area_of_a_half_ring_converges_with_second_order():
     ids=["rectangle", "half ring", "half disc"],
 )
 def test_every_boundary_has_the_body_on_its_left(mesh):
-    """Edge normals sum to zero and ∮ x·n ds is twice the area (Gauss)."""
+    """Edge normals sum to zero, and ∮ x·n ds is twice the area (Gauss)."""
     flux, total = 0.0, np.zeros(2)
     for nodes in mesh.boundaries.values():
         x = mesh.points[nodes]
@@ -117,7 +117,7 @@ def test_nodal_lengths_integrate_linear_functions_along_a_chain():
 
 
 def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
-    """The rigid modes of each body are written to a block of rows of R."""
+    """R stores the rigid modes of each body in a block of consecutive rows."""
     bodies = model(1, 1, 2, "strain")
     shuffle = np.random.default_rng(271828).permutation(len(bodies.mesh.points))
     mesh = replace(bodies.mesh, cells=shuffle[bodies.mesh.cells])
@@ -128,7 +128,7 @@ def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
 
 @pytest.fixture(params=["tests/data/press.msh", "suites/crossval/punch.msh"])
 def named(request):
-    """Triangles, and quadrilaterals, of several bodies with named sides."""
+    """Mesh of several bodies with named sides, of triangles or quadrilaterals."""
     return read_msh(ROOT / request.param)
 
 
@@ -143,7 +143,7 @@ def test_halved_cells_fill_each_body_and_meet_at_whole_edges(named):
         )
         assert after == pytest.approx(before, rel=1e-13)
         assert len(fine.surfaces[name]) == 4 * len(cells)
-    # Euler's characteristic stays; a node that hangs on an edge would change it
+    # Euler's characteristic is preserved; a hanging node would change it
     before, after = (len(m.points) - edges(m) + len(m.cells) for m in (named, fine))
     assert after == before
 
@@ -167,7 +167,7 @@ def test_halved_sides_are_the_same_polygons_with_the_body_on_their_left(named):
 
 
 def test_triangles_are_halved_into_similar_ones(named):
-    """Ratios of sides to area are preserved, so that no angle degenerates."""
+    """The ratios between the sides are preserved, so that no angle degenerates."""
 
     def shapes(mesh):
         cells = mesh.cells[mesh.cells[:, 2] == mesh.cells[:, 3]][:, :3]

@@ -1,4 +1,4 @@
-"""Meshes of Abaqus, CalculiX and Salome: the bodies and sides of the same .msh file."""
+"""Meshes of Abaqus, CalculiX and Salome: same bodies and sides as the .msh file."""
 
 import h5py
 import numpy as np
@@ -22,7 +22,7 @@ WRITERS = {
 
 
 def facets(named, name):
-    """Corners of the facets of a side by their coordinates, in any order."""
+    """Return the set of facets of a side, each as a set of corner coordinates."""
     places = named.points.round(12).tolist()
     return {frozenset(tuple(places[n]) for n in facet)
             for facet in named.curves[name].tolist()}  # fmt: skip
@@ -45,7 +45,7 @@ def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
     assert energies[1] == pytest.approx(energies[0], rel=1e-12)
     for side in expected.curves:
         assert facets(chosen, side) == facets(expected, side)
-        # from outside the corners are anticlockwise
+        # corners are anticlockwise as seen from outside
         for one in (chosen, expected):
             a, b, c, d = np.moveaxis(one.points[one.curves[side]], 1, 0)
             one.spots[f"area {side}"] = np.cross(c - a, d - b).sum(axis=0)
@@ -61,7 +61,7 @@ def named_like(path, expected):
     return named_mesh(read_mesh_file(path), expected.surfaces)
 
 
-#: the corners of one element, and the plane of each face S1, S2, …: axis and position,
+#: corners of one element, and the plane (axis and position) of each face S1, S2, …,
 #: or None for the oblique face
 ONE = {
     "C3D8": (
@@ -135,7 +135,7 @@ def test_sets_may_be_generated_nested_continued_and_in_any_case(tmp_path):
 
 
 def test_nodes_may_come_in_several_blocks_and_lines_may_end_in_a_comma(tmp_path):
-    """meshio keeps the last block of nodes only."""
+    """meshio would keep the last block of nodes only."""
     text = one_element("C3D8").replace("\n5, 0, 0, 1", ",\n*NODE\n5, 0, 0, 1,")
     (tmp_path / "a.inp").write_text(text.replace("*Element, ", "*Element,\n"))
 
@@ -223,7 +223,8 @@ def test_sets_of_sets_without_end_are_refused(tmp_path):
 
 
 def med(tmp_path, change):
-    """Write the blocks as a MED file and change it by h5py."""
+    """Write the mesh of the blocks as a MED file, and apply `change` to the open
+    file."""
     solid_blocks(tmp_path)
     write_med(tmp_path / "blocks.msh", tmp_path / "a.med")
     with h5py.File(tmp_path / "a.med", "r+") as file:
@@ -232,7 +233,7 @@ def med(tmp_path, change):
 
 
 def test_groups_of_nodes_are_boundaries_and_a_kind_may_have_no_families(tmp_path):
-    """meshio refuses files in which some kinds of cells have no families."""
+    """meshio rejects files in which cells of some kind have no families."""
 
     def change(file, step):
         del step["MAI/QU4/FAM"]

@@ -29,7 +29,7 @@ every_method = pytest.mark.parametrize(("contact", "basis"), METHODS)
 
 
 def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
-    """Assemble the same bodies with some arguments replaced."""
+    """Assemble the bodies again, with some arguments replaced."""
     return assemble(
         mesh or bodies.mesh, bodies.body, names=bodies.names,
         materials=bodies.materials, plane=bodies.plane,
@@ -41,9 +41,9 @@ def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
 
 @cache
 def mirrored(bodies, about):
-    """Reflect about the line x = `about`, m.
+    """Return the bodies reflected about the line x = `about`, m.
 
-    What ran anticlockwise runs clockwise: cells and chains are turned round.
+    Reflection reverses orientations; hence cells and chains are reversed.
     """
     mesh, flip = bodies.mesh, sign(bodies)
     points = mesh.points * [-1, 1] + [2 * about, 0]
@@ -71,7 +71,7 @@ def load_path(bodies, contact, basis, relin=1):
 
 @cache
 def results(bodies, contact, basis, form):
-    """Solve the QP of the last step in `form`; return u, m, and SI quantities."""
+    """Solve the QP of the last step in `form`; return u in m, and SI quantities."""
     primal = load_path(bodies, contact, basis).primal(STEPS)
     case = contact_case(
         bodies, primal, form, floating=lambda: factorise_floating(bodies),
@@ -108,7 +108,8 @@ def test_stiffness_and_load_are_mirrored(bodies):
 
 
 def kinked(bodies):
-    """Bend the beam to a V, whose tip is the closest point of several nodes."""
+    """Return a displacement that bends the beam to a V, whose tip is the closest point
+    of several nodes."""
     u = np.zeros((len(bodies.mesh.points), 2))
     beam = bodies.body_of_node == 0
     u[beam, 1] = 2 * abs(bodies.mesh.points[beam, 0] - 1.0625)
@@ -119,7 +120,7 @@ def kinked(bodies):
 @pytest.mark.parametrize("about", [1.0, -3.7])
 @pytest.mark.parametrize("state", ["loaded", "kinked"])
 def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
-    """Contact inside segments after sliding, and at a corner, with chains reversed."""
+    """Closest points are inside segments after sliding, or at the tip of a V."""
     there, flip = mirrored(bodies, about), sign(bodies)
     loaded = load_path(bodies, contact, basis).solution(1) * bodies.length
     u = loaded if state == "loaded" else kinked(bodies)
@@ -153,16 +154,16 @@ def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, for
     assert_allclose(v, sign(bodies) * u, rtol=0, atol=1e-8 * abs(u).max())
     assert other == pytest.approx(here, rel=1e-8)
     assert here["energy"] == pytest.approx(here["objective"], rel=1e-9)
-    assert here["up"] > bodies.force  # the ring holds the beam
+    assert here["up"] > bodies.force  # the ring supports the beam
 
 
-#: of length and of force per thickness: SI; mm and N/mm; m and GN/m; inches and lbf
+#: units of length and of force per thickness: SI; mm, N/mm; m, GN/m; inches, lbf
 UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
 
 
 @cache
 def measured(units=None):
-    """Return the same bodies, optionally with other units of their QPs."""
+    """Return the bodies of a small benchmark, optionally with other units."""
     return again(measured(), units=units) if units else model(4, 3, 4, "strain")
 
 

@@ -34,7 +34,8 @@ MESHES = {
 
 
 def definite(mesh):
-    """Return a stiffness matrix on an elastic foundation."""
+    """Return the positive definite stiffness matrix of a mesh on an elastic
+    foundation."""
     D = elasticity_matrix(MATERIAL, "stress" if mesh.dim == 2 else None)
     return csc_array(stiffness(mesh, D) + 7.0 * eye_array(mesh.dofs))
 
@@ -51,12 +52,12 @@ def dense(factor):
 
 
 def choices(mesh):
-    """Choices of free components and of components eliminated last."""
+    """Return pairs of free components and of components that are eliminated last."""
     n, rng = mesh.dofs, np.random.default_rng(161803)
     every, half = np.arange(n), np.sort(rng.permutation(n)[: n // 2])
     return [
         (every, half[::5]), (half, half[::7]), (every, every), (every, every[:0]),
-        (every[n // 2 :], every[n // 2 :: 9]),  # whole fronts have nothing to eliminate
+        (every[n // 2 :], every[n // 2 :: 9]),  # some fronts have no pivots
     ]  # fmt: skip
 
 
@@ -115,7 +116,7 @@ def test_the_trailing_blocks_are_the_schur_complements_of_each_body():
 
 
 def test_a_separator_separates():
-    """No front couples the two subtrees below it."""
+    """No entry of K couples the two subtrees below a separator."""
     mesh = MESHES["beam"]
     K = definite(mesh)
     order, f = dissect(K, mesh.points, np.arange(4))

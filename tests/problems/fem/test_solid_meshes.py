@@ -1,4 +1,4 @@
-"""Meshes in space from gmsh's files: cells, orientation, names, refusals."""
+"""Meshes in space from gmsh files: cells, orientation, names, rejected files."""
 
 import meshio
 import numpy as np
@@ -16,7 +16,7 @@ CUBE = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))
 
 
 def blocks_of(mesh, name, names):
-    """Cells, and faces of the bottom and the top, with numbers of their names."""
+    """Return cells, and faces of bottom and top, with the numbers of their names."""
     faces = [(side, mesh.boundaries[side]) for side in ("bottom", "top")]
     out = [(block.kind, block.nodes, names[name]) for block in mesh.blocks]
     for side, faces_of_side in faces:
@@ -28,7 +28,7 @@ def blocks_of(mesh, name, names):
 
 
 def write(path, bodies, version="2.2", binary=False):
-    """Write bodies, by name, as gmsh does; nodes of one body after another."""
+    """Write named bodies as gmsh does; nodes are numbered body by body."""
     names, cells, tags, points, start = {}, [], [], [], 0
     for name in bodies:
         for part in (name, f"{name}_bottom", f"{name}_top"):
@@ -52,7 +52,7 @@ def write(path, bodies, version="2.2", binary=False):
 
 
 def cut(corners=None, shift=0.0):
-    """A cube of one kind of cells with triangles or quadrilaterals as its faces."""
+    """Return a cube of one kind of cells, with triangular or quadrilateral faces."""
     mesh = Mesh(np.add(CUBE.points, [shift, 0, 0]), CUBE.cells, CUBE.boundaries)
     if corners is None:
         return mesh

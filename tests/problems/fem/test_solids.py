@@ -1,4 +1,4 @@
-"""Tetrahedra, wedges, hexahedra: exact solutions, an independent code, invariants."""
+"""Tetrahedra, wedges and hexahedra: exact solutions, independent code, invariants."""
 
 import numpy as np
 import pytest
@@ -64,14 +64,14 @@ PEERS = {
 
 
 def cube(kind, n=3, amplitude=0.05):
-    """Unit cube of one kind of cells, smoothly distorted."""
+    """Return the unit cube of one kind of cells, smoothly distorted."""
     mesh = bent(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (n, n, n)), amplitude)
     corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
     return mesh if corners is None else divided(mesh, corners)
 
 
 def independent(mesh, **rule):
-    """Assemble the stiffness by scikit-fem."""
+    """Assemble the stiffness matrix with scikit-fem."""
     theirs, element, ours = PEERS[mesh.element.kind]
     place = [int(np.abs(np.subtract(ours, x)).sum(axis=1).argmin())
              for x in element.doflocs]  # fmt: skip
@@ -81,7 +81,8 @@ def independent(mesh, **rule):
 
 
 def quadrature(element):
-    """Our quadrature on scikit-fem's reference cell, where intervals are [0, 1]."""
+    """Return our quadrature rule on scikit-fem's reference cell, with intervals [0,
+    1]."""
     points, weights = element.points.T.copy(), element.weights.copy()
     axis = 0
     for simplex in element.simplices:
@@ -93,9 +94,9 @@ def quadrature(element):
 
 
 def exact_rule(kind):
-    """Quadrature of degree 6 on scikit-fem's reference cell.
+    """Return a quadrature rule of degree 6 on scikit-fem's reference cell.
 
-    Its own rule for wedges (12.0.2) has weights that sum to 1/4 instead of 1/2.
+    The rule of scikit-fem 12.0.2 for wedges has weights that sum to 1/4 instead of 1/2.
     """
     if kind != "wedge":
         return get_quadrature({"tetra": RefTet, "hexahedron": RefHex}[kind], 6)
@@ -159,7 +160,8 @@ def test_shape_functions_interpolate_and_their_gradients_are_derivatives(element
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_linear_displacement_has_its_constant_stress_and_solves_the_problem(kind):
-    """Patch test: K u = 0 at inner nodes, and the boundary values determine u."""
+    """In this patch test, K u = 0 at inner nodes, and the boundary values determine
+    u."""
     mesh, gradient = cube(kind), np.arange(9).reshape(3, 3) / 7 - 0.4
     u = (mesh.points @ gradient.T).ravel()
     e = (gradient + gradient.T) / 2
@@ -199,7 +201,7 @@ def test_degenerate_hexahedra_have_the_stiffness_of_the_cells_themselves():
 
 
 def turned(facet):
-    """Start a facet from its lowest node, with a repeated corner left out."""
+    """Return the distinct corners of a facet, starting from the lowest number."""
     corners = list(dict.fromkeys(facet))
     first = corners.index(min(corners))
     return (*corners[first:], *corners[:first])
@@ -224,7 +226,7 @@ def test_facets_enclose_the_body_anticlockwise_from_outside(kind, faces):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("size", [(1, 1, 1), (1, 1, 12), (9, 2, 1)])
 def test_six_rigid_modes_are_the_kernel_of_a_floating_inverse(kind, size):
-    """The body is also a bar, whose central nodes alone would be collinear."""
+    """Some bodies are bars, whose central nodes alone would be collinear."""
     mesh = box((0.0, 0.0, 0.0), tuple(map(float, size)), size)
     corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
     mesh = mesh if corners is None else divided(mesh, corners)
@@ -238,7 +240,8 @@ def test_six_rigid_modes_are_the_kernel_of_a_floating_inverse(kind, size):
 
 
 def test_recovered_stress_of_a_bent_bar_converges_with_second_order():
-    """Pure bending: σ_z = −E κ x, exact in space with anticlastic curvature."""
+    """Pure bending with anticlastic curvature has the exact stress σ_z = −E κ x in
+    space."""
     nu, kappa, errors = STEEL.nu, 1e-3, []
     for n in (4, 8, 16):
         mesh = bent(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (n, n, n)), 0.03)
@@ -274,7 +277,7 @@ def test_the_fill_of_a_box_does_not_depend_on_its_orientation():
 
 @pytest.mark.parametrize("across", [1, 2, 3])
 def test_fixing_nodes_of_bars_exclude_every_rotation(across):
-    """The central nodes of 3 × 3 × 11 cells alone are on an axis of rotation."""
+    """The central nodes of 3 × 3 × 11 cells would be on an axis of rotation."""
     for length in range(1, 30):
         divisions = across, across, length
         mesh = box((0.0, 0.0, 0.0), tuple(map(float, divisions)), divisions)

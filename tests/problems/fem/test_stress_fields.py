@@ -24,14 +24,15 @@ STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
 
 
 def stretched(bodies):
-    """u = (ε_x x + γ y, ε_y y): linear, so the strain is the same everywhere."""
+    """Return the linear displacement u = (ε_x x + γ y, ε_y y), with constant strain."""
     x, y = bodies.mesh.points.T
     return np.column_stack([STRAIN[0] * x + STRAIN[2] * y, STRAIN[1] * y]).ravel()
 
 
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 def test_each_body_has_the_stress_of_its_own_material_up_to_its_boundary(plane):
-    """An average across the bodies would mix 200 and 20 GPa where they touch."""
+    """An average over both bodies would mix the moduli 200 and 20 GPa at the
+    interface."""
     bodies = model(2, 2, 4, plane)
     nodal = nodal_stresses(bodies, stretched(bodies))
 
@@ -43,7 +44,7 @@ def test_each_body_has_the_stress_of_its_own_material_up_to_its_boundary(plane):
 
 
 def test_plane_strain_has_a_stress_across_the_plane_and_plane_stress_none():
-    """σ_z keeps ε_z = (σ_z − ν(σ_x + σ_y))/E at zero."""
+    """In plane strain, σ_z follows from ε_z = (σ_z − ν(σ_x + σ_y))/E = 0."""
     strain, stress = (
         nodal_stresses(b, stretched(b)) for b in (model(2, 2, 4, p) for p in PLANES)
     )
@@ -117,7 +118,7 @@ def test_all_six_stresses_of_a_body_in_space_are_exact():
     "inverse", [factorise_clamped, factorise_supported, factorise_floating]
 )
 def test_bodies_in_space_stand_under_forces_at_one_corner(inverse):
-    """K⁺ of a cube on its clamped side, and of one that floats."""
+    """K⁺ is tested for a cube with a clamped side and for a floating cube."""
     fixed = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
     bodies = cube(fixed)
     b = np.zeros(bodies.mesh.dofs)

@@ -1,4 +1,4 @@
-"""Linear triangles, as degenerate quadrilaterals, compared with exact elasticity."""
+"""Linear triangles as degenerate quadrilaterals, compared with exact elasticity."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_a_constant_strain_has_its_stress_at_centres_and_at_every_node(quads):
 
 
 def test_a_linear_stress_is_recovered_from_the_centroids():
-    """The centroid of a triangle is not the mean of its four listed corners."""
+    """The centroid of a triangle is not the mean of its four stored corners."""
     mesh = halved(rectangle((0, 0), (1, 1), (5, 4)))
     centroid = mesh.points[mesh.cells[:, :3]].mean(axis=1)
     linear = np.array([[1.0, 2.0, 0.5], [-3.0, 1.0, 2.0]])
@@ -78,9 +78,10 @@ def test_the_boundary_of_triangles_is_that_of_their_quadrilaterals():
 
 
 def bending(n):
-    """Solve pure bending of a plate of n × n halved squares; Dirichlet all around.
+    """Return energy and stress error of a bent plate of n × n halved squares.
 
-    Plane stress, E = 1: u = (xy, −(x² + νy²)/2), σ_x = y, no other stress, no load.
+    The exact solution in plane stress with E = 1 is u = (xy, −(x² + νy²)/2) with
+    σ_x = y and no load; u is prescribed on the whole boundary.
     """
     mesh = halved(rectangle((0, -0.5), (1, 1), (n, n)))
     D = elasticity_matrix(Material(E=1.0, nu=0.3), "stress")
@@ -96,7 +97,8 @@ def bending(n):
 
 
 def test_energies_converge_with_the_square_of_the_size_and_stresses_with_the_size():
-    """½∫y² = 1/24; the strain of a linear triangle has an error of first order."""
+    """The exact energy is ½∫y² = 1/24; the strain of linear triangles has an error of
+    first order."""
     (e1, s1), (e2, s2), (e4, s4) = (bending(n) for n in (8, 16, 32))
     excess = np.array([e1, e2, e4]) - 1 / 24
 

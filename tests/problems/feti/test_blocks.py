@@ -1,4 +1,4 @@
-"""Products of blocks with columns, against those of NumPy."""
+"""Products of blocks with columns, compared with those of NumPy."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_blocks_multiply_columns(n, columns):
     Y = both(np.append([1.0, 2.0, 3.0], X))
 
     assert np.abs(Y[3:].reshape(n, -1) - M @ X).max(initial=0) < 1e-12
-    assert Y[:3].tolist() == [2, 4, 6]  # not overwritten by the second block
+    assert Y[:3].tolist() == [2, 4, 6]  # the second block does not overwrite
 
 
 @pytest.mark.parametrize(("rows", "n"), [(3, 7), (9, 2), (0, 4), (5, 0)])
@@ -54,11 +54,12 @@ def test_triangles_and_objects_multiply_matrices_like_arrays(columns):
 def test_blocks_and_columns_that_do_not_fit_are_refused():
     M = np.zeros((3, 3))
 
-    with pytest.raises(ValueError, match=r"\(3, 3\) times \(4, 2\)"):
+    with pytest.raises(ValueError, match=r"\(3, 3\) cannot multiply a \(4, 2\)"):
         BlockDiagonal([M], [4], [2])
     with pytest.raises(ValueError, match="9 components; expected 6"):
         BlockDiagonal([M], [3], [2])(np.zeros(9))
-    with pytest.raises(ValueError, match="times"):
+    with pytest.raises(ValueError, match="cannot multiply"):
         BlockDiagonal([np.zeros((3, 2))], [3], [2])
-    with pytest.raises(ValueError, match="times"):  # a triangle is of one subdomain
+    # triangles need one subdomain
+    with pytest.raises(ValueError, match="cannot multiply"):
         BlockDiagonal([np.zeros(6)], [3], [2])

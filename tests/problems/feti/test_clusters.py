@@ -1,4 +1,4 @@
-"""Clusters of subdomains joined by averages, against dense numpy."""
+"""Clusters of subdomains joined by averages, compared with dense linear algebra."""
 
 from dataclasses import replace
 from functools import cache
@@ -26,7 +26,7 @@ from tests.support.threads import on_threads, without_lock
 
 pytestmark = pytest.mark.together
 
-#: κ(PFP) by a prototype, and the number of rigid motions of all clusters
+#: κ(PFP) of a prototype, and the number of rigid motions of all clusters
 PUBLISHED = [
     ("plate", 10.7836, 48),
     ("plate/cluster=2", 20.8450, 12),
@@ -59,7 +59,7 @@ def test_condition_numbers_are_those_of_a_prototype(name, kappa, motions):
 
 
 def dense(local, side):
-    """Return K, B and C as arrays, C from the points of the faces alone."""
+    """Return K, B and C as arrays; C is computed from the points of the faces."""
     domains, layout, d = local.domains, local.problem.layout, local.problem.components
     K = block_diag(*[domains.classes[k].K.toarray() for k in domains.class_of])
     nodes, points = local.nodes, np.concatenate([*layout.points(local.number)])
@@ -103,7 +103,7 @@ CASES = [
     ("plate/Sx=3/Sy=2/n=3/ny=2/cluster=2", 2),
     ("plate/Sx=4/Sy=2/n=2/pattern=checkerboard/jump=10/glue=chain/cluster=2", 2),
     ("plate/Sx=3/Sy=3/n=2/plane=stress/glue=redundant/cluster=3", 3),
-    ("plate/Sx=4/Sy=2/n=1/cluster=2", 2),  # rows of C depend on one another
+    ("plate/Sx=4/Sy=2/n=1/cluster=2", 2),  # rows of C are linearly dependent
     ("plate/Sx=2/Sy=2/n=3/height=0.7/cluster=1", 1),
     ("plate/Sx=3/Sy=1/n=1/dim=3/Sz=2/cluster=2", 2),
 ]
@@ -124,7 +124,7 @@ def test_the_spectrum_is_that_of_dense_elimination(name, side):
     assert qp.A.shape[0] == R.shape[1]
     assert spectrum.smallest == pytest.approx(size[0], rel=1e-6)
     assert spectrum.largest == pytest.approx(size[-1], rel=1e-6)
-    # both bases of ker C ∩ ker K, and of the equations, span the same space
+    # both bases of ker C ∩ ker K span the same space
     assert np.linalg.matrix_rank(np.hstack([R, local.units.kernel.toarray()])) == len(
         R.T
     )
@@ -142,7 +142,8 @@ def test_the_spectrum_is_that_of_dense_elimination(name, side):
     [("plate/Sx=3/Sy=2/n=2/cluster=2", 2), ("plate/Sx=4/Sy=2/n=1/cluster=2", 2)],
 )
 def test_the_inverse_solves_the_constrained_problem(name, side):
-    """Kv + Cᵀμ = b and Cv = 0 for loads that balance; K̃⁺ ≥ 0 for all of them."""
+    """For balanced loads, v = K̃⁺b satisfies Kv + Cᵀμ = b and Cv = 0; K̃⁺ is positive
+    semidefinite."""
     local = on_one_process(plate.in_subdomains(params(name)))
     K, _, C = dense(local, side)
     known, R = eliminated(K, C)
@@ -158,7 +159,8 @@ def test_the_inverse_solves_the_constrained_problem(name, side):
 
 
 def test_subdomains_of_a_ring_are_joined_in_global_axes():
-    """Congruent subdomains have frames of their own; a continuous u has no jumps."""
+    """Congruent subdomains have different frames; a continuous displacement has no
+    jumps."""
     problem = PROBLEMS["beam-ring"].contact_problem(params("beam-ring/Nr=2/Nh=2"))
     bodies, (stage, *_) = problem.bodies, problem.stages
     layout = bodies.shape.layout(2)
@@ -179,7 +181,7 @@ FAMILIES = [
     ("obstacle/n=8/feti=2", "cluster=2"),
     ("beam-ring/Nr=3/Nh=2/steps=2/contact=mortar/feti=2", "glue=chain/cluster=2"),
     ("beam-ring/Nr=2/Nh=2/steps=1/friction=tresca/bound=1e6/feti=2", "cluster=2"),
-    # averages over sides of one cell determine normal gluing rows
+    # with sides of one cell, averages determine the normal gluing rows
     ("contact-patch/lower=4/upper=6/feti=2", "cluster=2"),
     ("contact-patch/lower=4/upper=6/friction=coulomb/mu=0.3/feti=2", "cluster=2"),
     ("cube-wall/n=4/feti=2", "cluster=2"),
@@ -211,7 +213,7 @@ def test_the_displacement_does_not_depend_on_clusters(name, cut):
     ],
 )  # fmt: skip
 def test_products_grow_at_most_like_the_root_of_the_side(name, side):
-    """κ grows about like the side of a cluster."""
+    """The condition number is about proportional to the side of a cluster."""
     alone, joined = (
         solved(one, 1e-6)[1].counts["P_products"]
         for one in (name, f"{name}/cluster={side}")
@@ -221,7 +223,10 @@ def test_products_grow_at_most_like_the_root_of_the_side(name, side):
 
 @pytest.mark.parametrize("preconditioner", ["auto", "lumped"])
 def test_multipliers_whose_forces_act_on_averages_alone_do_not_drift(preconditioner):
-    """F vanishes there. Without Π, λ grew to 3e8 until the steps were used up."""
+    """F vanishes on these multipliers.
+
+    Without Π, λ grew to 3e8 until all steps were used.
+    """
     name = "contact-patch/lower=8/upper=12/feti=2/cluster=2"
     case, s = solved(name, preconditioner=preconditioner, max_steps=200)
     F = case.qp.P @ np.eye(case.qp.q.size)

@@ -1,4 +1,4 @@
-"""Duals of torn bodies on ranks that are threads; assignment of blocks to ranks."""
+"""Duals of torn bodies on ranks in threads; assignment of blocks to ranks."""
 
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ from tests.support.threads import on_threads, without_lock
 
 
 def loads(work):
-    """Return the work of each rank under `assign_factorisations`."""
+    """Return the total work of each rank under `assign_factorisations`."""
     done = np.zeros(len(work))
     for name, task in assign_factorisations(work).items():
         size = work[task.factor_rank][name]
@@ -58,15 +58,17 @@ def test_blocks_fill_the_time_until_factors_are_sent():
     more, less = factors.argmax(), factors.argmin()
 
     assert blocks_before_exchange(tasks, more) == 0
-    assert blocks_before_exchange(tasks, less) == 3  # blocks take a third of a factor
+    # a block takes a third of the time of a factor
+    assert blocks_before_exchange(tasks, less) == 3
 
 
 def test_classes_of_a_single_rank_are_factorised_before_the_exchange():
     tasks = {
-        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # the factor takes 6
         "b": Assignment(4, [1], factor_rank=1, block_rank=1),
         "c": Assignment(4, [1], factor_rank=1, block_rank=1),
-        "d": Assignment(40, [0], factor_rank=0, block_rank=0),  # which nobody waits for
+        # not needed by other ranks
+        "d": Assignment(40, [0], factor_rank=0, block_rank=0),
     }
 
     assert blocks_before_exchange(tasks, 1) == 1
@@ -75,17 +77,16 @@ def test_classes_of_a_single_rank_are_factorised_before_the_exchange():
 
 def test_blocks_fill_the_time_until_the_last_factor_is_sent():
     tasks = {
-        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
-        "e": Assignment(
-            16, [1, 2], factor_rank=2, block_rank=1
-        ),  # whose factor takes 12
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # the factor takes 6
+        # the factor takes 12
+        "e": Assignment(16, [1, 2], factor_rank=2, block_rank=1),
         **{name: Assignment(4, [1], factor_rank=1, block_rank=1) for name in "bcd"},
     }
     assert blocks_before_exchange(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
     assert blocks_before_exchange(less, 1) == 1
     alone = {"a": less["a"], "b": Assignment(11, [1], factor_rank=1, block_rank=1)}
-    assert blocks_before_exchange(alone, 1) == 1  # more than half of it fits in
+    assert blocks_before_exchange(alone, 1) == 1  # more than half of the block fits
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
     assert blocks_before_exchange(smaller, 1) == 2
 
@@ -127,7 +128,7 @@ def test_a_rank_never_receives_more_work_than_the_sender_keeps():
 
 
 def test_contributions_of_several_neighbours_to_a_row_are_summed():
-    """Row 0 is shared with both neighbours, rows 2 and 1 with one each."""
+    """Row 0 is shared with both neighbours, rows 1 and 2 with one neighbour each."""
     arriving = np.array([1.0, 10.0, 100.0, 1000.0])
     at = Halo(
         ranks=SimpleNamespace(
@@ -164,7 +165,7 @@ def torn(request):
 
 
 def dual_of(torn):
-    """A QP with this F, whose data identify its rows."""
+    """Return F, and a QP with this F whose data identify its rows."""
     F = dual_operator(torn.B, torn.domains, torn.equalities)
     m = torn.B.shape[0]
     G = csr_array((torn.B @ torn.domains.kernel).T)
@@ -230,7 +231,7 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
 def test_contact_rows_are_inverted_in_distributed_or_replicated_form(
     torn, fill, monkeypatch
 ):
-    """In both forms, the sum of B W Bᵀ over ranks is inverted."""
+    """In both forms, the sum of B W Bᵀ over all ranks is inverted."""
     monkeypatch.setattr(factor, "MAX_FILL", fill)
     F, qp = dual_of(torn)
     x = np.random.default_rng(6).standard_normal(qp.q.size)
@@ -325,9 +326,9 @@ def test_each_of_as_many_ranks_has_one_subdomain():
         balanced_partition(chain(5), ones, ones, 6)
 
 
-#: of eight subdomains of equal work, of which the first four are four times as large
-ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: is even: sizes of 16 and 4
-ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work of 3 and 5, sizes of 12 and 8
+#: ranks of eight subdomains of equal work; the first four are four times as large
+ONLY_WORK = [0, 0, 0, 0, 1, 1, 1, 1]  #: work is balanced; sizes 16 and 4
+ONLY_SIZE = [0, 0, 0, 1, 1, 1, 1, 1]  #: work 3 and 5, sizes 12 and 8
 BETTER = [0, 0, 0, 1, 0, 1, 1, 1]  #: sizes of 13 and 7
 BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
 
@@ -345,12 +346,13 @@ BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
 def test_among_partitions_with_balanced_work_the_best_sizes_win(
     answers, taken, asked, monkeypatch
 ):
-    """If sizes are uneven, METIS runs with 12 seeds and three weights."""
+    """If sizes are out of balance, METIS runs with 12 seeds and three weights of the
+    size."""
     asks = []
 
     def answer(graph, weight, ranks, seed=None):
         assert not graph.diagonal().any()
-        assert (graph.data > 0).all()  # METIS takes no other weights
+        assert (graph.data > 0).all()  # METIS requires positive weights
         assert weight.dtype.kind == "i"
         assert weight.min() == 1
         asks.append((seed, weight.tolist()))
@@ -366,7 +368,8 @@ def test_among_partitions_with_balanced_work_the_best_sizes_win(
 
 
 def test_weights_of_sizes_are_a_quarter_a_half_and_one(monkeypatch):
-    """One subdomain has 7.94 of the mean size, others 0.008; all have equal work."""
+    """One subdomain has 7.94 times the mean size, all others 0.008 times; the work of
+    all is equal."""
     seen = set()
 
     def answer(graph, weight, ranks, seed=None):
@@ -422,24 +425,25 @@ def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
 
 
 def halo_of(ranks, here):
-    """Halo of rows touched by ranks as in the mask `here` (ranks, m)."""
+    """Return the halo of a rank, given a mask (ranks, m) of the rows that ranks
+    touch."""
     rows = np.flatnonzero(here[ranks.rank])
     reach = csr_array(here[:, rows].T.astype(int))
     return build_halo(ranks, rows, reach, assign_owners(rows, reach))
 
 
 def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
-    """Two ranks share rows 0 … 5, and each touches two more rows alone."""
+    """Two ranks share rows 0 … 5, and each rank touches two further rows alone."""
     here = np.zeros((2, 10), dtype=bool)
     here[:, :6] = here[0, [6, 8]] = here[1, [7, 9]] = True
     length = np.ones(10)
     length[[4, 6]], length[[5, 7]] = 1e3, 1e-3
     parts = np.array([np.diag(2.0 * on / here.sum(axis=0)) for on in here])
     for p, i, j, share in (
-        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # which cancel
+        (0, 0, 1, 0.5), (1, 0, 1, -0.5),  # these entries cancel
         (0, 2, 3, 0.25), (1, 2, 3, 0.25),
-        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding of long and of short rows
-        (0, 0, 8, 0.5),  # which is none of those that are asked for
+        (0, 4, 6, 1e-14), (1, 5, 7, 1e-14),  # rounding in long and short rows
+        (0, 0, 8, 0.5),  # row 8 is not selected
         (1, 1, 9, 0.5),
     ):  # fmt: skip
         parts[p, i, j] = parts[p, j, i] = share
@@ -455,7 +459,7 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
 
 
 def summed(decades=0):
-    """Return masks of 14 rows on three ranks, row lengths and summands."""
+    """Return masks of 14 rows on three ranks, lengths of the rows, and summands."""
     rng = np.random.default_rng(0)
     here = np.zeros((3, 14), dtype=bool)
     for p in range(3):
@@ -490,7 +494,7 @@ def test_the_sum_of_parts_is_inverted_rank_by_rank():
 
 
 def test_equal_contact_rows_are_inverted_to_rounding():
-    """A row is repeated: only the sum of y over both copies is determined."""
+    """One row is repeated, so that only the sum of y over both copies is determined."""
     here = np.ones((1, 3), dtype=bool)
     A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
 
@@ -506,7 +510,8 @@ def test_equal_contact_rows_are_inverted_to_rounding():
 
 
 def test_the_sum_of_parts_on_selected_rows_is_inverted_on_all_ranks():
-    """Couplings with other rows, and of equality with contact rows, are dropped."""
+    """Couplings with unselected rows, and of equality with contact rows, are
+    dropped."""
     here, _, parts = summed()
     some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
     A = sum(parts)[np.ix_(some, some)]
@@ -518,7 +523,7 @@ def test_the_sum_of_parts_on_selected_rows_is_inverted_on_all_ranks():
     def work(ranks):
         at = halo_of(ranks, here)
         part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # no other knows
+        first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # on no other rank
         owned, inverse = over_ranks._replicated_inverse(
             part, np.isin(at.rows, some) & first_of, at, first
         )

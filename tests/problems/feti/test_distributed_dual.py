@@ -35,8 +35,8 @@ CASES = (
     "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
     "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
-#: that solutions come before, by number of cells the smallest there are: contact is
-#: linearised there, or the bound of Coulomb's law is theirs
+#: small cases that depend on solutions of previous problems, at which contact is
+#: linearised or from which the bound of Coulomb's law follows
 LATER = (
     "beam-ring/Nr=1/Nh=1/steps=2/relin=2/friction=tresca/bound=1e6/feti=2/dual",
     "beam-ring/Nr=1/Nh=1/steps=2/relin=2/friction=coulomb/mu=0.3/feti=2/dual",
@@ -47,17 +47,17 @@ LATER = (
     "greco/n=7/mu=0.4/iterate=2/glue=chain/feti=2/dual",
     "greco/n=4/dim=3/depth=2/feti=2/dual",
 )
-#: of which active sets alone come in circles (`solvers.reference.over_ranks`)
+#: case in which an active set method alone cycles (`solvers.reference.over_ranks`)
 CIRCLES = (
     "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/glue=chain/contact=mortar/"
     "friction=coulomb/mu=0.3/loading=static/dual"
 )
 COUPLING_ROUNDING = 1e-14
-SOLVED = 1e-10  #: what two references may leave of another point to linearise at
+SOLVED = 1e-10  #: accepted difference of two reference solutions
 
 
 def emitted(ranks, cases):
-    """Return the assembled parts of several ranks, by case."""
+    """Return the parts that several ranks assemble, by case."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
@@ -71,7 +71,7 @@ def emitted(ranks, cases):
 
 @pytest.fixture(scope="module")
 def described(tmp_path_factory):
-    """Cases of described bodies in parts, by topic."""
+    """Names of cases of user-defined bodies in parts, by topic."""
     path = press.described(tmp_path_factory.mktemp("press"))
     name = f"bodies:{path}/parts=8"
     return {
@@ -99,7 +99,7 @@ def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request, described):
-    """Return the assembled parts of several ranks."""
+    """Parts that several ranks assemble for all cases."""
     bodies = described["first"], described["friction"]
     return emitted(request.param, [*CASES, *bodies])
 
@@ -140,7 +140,8 @@ def test_problems_after_solutions_equal_those_of_one_process(ranks):
 
 
 def test_every_disc_has_one_owner(found):
-    """Of 16 nodes, whose discs and multipliers are those of one process."""
+    """Together, the ranks store the 16 discs of a single process, with equal indices
+    and radii."""
     of = found[DISCS]
     assert of["discs"][0] == of["discs"][1]
     assert len(of["discs"][0]) == 16
@@ -175,7 +176,8 @@ def test_no_choice_of_keys_is_emitted_as_another_qp(seed):
 
 
 def generated(rng, count=8):
-    """Names of tiny cases, with blocks of all shapes and three subdomains or more."""
+    """Yield names of small cases with blocks of all shapes and at least three
+    subdomains."""
     for _ in range(count):
         glue = rng.choice(["orthonormal", "chain", "redundant"])
         law = rng.choice(["", "/friction=tresca/bound=1e5"])
@@ -221,10 +223,10 @@ def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
 
 
 def generated_with_coulomb_s_law(rng, count=3):
-    """Names of tiny cases with subdomains enough for two ranks.
+    """Yield names of small cases with enough subdomains for two ranks.
 
-    Of cylinders without Q, supports hold the node in the middle of both, whose force of
-    friction is no unique one then.
+    Cylinders without Q are not included: supports fix the central node of both bodies,
+    so that its friction force is not unique.
     """
     for _ in range(count):
         method = (

@@ -1,4 +1,4 @@
-"""F = B K⁺Bᵀ by classes, and its preconditioners, against dense definitions."""
+"""F = B K⁺Bᵀ by classes, and its preconditioners, compared with dense definitions."""
 
 from dataclasses import replace
 
@@ -61,7 +61,7 @@ def operator_of(pair):
 
 
 def dense(pair):
-    """K as a whole, with B and R."""
+    """Return K, B and R of all subdomains as dense matrices."""
     K = block_diag(*(pair.classes[k].K.toarray() for k in pair.class_of))
     return K, pair.B.toarray(), pair.domains.kernel.toarray()
 
@@ -150,7 +150,7 @@ def test_the_largest_blocks_are_implicit_if_memory_is_limited(monkeypatch):
 
 
 def test_a_single_subdomain_stores_one_triangle_of_its_blocks():
-    """Two membranes of one square each, in one class or in two."""
+    """Two membranes of one subdomain each are grouped into one class, or into two."""
     pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
     (kind,) = pair.classes
     other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))
@@ -165,7 +165,8 @@ def test_a_single_subdomain_stores_one_triangle_of_its_blocks():
 
 
 def definition(pair, kind, scaling):
-    """B_D diag(D) B_Dᵀ by pseudo-inverses; B_D is unique but for the kernel of Bᵀ."""
+    """Return B_D diag(D) B_Dᵀ by pseudoinverses; B_D is unique up to the kernel of
+    Bᵀ."""
     _, B, _ = dense(pair)
     touched = np.abs(B).sum(axis=0) > 0
     D, softness = [], []
@@ -184,7 +185,7 @@ def definition(pair, kind, scaling):
         softness.append(1 / stiffness if scaling == "stiffness" else 0 * stiffness + 1)
     B, W = B[:, touched], np.diag(np.concatenate(softness))
     gram, E = B @ W @ B.T, pair.equalities
-    gram[:E, E:] = gram[E:, :E] = 0  # contact does not weigh the equations
+    gram[:E, E:] = gram[E:, :E] = 0  # drop couplings with contact
     B_D = np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ B @ W
     return B_D @ block_diag(*D) @ B_D.T
 
@@ -207,7 +208,7 @@ def test_preconditioners_add_nothing_in_the_kernel_of_redundant_rows():
     deaf = null_space(B.T)
     M = operator_of(pair).build().preconditioner("dirichlet", "stiffness")
 
-    assert deaf.shape[1] == 2 * 3  # six rows of four copies, of rank three
+    assert deaf.shape[1] == 2 * 3  # six rows for four copies have rank 3
     assert_allclose(deaf.T @ M(np.eye(len(B))), 0, atol=1e-13)
 
 
@@ -238,7 +239,8 @@ def test_contact_rows_do_not_affect_the_weights_of_equality_rows(kind):
 
 
 def test_preconditioners_bring_the_spectrum_together():
-    """Condition numbers are ordered as in the literature: none, lumped, Dirichlet."""
+    """The condition number is smallest with the Dirichlet preconditioner, and largest
+    without a preconditioner."""
     pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
     F = operator_of(pair)
     _, B, R = dense(pair)
@@ -295,7 +297,7 @@ def test_equal_subdomains_share_one_stored_stiffness():
 
 
 def test_a_kind_without_kernel_has_its_inverse():
-    """Supports are eliminated, as in FETI-1."""
+    """This is the case of eliminated supports, as in FETI-1."""
     (kind,) = membranes().classes
     n = kind.K.shape[0]
     K = csc_array(kind.K + eye_array(n))

@@ -34,7 +34,7 @@ def test_parts_are_connected_of_one_body_and_about_equal(parts):
 
 
 def test_cells_are_neighbours_where_they_share_an_edge():
-    """A 2 × 2 grid, and a triangle that touches it in one node only."""
+    """The mesh is a 2 × 2 grid and a triangle that shares only a node with the grid."""
     cells = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7],
                       [8, 9, 10, 10]])  # fmt: skip
     points = np.random.default_rng(314159).standard_normal((11, 2))
@@ -68,7 +68,8 @@ def test_too_few_and_too_many_parts_are_refused(parts):
 
 
 def test_parts_of_long_and_thin_cells_are_compact():
-    """A square of 8 × 128 cells: parts with the fewest edges are 16 times as long."""
+    """On a square of 8 × 128 cells, parts with the fewest shared edges would be 16
+    times as long as wide."""
     mesh, body = rectangle((0.0, 0.0), (1.0, 1.0), (8, 128)), np.zeros(1024, dtype=int)
     label = graph_partition(mesh.points, mesh.cells, body, 16)
     corners = mesh.points[mesh.cells]
@@ -78,7 +79,8 @@ def test_parts_of_long_and_thin_cells_are_compact():
 
 
 def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
-    """Cells of 1 × 2 × 4: a face of area A is A^⅓ d^−⅔ where cells have volume 1."""
+    """For cells of 1 × 2 × 4, the weight of a face of area A is 100 A^⅓ d^−⅔, with the
+    distance d of the centres."""
     mesh = bricks((2, 2, 2), (2.0, 4.0, 8.0))
     graph = neighbours(mesh.points, mesh.cells).toarray()
 

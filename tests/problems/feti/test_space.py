@@ -1,4 +1,4 @@
-"""Bodies of hexahedra in subdomains: the same body, and its rigid motions."""
+"""Bodies of hexahedra in subdomains: undivided solution, and rigid motions."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,8 @@ STEEL = Material(E=2e11, nu=0.3)
 
 
 def box() -> Mesh:
-    """24 cells, no two of them alike, with principal axes along no coordinate."""
+    """Return a mesh of 24 different cells, without principal axes along the
+    coordinates."""
     mesh = bricks((4, 3, 2), (2.0, 1.0, 0.7))
     bump = 0.05 * np.sin(mesh.points @ [2.0, 3.0, 5.0])
     shear = np.array([[1, 0.3, 0.1], [0, 1, 0.4], [0, 0, 1]])
@@ -37,7 +38,7 @@ def box() -> Mesh:
 def torn(
     mesh: Mesh, fixed: np.ndarray, parts: int = 4, glue: str = "orthonormal"
 ) -> LocalSubdomains:
-    """Cut a body by METIS, under gravity."""
+    """Divide a body under gravity into subdomains by METIS."""
     down = dofs_of(np.arange(len(mesh.points)), 3, 2)
     forces = Forces(down, np.full(down.size, -1.0))
     body = np.zeros(len(mesh.cells), dtype=np.int64)
@@ -72,7 +73,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
     free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
     jumps = own.rows.B @ own.spread[:, free]
-    assert abs(jumps).max() <= 1e-15  # none where copies are one
+    assert abs(jumps).max() <= 1e-15  # copies are equal
 
 
 def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
@@ -89,7 +90,8 @@ def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
 @pytest.mark.parametrize("parts", [6, 12])
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
 def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, parts):
-    """Up to 8 copies of a node: B_E v = 0 for v = T u with u = 0 at supports only."""
+    """With up to 8 copies of a node, B_E v = 0 exactly if v = T u with u = 0 at the
+    supports."""
     mesh = box()
     fixed = dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3)
     own = torn(mesh, fixed, parts, glue)
@@ -106,7 +108,7 @@ def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, part
     assert (rank == len(B)) == (glue != "redundant")
 
 
-#: motions that a face across x leaves that is held along some axes
+#: number of rigid motions that remain if a face x = 0 is fixed along some axes
 LEFT = {"x": 3, "y": 4, "z": 4, "xy": 1, "xz": 1, "yz": 3, "xyz": 0}
 
 
@@ -137,9 +139,11 @@ def test_the_longitudinal_share_is_the_same_of_plane_strain_and_space():
 
 
 def test_slip_on_an_ill_conditioned_dual_gives_the_same_displacement_in_few_products():
-    """Rows of friction nearly depend on supports: κ = 4e4, and 6e4 in subdomains.
+    """Friction rows are nearly dependent on support rows: κ is 4e4, or 6e4 in
+    subdomains.
 
-    With spectral steps alone, 1e-8 takes 2013 products, and 32 063 undivided.
+    With spectral steps alone, the tolerance 1e-8 requires 2013 products, or 32 063 for
+    undivided bodies.
     """
     name = "contact-patch/dim=3/distort=0.2/ratio=10/friction=coulomb/mu=0.2"
     u, tol = [], 1e-9

@@ -1,4 +1,4 @@
-"""Extreme eigenvalues by Lanczos, for operators with known spectra."""
+"""Extreme eigenvalues by the Lanczos method, for operators with known spectra."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,7 +74,7 @@ def test_the_error_bounds_hold_and_are_as_small_as_asked(crowded: str) -> None:
     assert abs(found.smallest - 1.0) <= found.smallest_error <= 1e-3
     assert abs(found.largest - 10.0) <= found.largest_error <= 1e-3 * 10.0
     slow = "smallest_error" if crowded == "below" else "largest_error"
-    assert getattr(found, slow) > 1e-8  # the other end is found long before
+    assert getattr(found, slow) > 1e-8  # the other end converges long before
     assert abs(found.condition - 10.0) <= 1.001 * found.condition_error
 
 
@@ -99,7 +99,7 @@ def test_errors_of_ritz_values_come_from_the_last_entries_of_their_vectors() -> 
 def test_each_error_is_relative_to_its_own_eigenvalue(
     errors: tuple[float, float], is_within: bool
 ) -> None:
-    """1 % of the eigenvalues 1 and 10 are 0.01 and 0.1."""
+    """The errors 0.01 and 0.1 are 1 % of the eigenvalues 1 and 10."""
     assert Spectrum(1.0, 10.0, *errors, 7).within(0.01) is is_within
 
 
@@ -125,12 +125,13 @@ def test_the_projector_is_onto_the_kernel_of_g_in_the_range_of_b(rows: str) -> N
     size, u = np.linalg.eigh(dense @ dense.T)
     u = u[:, size > 1e-12 * size[-1]]
     assert_allclose(u @ (u.T @ y), y, atol=1e-12)  # in range B
-    inside = dense @ np.cos(np.arange(B.shape[1]))  # what is left out is orthogonal
+    inside = dense @ np.cos(np.arange(B.shape[1]))  # the remainder is orthogonal
     assert abs((x - y) @ P(inside)) < 1e-9 * np.linalg.norm(inside)
 
 
 def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
-    """Compute the spectrum for supports and gluing of beam and ring without contact."""
+    """Compute the spectrum for supports and gluing of beam and ring, without
+    contact."""
     bodies = of_beam_ring(layers, layers // 2, layers, "strain")
     (stage,) = load_steps(1, 1, bodies.forces, bodies.fixed)
     layout = bodies.shape.layout(cells)
@@ -141,13 +142,14 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     return result
 
 
-#: ‖PFP‖/κ of 2 × 2 squares of 4 × 4 cells, and of 8 × 8 (plate; notes of the issue)
+#: ‖PFP‖/κ of plates of 2 × 2 subdomains, by cells per side of a subdomain
 OF_SQUARES = {4: 5.63810 / 9.9829, 8: 10.92276 / 19.4934}
 
 
 @pytest.mark.parametrize("cells", [4, 8])
 def test_stretched_cells_of_a_ring_leave_the_least_eigenvalue_of_squares(cells) -> None:
-    """Without the factor of their shape, it is 7 and 12 % below."""
+    """Without the shape factor, the smallest eigenvalue would be 7 % and 12 %
+    smaller."""
     assert spectrum_of_beam_ring(2 * cells, cells).smallest == pytest.approx(
         OF_SQUARES[cells], rel=0.005
     )
@@ -163,7 +165,7 @@ def test_the_condition_number_is_flat_from_16_900_unknowns_on(cells) -> None:
 
 
 def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
-    """2 ± 0.1 and 8 ± 0.8: a twentieth and a tenth."""
+    """The eigenvalues are 2 ± 0.1 and 8 ± 0.8; the relative errors are 5 % and 10 %."""
     found = Spectrum(2.0, 8.0, 0.1, 0.8, steps=1)
     assert found.condition == 4.0
     assert found.condition_error == pytest.approx(4 * 0.15)
@@ -223,7 +225,8 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
 def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
     sign: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The residual of a Ritz vector is the next length times its last entry."""
+    """The residual norm of a Ritz vector is the norm of the next Lanczos vector times
+    the last entry in magnitude."""
     rng, solve = np.random.default_rng(0), module.eigh_tridiagonal
 
     def turned(*args: Any, **how: Any) -> Any:
@@ -244,7 +247,7 @@ def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
 
 
 def test_a_zero_residual_leaves_rounding_of_the_largest_eigenvalue() -> None:
-    """Five steps of an operator with eigenvalues up to 9e6."""
+    """The operator has eigenvalues up to 9e6, and five steps are taken."""
     found = ritz_bounds(1e6 * np.array([1.0, 9, 2, 3, 4]), np.zeros(4), 0.0)
     rounding = 5 * np.finfo(float).eps * 9e6
     assert found.smallest_error == pytest.approx(rounding, abs=0)

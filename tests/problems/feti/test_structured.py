@@ -1,4 +1,4 @@
-"""Blocks of structured grids are numbered like the torn mesh of the whole."""
+"""Blocks of structured grids have the numbers of the torn undivided mesh."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ GRIDS = (
 
 @pytest.fixture(scope="module", params=[1, 3, 4, 20])
 def torn(request):
-    """The layout of three grids in blocks, and their torn meshes."""
+    """Layout of three grids in blocks, and their torn meshes."""
     mesh, body = join(tuple(grid.mesh() for grid in GRIDS))
     label = structured_bodies([grid.divisions for grid in GRIDS], request.param)
     whole = decompose(mesh.points, mesh.cells, label, body)
@@ -41,11 +41,14 @@ def test_a_block_has_the_points_of_the_whole_mesh(grid):
 
 
 def stiffest_saw_tooth(D, r):
-    """The largest stiffness of displacements ±a in turn on a half plane of cells.
+    """Return the largest stiffness of alternating displacements ±a on a half plane of
+    cells.
 
-    r : cells are 1 along its edge and r deep. Layer on layer: S = A − B(A + S)⁻¹B, with
-    the blocks A, B of a layer of cells on displacements that change sign from node to
-    node.
+    r : depth of the cells, whose edge has length 1
+
+    With the blocks A, B of one layer of cells for displacements of alternating sign,
+    the stiffness is the fixed point of S = A − B(A + S)⁻¹B, which adds one layer at a
+    time.
     """
     K = stiffness(
         rectangle_grid((0, 0), (1, r), (1, 1)).mesh(), D[None], np.zeros(1, int)

@@ -1,4 +1,4 @@
-"""Subdomains described without the whole mesh, compared with those of tearing."""
+"""Subdivisions without an undivided mesh, compared with torn meshes."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def discs(most):
 
 
 def mesh(most):
-    """The same grids as a mesh with all nodes listed."""
+    """Return the subdivision of the grids as a mesh with all nodes listed."""
     _, whole, body, parts = grids(most)
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
     return (
@@ -64,7 +64,7 @@ def mesh(most):
     params=[(how, n) for how in (grids, discs, mesh) for n in (1, 3, 20)],
 )
 def known(request):
-    """A subdivision, and the torn mesh of the whole."""
+    """A subdivision, and the torn undivided mesh."""
     how, most = request.param
     return how(most)
 
@@ -130,9 +130,7 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
     all_ = np.arange(of.count)
     keys = [(key, b) for key, b in zip(of.keys(all_), of.body.tolist(), strict=True)]
     nodes = np.split(whole.node, whole.start[1:-1])
-    found = [
-        own[of.cells(s)] for s, own in enumerate(nodes)
-    ]  # cells in the numbers of the whole
+    found = [own[of.cells(s)] for s, own in enumerate(nodes)]  # cells in global numbers
 
     for points, own in zip(of.points(all_), nodes, strict=True):
         assert_array_equal(points, mesh.points[own])
@@ -176,7 +174,8 @@ def _around(own):
 
 
 def test_sizes_are_balanced_even_if_few_subdomains_have_most_of_the_work():
-    """A half disc, graded: long boundaries in its middle, most nodes around it."""
+    """In a graded half disc, subdomains in the middle have long boundaries; most nodes
+    are in the others."""
     problem = parts_of("hertz-plane/n=8/halvings=4/feti=16/dual")
     of, rank = problem.layout, subdomains_of(problem, 2)
 

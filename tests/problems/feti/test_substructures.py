@@ -1,4 +1,4 @@
-"""Local problems of torn bodies against dense algebra with the stored stiffness."""
+"""Local problems of torn bodies, compared with dense linear algebra."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.support.decomposed_bodies import decomposed_pair
 
 @pytest.fixture(scope="module")
 def parts() -> LocalProblems:
-    """The beam on its ring in subdomains of 4² cells at most."""
+    """Beam and ring of the benchmark in subdomains."""
     return LocalProblems(decomposed_pair(most=8)[2])
 
 
@@ -23,7 +23,8 @@ def dense(parts: LocalProblems) -> np.ndarray:
 def test_a_solve_projects_out_rigid_motions(
     parts: LocalProblems,
 ) -> None:
-    """PK⁺Pb is the pseudoinverse of PKP, for forces with resultants too."""
+    """PK⁺Pb is the pseudoinverse of PKP applied to b, even for forces with
+    resultants."""
     K, R = dense(parts), parts.kernel.toarray()
     rng = np.random.default_rng(8)
     b = rng.standard_normal(len(K)) + 1e3 * (R @ rng.standard_normal(R.shape[1]))
@@ -47,7 +48,7 @@ def test_a_subdomain_without_force_stays_where_it_is(parts: LocalProblems) -> No
 
 
 def test_the_kernel_is_that_of_the_stiffness(parts: LocalProblems) -> None:
-    """Three motions of each subdomain, and these span the null space of its K."""
+    """Each subdomain has three rigid motions, which span the null space of its K."""
     R, start = parts.kernel.toarray(), parts.torn.domains.start
     assert R.shape[1] == 3 * (start.size - 1)
     own = slice(start[0], start[1])
@@ -90,4 +91,4 @@ def test_a_squared_product_is_with_the_squares_of_all_entries(
     expected = K**2 @ v
     found = parts.squared_product(v)
     assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max())
-    assert_allclose(dense(parts), K, atol=0)  # of which none has changed
+    assert_allclose(dense(parts), K, atol=0)  # K is unchanged

@@ -60,7 +60,7 @@ def test_compact_blocks_of_squares_are_squares() -> None:
 
 
 def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> None:
-    """A block of 2 × 16 cells is a square if cells are 8 times as long as wide."""
+    """If cells are 8 times as long as wide, a block of 2 × 16 cells is a square."""
     mesh = rectangle((0.0, 0.0), (8.0, 1.0), (16, 16))
     label = label_blocks(
         compact_blocks(sides(np.full(16, 1 / 2), np.full(16, 1 / 16)), 6)
@@ -81,7 +81,7 @@ def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() ->
 
 
 def test_compact_blocks_depend_on_local_lengths_of_rows_and_columns() -> None:
-    """Cells of 100 by 1, in rows and columns given by two factors each."""
+    """Cells measure 100 × 1; one of the two factors of a length varies."""
     one, many = np.ones(4), np.full(4, 100.0)
     strips, whole = [slice(k, k + 1) for k in range(4)], slice(0, 4)
     long = compact_blocks(((one, one), (one, many)), 2)
@@ -98,7 +98,8 @@ def test_a_compact_block_as_long_as_wide_is_cut_between_rows() -> None:
 
 
 def boxed(*axes):
-    """Points of a box between coordinates x, y and z, an axis per direction."""
+    """Return the points of a box grid with given coordinates, one axis per
+    direction."""
     sizes = [len(axis) for axis in axes[::-1]]
     return box_grid(*map(np.asarray, axes)).points.reshape(*sizes, 3)
 
@@ -140,13 +141,13 @@ def test_boxes_of_graded_cells_are_compact_everywhere():
         length = fine[high] - fine[low]
         h = length / (high - low)
         assert (high - low <= 4).all()
-        # half a cell by rounding their number; a single cell cannot be cut
+        # numbers of cells are rounded to half a cell; a single cell cannot be cut
         assert ((length <= 4 * h.min() + h / 2) | (high - low == 1)).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rounding_of_lengths_moves_no_cut_of_compact_blocks(seed: int) -> None:
-    """Two grid lines of seven equal cells are equally close to the middle."""
+    """In a row of seven equal cells, two grid lines are equally close to the middle."""
     wide, deep = np.full(7, 1.0), np.full(2, 1.0)
     rounding = 1 + 1e-15 * np.random.default_rng(seed).standard_normal((2, 7))
     found = compact_blocks(sides(wide * rounding[0], deep * rounding[1, :2]), 3)
@@ -156,7 +157,7 @@ def test_rounding_of_lengths_moves_no_cut_of_compact_blocks(seed: int) -> None:
 
 
 def sides(wide, deep):
-    """Sides of rectangular cells, of columns and of rows."""
+    """Return the side lengths of rectangular cells, as for `compact_blocks`."""
     return (deep, np.ones(wide.size)), (np.ones(deep.size), wide)
 
 
@@ -166,7 +167,7 @@ def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
     label = blocks((6, 2), 2)
     assert decompose(mesh.points, cells, label, of_one).class_of.tolist() == [0, 0, 0]
     moved = mesh.points.copy()
-    moved[6] += 1e-7  # the upper right corner of the last one, in the first row
+    moved[6] += 1e-7  # upper right corner of the last block, in the first row
     assert decompose(moved, cells, label, of_one).class_of.tolist() == [0, 0, 1]
     of_two = np.where(label == 1, 1, 0)
     assert decompose(mesh.points, cells, label, of_two).class_of.tolist() == [0, 1, 0]
@@ -213,7 +214,7 @@ def test_rows_vanish_exactly_on_continuous_supported_displacements(rows: str) ->
         rtol=1e-10,
     )
     assert_allclose(pair.c[pair.equalities :], pair.scale * primal.h, rtol=1e-12)
-    # nothing else is held: the torn motions that all equations leave at rest
+    # nothing else is fixed: rank of B_E = torn unknowns − free components
     B_E = (pair.B[: pair.equalities]).toarray()
     rank = int((np.linalg.svd(B_E, compute_uv=False) > 1e-9).sum())
     left = pair.B.shape[1] - rank
@@ -246,7 +247,7 @@ def test_a_class_has_its_boundary_and_material() -> None:
 
 @pytest.mark.parametrize("rows", GLUING)
 def test_rows_are_those_of_sparse_algebra_on_the_whole_body(rows: str) -> None:
-    """Supports, gluing and contact in the same order, with the same signs."""
+    """Supports, gluing and contact have the same order and the same signs."""
     bodies, primal, found = decomposed_pair(rows)
     label = structured_bodies([(32, 4), (36, 6)], 2)
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)

@@ -1,4 +1,4 @@
-"""FCLIB files: both loops, both forms, refusals, the writer, independent readers."""
+"""FCLIB files: both loops, both forms, errors, the writer, independent readers."""
 
 import ctypes
 import json
@@ -35,14 +35,16 @@ def case_of(path, *parts):
 
 
 def one_contact(mu=0.5, push=1.0):
-    """W = I, q = (−1, push, 0): the force (1, −min(push, μ), 0)."""
+    """Return a problem with W = I and q = (−1, push, 0), solved by (1, −min(push, μ),
+    0)."""
     return local_arrays(np.eye(3), np.array([-1.0, push, 0.0]), np.array([mu]))
 
 
 @pytest.mark.parametrize("loop", LOOPS)
 @pytest.mark.parametrize(("push", "force"), [(0.3, -0.3), (2.0, -0.5)])
 def test_one_contact_has_the_force_of_coulombs_law(tmp_path, loop, push, force):
-    """Sticking if push ≤ μ, else slipping with the force μ·1, and no dilatancy."""
+    """The contact sticks if push ≤ μ; otherwise it slips with the force μ·1, without
+    dilatancy."""
     write_datasets(tmp_path / "one.hdf5", one_contact(push=push))
     case = case_of(tmp_path / "one.hdf5", f"loop={loop}")
     answer = mb.solve(case, "ecos", 1e-9)
@@ -55,7 +57,7 @@ def test_one_contact_has_the_force_of_coulombs_law(tmp_path, loop, push, force):
 
 @pytest.mark.parametrize("loop", LOOPS)
 def test_a_stack_of_boxes_is_solved_by_both_loops(tmp_path, loop):
-    """W has half of full rank, and the forces are not unique."""
+    """The rank of W is half its order, so that the forces are not unique."""
     write_boxes(tmp_path / "boxes.hdf5", 2)
     case = case_of(tmp_path / "boxes.hdf5", f"loop={loop}")
     answer = mb.solve(case, "scs", 1e-8)
@@ -102,7 +104,8 @@ def test_the_global_form_is_the_same_problem(tmp_path):
 
 
 def test_multipliers_of_equations_are_those_of_the_eliminated_problem():
-    """Gᵀv + b = 0 as a local problem with V and R, which Schur's complement removes."""
+    """Gᵀv + b = 0 becomes a local problem with V and R, which are then eliminated by a
+    Schur complement."""
     M, H, f, mu = box_stack(2)
     rng = np.random.default_rng(1)
     G, b = rng.standard_normal((12, 2)), np.array([1e-3, 0.0])
@@ -259,7 +262,7 @@ def test_arrays_survive_the_round_trip_byte_by_byte(tmp_path):
 
 
 def test_a_qp_over_cones_becomes_a_file(tmp_path):
-    """Cones in another order of variables, and equations as V and s."""
+    """The cones permute the variables, and equality rows are stored as V and s."""
     rng = np.random.default_rng(3)
     M = rng.standard_normal((6, 6))
     P, q, A = M @ M.T + np.eye(6), rng.standard_normal(6), rng.standard_normal((1, 6))
@@ -281,7 +284,7 @@ def test_a_qp_over_cones_becomes_a_file(tmp_path):
 
 
 def test_a_qp_without_cones_is_not_written(tmp_path):
-    with pytest.raises(InputError, match="FCLIB holds friction cones of all variables"):
+    with pytest.raises(InputError, match="store only friction cones of all variables"):
         mb.export("contact-patch/dual", tmp_path / "patch.hdf5")
     assert not list(tmp_path.iterdir())
 
@@ -338,7 +341,11 @@ print(json.dumps(dict(p=W.p[:W.n + 1], i=W.i[:W.p[W.n]], x=W.x[:W.p[W.n]], nz=W.
 
 @pytest.mark.slow
 def test_libfclib_reads_our_files_and_finds_the_same_error(tmp_path):
-    """Its error divides by 1 + √‖q‖ and, with W by rows, leaves out W r (issue 4)."""
+    """The error of libfclib is divided by 1 + √‖q‖.
+
+    If W is stored by rows, libfclib omits W r (issue 4); hence the file stores W by
+    columns.
+    """
     try:
         ctypes.CDLL("libfclib.so.0")
     except OSError:
@@ -385,7 +392,7 @@ SYSTEM_PYTHON = os.environ.get("SICONOS_PYTHON", "/usr/bin/python3")
 
 @pytest.mark.slow
 def test_siconos_has_the_same_forces(tmp_path):
-    """Its NSGS on W, q and μ of our file; each side's error at the other's forces."""
+    """The solver NSGS of Siconos is applied to W, q and μ of our file."""
     imports = [SYSTEM_PYTHON, "-c", "import siconos.numerics"]
     if (
         not Path(SYSTEM_PYTHON).exists()
@@ -411,7 +418,7 @@ def test_siconos_has_the_same_forces(tmp_path):
 
 
 def test_a_suite_takes_a_pattern_and_keeps_copies(tmp_path):
-    """A run of all files, judged again after the files are gone."""
+    """A run of all files is replayed after the files have been deleted."""
     for seed in range(2):
         write_regular(tmp_path / f"{seed}.hdf5", seed=seed)
     suite = {

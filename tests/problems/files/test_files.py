@@ -1,4 +1,4 @@
-"""QPs from files: the QP that is read equals the one that was written."""
+"""QPs from files: the QP that is read equals the QP that was written."""
 
 import gzip
 import json
@@ -31,7 +31,7 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: the example of Maros and Mészáros's report, with every kind of row, range and bound
+#: example of Maros and Mészáros's report, with every kind of row, range and bound
 QPS = """\
 * a comment
 NAME          EXAMPLE
@@ -83,7 +83,8 @@ def solved(qp):
 
 @pytest.fixture
 def written(tmp_path, monkeypatch):
-    """Write a file and name it; the working directory is its folder."""
+    """Return a function that writes a file to the working directory and returns its
+    case name."""
     monkeypatch.chdir(tmp_path)
 
     def write(content, name):
@@ -114,7 +115,7 @@ def test_a_qps_text_holds_the_qp_that_its_sections_say():
     given, sign = parse_qps(QPS)
 
     assert sign == 1
-    assert given.r == 4  # the right-hand side of the objective is minus its constant
+    assert given.r == 4  # the RHS of the objective is −r
     np.testing.assert_array_equal(given.q, [1.5, -2, 0, 0, 0])
     expected = np.zeros((5, 5))
     expected[:2, :2] = [[8, 2], [2, 10]]
@@ -158,7 +159,8 @@ def test_highs_reads_the_same_qp(tmp_path, section):
 
 
 def awkward(rng, n=7, *, symmetric=True):
-    """Every kind of bound, an empty row and column, numbers of 17 and of few digits."""
+    """Return a QP with all kinds of bounds, empty rows and columns, and numbers with
+    few or 17 digits."""
     P = rng.standard_normal((n, n))
     P = P @ P.T
     P[:, -1] = P[-1] = 0
@@ -178,7 +180,7 @@ def awkward(rng, n=7, *, symmetric=True):
 
 
 def of_symmetric_part(qp):
-    """The QP with the symmetric part of P, on which the objective depends alone."""
+    """Return the QP with the symmetric part of P, which determines the objective."""
     M = {name: csc_array(M) for name, M in explicit_matrices(qp)[0].items()}
     return replace(qp, **{**M, "P": csc_array((M["P"] + M["P"].T) / 2)}, structure=None)
 
@@ -202,7 +204,7 @@ def test_the_export_of_a_case_as_qps_is_its_qp(written, command, form):
 
 
 def test_highs_reads_an_exported_qps(tmp_path):
-    """Also where P is symmetric up to rounding only."""
+    """P is symmetric only up to rounding."""
     qp = awkward(np.random.default_rng(32), symmetric=False)
     save_qps(tmp_path / "a.mps", qp, {})
     qp = of_symmetric_part(qp)
@@ -296,8 +298,8 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
     case = build(written(concave.replace("ROWS", "OBJSENSE\n    MAX\nROWS"), "a.QPS"))
     s = solved(case.qp)
 
-    # of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 where both r1 and r2 are at their lower
-    # sides: c₁ = 0.1, c₂ = 1.8
+    # maximum of −4c₁² + 2c₁c₂ − 5c₂² + 1.5c₁ − 2c₂ + 4 with r1 and r2 at their lower
+    # limits: c₁ = 0.1, c₂ = 1.8
     np.testing.assert_allclose(s.x[:2], [0.1, 1.8], atol=1e-8)
     assert case.quantities(s)["value"] == pytest.approx(-15.33)
     energy = case.scale * case.qp.objective(s.x) + case.constant
@@ -433,7 +435,8 @@ def test_a_bad_mat_file_is_named_with_what_is_wrong(written, changes, message):
     ids=["concave", "saddle", "small", "large"],
 )
 def test_a_qp_that_is_not_convex_is_refused(written, P, message):
-    """min −½x² over −1 ≤ x ≤ 1 has its maximum, a KKT point, at 0."""
+    """For example, min −½x² over −1 ≤ x ≤ 1 has a KKT point at 0, which is its
+    maximum."""
     n = P.shape[0]
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.zeros(n)}
     with pytest.raises(InputError) as e:
@@ -511,7 +514,8 @@ def test_the_error_for_a_missing_path_states_the_syntax(text):
 
 @pytest.fixture
 def command(capsys):
-    """Run the command line; return exit code, stdout and stderr."""
+    """Return a function that runs the command line and returns exit code, stdout and
+    stderr."""
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,
         report=lambda *_, **__: [],
@@ -564,14 +568,14 @@ def test_the_dual_s_matrices_obey_the_paper(written, command, form):
     B, R, F, d, c = (csc_array(a[k]).toarray() for k in "BRFdc")
     if form == "dual":
         inverse = np.linalg.pinv(K, rcond=1e-12)
-    else:  # supports are not in B but in K⁺, which is zero there
+    else:  # K⁺ is zero at the supports
         free = np.setdiff1d(np.arange(f.size), csr_array(p["A"]).indices)
         inverse = np.zeros_like(K)
         inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
 
     np.testing.assert_array_equal(F, a["P"].toarray())
     np.testing.assert_array_equal(d, -a["q"])
-    # any generalised inverse serves on the λ that satisfy RᵀBᵀλ = Rᵀf
+    # for λ with RᵀBᵀλ = Rᵀf, any generalised inverse is valid
     T = np.linalg.svd(R.T @ B.T)[2][R.shape[1] :] if R.size else np.eye(len(c))
     scale = abs(T @ F @ T.T).max()
     np.testing.assert_allclose(
