@@ -8,6 +8,7 @@ from functools import cache
 from importlib import import_module
 
 import pytest
+from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
@@ -18,6 +19,12 @@ from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import supervisor
 from tests.support import ROOT
 from tests.support.fork_server import Forks
+
+# On a loaded machine, examples may take longer than the limits of hypothesis.
+settings.register_profile(
+    "untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("untimed")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -35,7 +35,10 @@ from pathlib import Path
 from time import perf_counter
 
 from mortarbench.harness.crossval.comparison import brief
-from mortarbench.harness.crossval.mesh_refinement import prolongation
+from mortarbench.harness.crossval.mesh_refinement import (
+    NonNestedMeshError,
+    prolongation,
+)
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.reading import read_json
@@ -304,6 +307,11 @@ class _Halving:
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
             self.why = f"{text} has no reference solution: {e}"
+            return None
+        except NonNestedMeshError:
+            self.why = (
+                f"the mesh of {text} is not the coarser mesh with every cell halved"
+            )
             return None
         except (Exception, SystemExit) as e:  # raised by code of the family
             self.why = unbuilt(text, e)

@@ -32,6 +32,13 @@ EDGES = (
 FACES = ((0, 2), (4, 6), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
+class NonNestedMeshError(ValueError):
+    """The refined mesh is not the coarse mesh with every cell halved."""
+
+    def __init__(self) -> None:
+        super().__init__("the refined mesh is not the mesh with every cell halved")
+
+
 def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     """Return the matrix (M, N) that interpolates from `coarse` to the nodes of `fine`.
 
@@ -42,7 +49,7 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
 
     Raises
     ------
-    ValueError
+    NonNestedMeshError
         If `fine` is not the refinement of `coarse` with half the cell size.
 
     """
@@ -67,7 +74,7 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
         rows.append(csr_array(rows[0] + rows[2])[cut] / 2)
     nodes, first = np.unique(np.concatenate(places), return_index=True)
     if nodes.size != len(fine.points):
-        raise _unfit()
+        raise NonNestedMeshError
     return csr_array(csr_array(vstack([unit, *rows]))[first])
 
 
@@ -88,13 +95,13 @@ def _shared(coarse: Grid, fine: Grid) -> Nodes:
         mine = np.unique(coarse.cells[coarse.bodies == body])
         theirs = np.unique(fine.cells[fine.bodies == body])
         if not theirs.size:
-            raise _unfit()
+            raise NonNestedMeshError
         distance, nearest = cKDTree(fine.points[theirs]).query(coarse.points[mine])
         if (
             distance.max()
             > MAX_NODE_DISTANCE * np.ptp(coarse.points[mine], axis=0).max()
         ):
-            raise _unfit()
+            raise NonNestedMeshError
         to[mine] = theirs[nearest]
     return to
 
@@ -116,10 +123,6 @@ def _between(near: csr_array, a: Nodes, b: Nodes) -> Nodes:
     middle, differs = a.copy(), a != b
     common = csr_array(near[a[differs]].multiply(near[b[differs]]))
     if (np.diff(common.indptr) != 1).any():
-        raise _unfit()
+        raise NonNestedMeshError
     middle[differs] = common.indices
     return middle
-
-
-def _unfit() -> ValueError:
-    return ValueError("the refined mesh is not the mesh with every cell halved")

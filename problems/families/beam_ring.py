@@ -54,7 +54,7 @@ class BeamRing(ContactFamily):
     forms = CONTACT_FORMS
     problem = "beam_ring.problem"
     model = "beam_ring.newton_step"
-    cells = ("Nr", "Nh", "radial")
+    cells = ("Nr", "Nh", "radial", "depth")
     #: the energy under the point load grows like log 1/h
     singular = "the work of a point load grows without bound as its cell shrinks"
 

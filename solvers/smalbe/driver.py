@@ -316,6 +316,7 @@ class OuterLoop:
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product."""
         box = qp.box
+        at = at._replace(nu=self.solver.onto_rows(at.nu))
         point = self.solver.point(at.nu, at.mu, box.lower, box.upper)
         return point or recovered(self.problem, qp, at)
 

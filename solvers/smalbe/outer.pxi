@@ -19,6 +19,10 @@ cdef double MIN_TAIL = 1e-4
 # ‖g^P‖/‖b‖ = 1e-4, and journal bearings 1e-5.
 cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
+# Pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact force of a
+# sphere on a plane differs from the load by 3e-9 without projections and by 2e-10 with
+# four; each pair takes two products with C.
+cdef int ALTERNATIONS = 4
 
 
 @cython.final
@@ -444,6 +448,37 @@ cdef class SMALBE(MPRGP):
         return 0
 
     # recovery
+
+    def onto_rows(self, nu):
+        """Return ν (n,), moved towards Cν = 0 without leaving its face; no product.
+
+        The outer loop ends with a violation ‖Cν‖ of the order of the tolerance. This
+        violation is the resultant of forces in balance, which users compare with the
+        load. Projections onto {Cν = 0} and onto the free components alternate (von
+        Neumann), so active bounds and discs stay active and multipliers keep their
+        meaning. The factor per projection is 1 − λ, where λ is the smallest eigenvalue
+        of C_F C_Fᵀ on the free components F: 0.5 for a sphere on a plane.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef list owners = []
+        if not self.rows.exist:
+            return nu
+        moved = empty(n)
+        cdef double *v = address(moved)
+        cdef double *free = self.x2
+        cdef double *t = self.t
+        memcpy(v, read(nu, owners), n * sizeof(double))
+        for i in range(n):
+            free[i] = 1.0
+        self.set.marks(v, free)
+        for _ in range(ALTERNATIONS):
+            self.rows.times(v, self.Cv)
+            memset(t, 0, n * sizeof(double))
+            self.rows.combine(1.0, self.Cv, t, t)
+            for i in range(n):
+                t[i] *= free[i]
+            self.set.project(v, 1.0, t, v)
+        return self.over.vector(moved)
 
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.

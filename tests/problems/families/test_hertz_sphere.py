@@ -18,9 +18,9 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 
 @cache
-def solved(keys, solver="smalbe"):
+def solved(keys, solver="smalbe", tol=1e-11):
     case = parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)
-    s = SOLVERS[solver].prepare(case.qp, 1e-11)()
+    s = SOLVERS[solver].prepare(case.qp, tol)()
     return case, s, case.quantities(s)
 
 
@@ -44,6 +44,17 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
     r = np.linalg.norm(case.fields(s).points[side.nodes, :2], axis=1)
     touching = side.pressure > 1e-6 * side.pressure.max()
     assert r[touching].max() == pytest.approx(0.648715, abs=1.5 * 0.648715 / 8)
+
+
+@pytest.mark.parametrize(
+    "keys", ["", "n=3/", "against=sphere/", "n=2/against=sphere/Q=0.5/"]
+)
+@pytest.mark.parametrize("tol", [1e-6, 1e-8])
+def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys, tol):
+    """Without projections at the end of a solve, the error was up to 3.2e-9."""
+    *_, found = solved(f"{keys}dual", tol=tol)
+
+    assert abs(found["force_error"]) < 1e-9
 
 
 #: two spheres of the verification of MOOSE, with a/R = 0.05

@@ -31,6 +31,7 @@ from tests.support.textbook.outer_loop import (
 from tests.support.textbook.projected import Projected
 
 KEPT = 200  #: directions of CG on a face
+ALTERNATIONS = 4  #: pairs of projections onto Cν = 0 and onto the face
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,11 @@ class TextbookLoop:
         return at
 
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
-        return recovered(self.problem, qp, at)
+        nu, C, (lower, upper) = at.nu, self.problem.rows.C, self.problem.bounds
+        free = (lower < nu) & (nu < upper)
+        for _ in range(ALTERNATIONS):
+            nu = np.clip(nu - free * (C.T @ (C @ nu)), lower, upper)
+        return recovered(self.problem, qp, at._replace(nu=nu))
 
 
 def outer_loop(
