@@ -87,7 +87,7 @@ cdef class SMALBE(MPRGP):
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
-        if problem.discs:  # with discs, CG takes few steps on a face
+        if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
         # n is that of all ranks, so that they take the same decisions
