@@ -74,6 +74,13 @@ cdef double SUFFICIENT_DECREASE = 1e-4
 cdef double LONG_STEP = 0.5
 
 
+# Relative difference of the lengths at which two components or discs count as reaching
+# the boundary at once: a step to the boundary is longer by this, and both end on it. In
+# symmetric problems, such as greco/dim=3, the lengths of mirror images differ by rounding
+# (3e-14), and which of them is shorter depends on the number of ranks.
+cdef double TIE = 2.0 ** -42
+
+
 # Relative accuracy of conjugate gradients in a Newton step. With 0.1, the contact
 # patches take up to 1.7 times as many products.
 cdef double NEWTON_ACCURACY = 0.01
@@ -853,7 +860,7 @@ cdef class MPRGP:
 
     cdef int expand_spectrally(self) except -1:
         """Step to the boundary; add a spectral step unless it was most of the CG step."""
-        cdef double feasible = self.line.feasible, cg = self.line.cg
+        cdef double feasible = (1 + TIE) * self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
             self.spectral_length = rounded(
                 self.over.total(dot(self.p, self.p, self.n)) / self.line.curvature

@@ -209,14 +209,14 @@ cdef class SMALBE(MPRGP):
         return self.over.vector(copied(self.p, n))
 
     def face_and_gradients(self, x, g):
-        """Return `free` (1 for free components, else 0), φ and β, each (n,)."""
+        """Return `free` (1 for free components, else 0), φ and β, vectors (n,)."""
         cdef list owners = []
         cdef Parts parts
         free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
         self.set.split(read(x, owners), read(g, owners), self.B.tau, address(phi),
                        address(free), &parts)
         self.set.chop(read(x, owners), read(g, owners), address(beta))
-        return free, phi, beta
+        return self.over.vector(free), self.over.vector(phi), self.over.vector(beta)
 
     # the start
 
