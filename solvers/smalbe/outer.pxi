@@ -172,7 +172,7 @@ cdef class SMALBE(MPRGP):
         return self.cached_model
 
     cdef Model model_of_penalty(self, double rho):
-        """Return the model I + (ρ − 1)Q of H without Ritz pairs."""
+        """Return the model I + (ρ − 1)Q of H without Ritz pairs; I for ρ < 1."""
         cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
         cdef Room w = Room(of_rows)
         if not self.rows.exist:
@@ -191,7 +191,7 @@ cdef class SMALBE(MPRGP):
             self.B = self.model(self.rho)
         self.preconditioner = None
         if self.M is not None:
-            self.preconditioner = self.model_of_penalty(fmax(self.rho, MIN_PROJECTING))
+            self.preconditioner = self.model_of_penalty(self.penalty_of_M())
         elif self.preconditioned:
             self.preconditioner = self.model(self.rho)
         return 0
