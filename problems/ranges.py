@@ -273,8 +273,8 @@ def other_decomposition(key: str, keys: Container[str]) -> str:
     """
     if key == "parts" and "feti" in keys:
         return (
-            "feti and parts exclude each other, parts is for bodies:PATH.toml; expected "
-            "feti, the most cells along a subdomain's side"
+            "feti and parts exclude each other, parts is for bodies:PATH.toml; "
+            "expected feti, the most cells along a subdomain's side"
         )
     if key in ("feti", *CLUSTERS) and "parts" in keys:
         return (
