@@ -160,6 +160,8 @@ def assemble(
     typed: dict[str, Value] = {}
     for key, value in given.items():
         if key not in family.defaults:
+            if instead := family.instead_of(key):
+                raise InputError(f"{family.name}: unknown key {key!r}; {instead}")
             raise unknown("key", key, family.defaults, where=family.name)
         where, kind = f"{family.name}: {key}", type(family.defaults[key])
         if texts and kind is not str and isinstance(value, str):

@@ -313,6 +313,13 @@ class Family(ABC):
     def check(self, params: Mapping[str, Value]) -> None:  # noqa: B027  # may be none
         """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
+    def instead_of(self, key: str) -> str:
+        """Return the key to use instead of a key of other families, "" if unknown.
+
+        The text is the end of the message about an unknown key.
+        """
+        return ""
+
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the params for half the cell size, or None if there is no such mesh.
 

@@ -5,7 +5,7 @@ A failed check raises InputError with one line that states the expected value.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -264,6 +264,24 @@ def check_decomposition(
                 f"{family}: {name}={params[name]} is not used by {key}=0, one piece "
                 f"per body; expected no {name}, or {key}, {what}"
             )
+
+
+def other_decomposition(key: str, keys: Container[str]) -> str:
+    """Return the message for an unknown key of a decomposition, or "" for other keys.
+
+    keys : keys of the family
+    """
+    if key == "parts" and "feti" in keys:
+        return (
+            "feti and parts exclude each other, parts is for bodies:PATH.toml; "
+            "expected feti, the most cells along a subdomain's side"
+        )
+    if key in ("feti", *CLUSTERS) and "parts" in keys:
+        return (
+            f"{key} and parts exclude each other, {key} needs subdomains that form a "
+            "grid; expected parts, the number of subdomains"
+        )
+    return ""
 
 
 def check_kinematics(family: str, params: Mapping[str, Value]) -> None:

@@ -17,6 +17,7 @@ from mortarbench.problems.ranges import (
     check_kinematics,
     defaults_of,
     double,
+    other_decomposition,
     refuse_finite_strain,
 )
 
@@ -71,6 +72,10 @@ class DeclaredFamily(Family):
         for name, check in self.conditions.items():
             if name in params:
                 check(self.name, params)
+
+    def instead_of(self, key: str) -> str:
+        """Return the key of a decomposition that excludes the key of another one."""
+        return other_decomposition(key, self.keys)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the keys with half the mesh size, or None if the family has no mesh.

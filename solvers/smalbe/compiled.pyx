@@ -33,7 +33,9 @@ free gradient is not stored. The loops over vectors are in `vectors.h`.
 cimport cython
 cimport numpy as cnp
 from cpython.exc cimport PyErr_CheckSignals
-from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
+from libc.math cimport (
+    INFINITY, fabs, fmax, fmin, frexp, isfinite, isinf, ldexp, rint, sqrt
+)
 from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv

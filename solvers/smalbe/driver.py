@@ -190,10 +190,10 @@ def _projected(
     steps : largest number of steps of the Lanczos process
     """
     find = partial(_estimated_spectrum, options, steps, carry)
-    if options.expansion == "spectral" and not qp.b.size and qp.q.any():
-        # no step depends on the norm, and q is closer to the first eigenvector than a
-        # random vector is
-        find = partial(by_lanczos, steps=1, start=qp.q)
+    if options.expansion == "spectral" and qp.q.any():
+        # q is closer to the first eigenvector than a random vector is, and does not
+        # depend on the number of ranks; without rows, no step depends on the norm
+        find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
         problem.factor = scaled.factor()

@@ -91,7 +91,7 @@ cdef class SMALBE(MPRGP):
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
-        if problem.discs:  # with discs, CG takes few steps on a face
+        if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
         # n is that of all ranks, so that they take the same decisions
@@ -195,7 +195,7 @@ cdef class SMALBE(MPRGP):
             self.B = self.model(self.rho)
         self.preconditioner = None
         if self.M is not None:
-            self.preconditioner = self.model_of_penalty(self.rho)
+            self.preconditioner = self.model_of_penalty(self.penalty_of_M())
         elif self.preconditioned:
             self.preconditioner = self.model(self.rho)
         return 0
@@ -213,14 +213,14 @@ cdef class SMALBE(MPRGP):
         return self.over.vector(copied(self.p, n))
 
     def face_and_gradients(self, x, g):
-        """Return `free` (1 for free components, else 0), φ and β, each (n,)."""
+        """Return `free` (1 for free components, else 0), φ and β, vectors (n,)."""
         cdef list owners = []
         cdef Parts parts
         free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
         self.set.split(read(x, owners), read(g, owners), self.B.tau, address(phi),
                        address(free), &parts)
         self.set.chop(read(x, owners), read(g, owners), address(beta))
-        return free, phi, beta
+        return self.over.vector(free), self.over.vector(phi), self.over.vector(beta)
 
     # the start
 

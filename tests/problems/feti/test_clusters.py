@@ -298,7 +298,18 @@ def test_more_ranks_than_clusters_are_refused():
             "with supports=eliminated is not built",
         ),
         ("plate/cluster=-1", "cluster=-1 must be at least 0"),
-        ("bodies:press.toml/parts=4/cluster=2", "unknown key 'cluster'"),
+        (
+            "bodies:press.toml/parts=4/cluster=2",
+            "unknown key 'cluster'; cluster and parts exclude each other, .*expected p",
+        ),
+        (
+            "bodies:press.toml/feti=2",
+            "unknown key 'feti'; feti and parts exclude each other, .*expected parts, ",
+        ),
+        (
+            "greco/parts=4",
+            "unknown key 'parts'; feti and parts exclude each other, .*expected feti, ",
+        ),
     ],
 )
 def test_clusters_that_are_not_built_are_refused_by_name(name, message):
