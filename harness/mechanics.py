@@ -402,9 +402,8 @@ class RigidMotions(NamedTuple):
     constrained: Any  #: (n, p) sparse; motions that change gaps or slip
     free: Any  #: (n, q) sparse; motions that change gaps and slip by rounding only
     G: Extended  #: (m, p)  B·constrained
-    largest: (
-        Any  #: (n, p) `constrained`; each nonzero becomes the largest of its column
-    )
+    #: (n, p) `constrained`; each nonzero becomes the largest of its column
+    largest: Any
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
@@ -544,9 +543,8 @@ class Mechanics:
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
     #: equilibrium
     rigid: NDArray[np.float64]
-    names: tuple[
-        str, ...
-    ] = ()  #: names of the bodies, in the order of the columns of `rigid`
+    #: names of the bodies, in the order of the columns of `rigid`
+    names: tuple[str, ...] = ()
     scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
     #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`

@@ -127,9 +127,8 @@ class About:
     licence: str
     linear_solver: str  #: solver used for its linear systems
     phases: str  #: which work is timed as preparation, and which as solution
-    package: str = (
-        ""  #: package to install; its module has the same name unless `module` is set
-    )
+    #: package to install; its module has the same name unless `module` is set
+    package: str = ""
     module: str = ""  #: name of the module, if it differs from that of the package
     sequence: str = ""  #: work reused from one QP to the next; empty if none is reused
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
@@ -230,12 +229,10 @@ class Case:
     """
 
     qp: QP
-    recover: Callable[
-        [Solution], Vector
-    ]  #: maps a solution of the QP to the physical unknown u, SI
-    quantities: Callable[
-        [Solution], Mapping[str, Any]
-    ]  #: maps a solution of the QP to physical results, SI
+    #: maps a solution of the QP to the physical unknown u, SI
+    recover: Callable[[Solution], Vector]
+    #: maps a solution of the QP to physical results, SI
+    quantities: Callable[[Solution], Mapping[str, Any]]
     #: maps a solution of the QP to the deformed state, for plots
     fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0

@@ -121,12 +121,10 @@ class Record(Measurement):
     message: str = ""
     iterations: int | None = None
     counts: Mapping[str, Any] = field(default_factory=dict)
-    reported: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: other data from the solver, such as its own times in seconds
-    build_seconds: float | None = (
-        None  #: time to build the case, in the process that built it
-    )
+    #: other data from the solver, such as its own times in seconds
+    reported: Mapping[str, Any] = field(default_factory=dict)
+    #: time to build the case, in the process that built it
+    build_seconds: float | None = None
     #: part of `build_seconds` spent on the factorisation and the dual; dual forms only
     dualise_seconds: float | None = None
     #: peak resident memory of the new process that built the case; measured only in
@@ -134,9 +132,8 @@ class Record(Measurement):
     build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
-    canary_seconds: float | None = (
-        None  #: time of a fixed computation before the measurement, to reveal drift
-    )
+    #: time of a fixed computation before the measurement, to reveal drift
+    canary_seconds: float | None = None
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
@@ -158,9 +155,8 @@ class Record(Measurement):
     #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
     #: which measures the noise; "copies": `ranks` independent solves at the same time
     role: str = ""
-    primal: float | None = (
-        None  #: this and the next three are the residuals of `harness.verify.kkt`
-    )
+    #: this and the next three are the residuals of `harness.verify.kkt`
+    primal: float | None = None
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
@@ -169,9 +165,8 @@ class Record(Measurement):
     decided_by: str = "residuals"
     #: error relative to a proven optimum, see `harness.verify.optimum`
     optimum_error: float | None = None
-    energy_bound: float | None = (
-        None  #: certified bound on the relative error in the energy norm
-    )
+    #: certified bound on the relative error in the energy norm
+    energy_bound: float | None = None
     #: terms of `energy_bound`, relative; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP

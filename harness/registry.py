@@ -78,9 +78,8 @@ class SolverSpec:
 
     name: str  #: name in the registry, "NAME" or "PREFIX:BACKEND"
     label: str  #: label in records and reports
-    options: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: options that the suite sets, by name
+    #: options that the suite sets, by name
+    options: Mapping[str, Any] = field(default_factory=dict)
     #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
     #: which measures the noise; "copies": `ranks` independent solves at the same time,
     #: which bound the speed-up of a solve on that number of ranks
@@ -163,9 +162,8 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    operators: Mapping[str, Maker] = field(
-        default_factory=dict
-    )  #: functions that build operators, see `harness.operators`
+    #: functions that build operators, see `harness.operators`
+    operators: Mapping[str, Maker] = field(default_factory=dict)
     origin: str = ""  #: path of the plug-in file, or "entry points"
 
 

@@ -83,12 +83,10 @@ class Solution:
     iterations: int | None = None  #: None if the solver does not report the number
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record
-    reported: Mapping[str, float | str] = field(
-        default_factory=dict
-    )  #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
-    history: History = field(
-        default_factory=dict
-    )  #: columns of equal length, a row per iteration; see `harness.solution`
+    #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
+    reported: Mapping[str, float | str] = field(default_factory=dict)
+    #: columns of equal length, a row per iteration; see `harness.solution`
+    history: History = field(default_factory=dict)
 
     @classmethod
     def without_point(

@@ -58,9 +58,8 @@ class Answer:
     stored: Verdict  #: verdict that the run stored
     verdict: Verdict  #: verdict on the stored point, evaluated again
     residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
-    optimum_error: (
-        float | None
-    )  #: error relative to a proven optimum, which decides instead of the residuals
+    #: error relative to a proven optimum, which decides instead of the residuals
+    optimum_error: float | None
     allowed: float  #: largest residual of a verified answer
     energy_allowed: float  #: largest permitted relative error in the energy norm
     energy_bound: float | None  #: certified error bound that the run stored

@@ -260,10 +260,8 @@ class _Halving:
             start = perf_counter()
             level = self._level(params, form, first=not sizes)
             if level is None and not sizes and form != case.form:
-                form, self.why = (
-                    case.form,
-                    "",
-                )  # cases on subdomains have only a dual form
+                # cases on subdomains have only a dual form
+                form, self.why = (case.form, "")
                 level = self._level(params, form, first=True)
             if level is None:
                 return

@@ -46,10 +46,8 @@ BLAS_LIBRARIES = (
 #: owners of libraries whose thread pools the code of mortarbench may use: the operating
 #: system, or the wheel of a package
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
-CHOLMOD_OWNERS = (
-    "system",
-    "scikit_sparse",
-)  #: owners of libraries that CHOLMOD may use
+#: owners of libraries that CHOLMOD may use
+CHOLMOD_OWNERS = ("system", "scikit_sparse")
 
 VOLATILE = ("now",)  #: keys of an environment that its digest excludes
 

@@ -112,9 +112,8 @@ class _SolverHost:
         # inode, size and time of each verified file, by the digest of its content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        self.parallel: ParallelSolver | None = (
-            None  #: replaces the solver in measurements, on several ranks
-        )
+        #: replaces the solver in measurements, on several ranks
+        self.parallel: ParallelSolver | None = None
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds and one with constraint rows, ignoring the results.

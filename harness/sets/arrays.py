@@ -1,4 +1,4 @@
-"""Conversion of discs and cones to and from the named arrays in files.
+"""Conversion of discs and cones to and from named arrays in files.
 
 The first set of discs is stored as `disc_index` and `disc_radius`, the first set of
 cones as `cone_index` and `cone_slope`. The names of further sets of the same class,
@@ -72,7 +72,7 @@ def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
         while parts := _parts(kind, _prefix(kind, count), arrays, names):
             sets.append(kind(**parts))
             count += 1
-    if names:  # without this array the QP would be a different problem
+    if names:  # ignoring this array would change the problem
         raise InputError(
             f"{min(names)} belongs to no set; expected disc_index and disc_radius, "
             "cone_index and cone_slope, then disc2_index, …"
@@ -87,7 +87,7 @@ def _prefix(kind: type[Discs] | type[Cones], count: int) -> str:
 def _parts(
     kind: Any, prefix: str, arrays: Mapping[str, Any], names: set[str]
 ) -> dict[str, Any]:
-    """Return the constructor arguments of a set; empty if `arrays` does not contain it.
+    """Return the constructor arguments of a set; empty if `arrays` lacks the set.
 
     names : names of the arrays that are not yet assigned to a set; the names of this
         set are removed in place

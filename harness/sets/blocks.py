@@ -95,7 +95,7 @@ class Blocks(ABC):
         return {f"{self.prefix}_{name}": getattr(self, name) for name in names}
 
     def entries(self, T: Any, a: Vector) -> tuple[NDArray[np.int64], Vector]:
-        """Return columns and entries of T in the rows of the blocks, (k, d) each.
+        """Return columns and entries (k, d) of T in the rows of the blocks.
 
         T has a single entry in each row and column, and x = T x' + a is substituted.
 
@@ -114,7 +114,7 @@ class Blocks(ABC):
 
 
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
-    """Return the Euclidean norms (k,) of the rows of (k, d), in the same precision."""
+    """Return the Euclidean norms (k,) of rows (k, d), without a change of precision."""
     return np.asarray(np.linalg.norm(blocks, axis=1))
 
 

@@ -22,13 +22,14 @@ from mortarbench.harness.registry import SolverSpec, option_types, options_of, r
 from mortarbench.harness.suite.suite import NULL_SUFFIX
 
 _KEY = re.compile(r"[^\W\d]\w*")
+# stricter than int() and float(), which accept 1_0 and digits of other scripts
 _NUMBERS = {
     int: (re.compile(r"[+-]?[0-9]+"), "an integer"),
     float: (
         re.compile(r"[+-]?(inf|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?)"),
         "a number",
     ),
-}  # stricter than int() and float(), which accept 1_0 and digits of other scripts
+}
 _TRUTH = {"true": True, "false": False}
 _PLAIN = (bool, Real, str, NoneType)  #: types of values that Python callers may pass
 _MAX_VARIANTS = 1000  #: largest number of variants of one solver in a sweep
