@@ -193,7 +193,7 @@ def _selections(
 
 
 def _sorted(M: Matrix) -> Matrix:
-    """Sort the indices of a sparse matrix, in place; matrix products do not sort them."""
+    """Sort the indices of a sparse matrix in place; products leave them unsorted."""
     if hasattr(M, "sort_indices"):
         M.sort_indices()
     return M

@@ -14,7 +14,7 @@ three representations:
 * additive: the vector is the sum of the contributions of all ranks
 * consistent: each rank stores the entries of the rows that it touches
 * orthonormal: in the row order of L, each rank stores the entries of its inner rows and
-* all shared entries divided by √P, where P is the number of ranks
+  all shared entries divided by √P, where P is the number of ranks
 
 The inner product of two vectors is the sum over ranks of local inner products if one
 vector is additive and the other is consistent, or if both vectors are orthonormal.

@@ -1,4 +1,4 @@
-"""Checks whether a machine is fit for measuring times, with advice on changes."""
+"""Checks of the fitness of a machine for measuring times, with advice on changes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def load_advice(load: float) -> str:
 
 
 def _check(section: str, name: str, value: object, advice: str = "") -> Check:
-    """Return a check with the level that follows from the value and the advice.
+    """Return a check, whose level follows from the value and the advice.
 
     The level is WARN if there is advice, UNKNOWN if the value is None, otherwise OK.
     """
@@ -169,7 +169,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the BLAS in a package's wheel, else the BLAS of the system, or None."""
+    """Return the BLAS in a package's wheel, else the system's BLAS, else None."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":

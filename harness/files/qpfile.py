@@ -10,8 +10,8 @@ is stored as
 * the arrays ``M_data, M_indices, M_indptr, M_shape`` of the CSC format of each matrix M
   of ``P, G, A``, with both triangles of P,
 * the arrays of sets other than bounds, such as ``disc_index, disc_radius``, with the
-* names of `harness.sets.arrays`, and ``meta``, a JSON object, whose entry ``dense``
-* lists the matrices that were dense.
+  names of `harness.sets.arrays`, and
+* ``meta``, a JSON object, whose entry ``dense`` lists the matrices that were dense.
 
 Absent constraints have zero rows, and absent bounds are ±inf. The optional structure of
 a dual QP (`harness.qp.Structure`) is stored as the matrices ``K, B`` and the vector

@@ -12,10 +12,11 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
   error. If ``fields`` is a path and the case defines a deformed state, this state is
   written to ``fields``
 * ``{"shared": NAME}`` determines, without building the case, whether MPI ranks can emit
-* the QP of the case. Reply: ``{"event": "done", "shared": …}`` ``{"solve": PATH,
-* "point": PATH}`` solves the QP in the first file with the reference solver and writes
-* the solution to the second file. It is sent if the residuals do not decide a verdict.
-* Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
+  the QP of the case. Reply: ``{"event": "done", "shared": …}``
+* ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
+  solver and writes the solution to the second file. It is sent if the residuals do not
+  decide a verdict. Reply: ``{"event": "done", "found": …}``, false if the reference
+  solver fails
 
 If a case cannot be built, the reply to the first two requests is ``{"event": "done",
 "unbuilt": REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true if the case

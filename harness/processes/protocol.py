@@ -6,13 +6,14 @@ more events. The worker ends when the pipe of requests is closed.
 * ``{"event": "ready"}`` is sent once, when the worker accepts requests.
 * ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
-* its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
-* worker sends ``{"event": "timed"}`` between these two events, when its own clock has
-* stopped. The worker then waits for a line from the parent, so that the parent can read
-* the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
-* "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
-* answer, rank 0 sends ``{"event": "measured"}``. ``{"event": "fault", "what": …}``
-* replaces any other event if code of the harness fails.
+  its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
+  worker sends ``{"event": "timed"}`` between these two events, when its own clock has
+  stopped. The worker then waits for a line from the parent, so that the parent can read
+  the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
+  "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
+  answer, rank 0 sends ``{"event": "measured"}``.
+* ``{"event": "fault", "what": …}`` replaces any other event if code of the harness
+  fails.
 
 A library that writes to the wrong file descriptor can mix other bytes into the replies;
 `event_of` rejects such lines.

@@ -15,7 +15,7 @@ requests:
   - ``tightens``: true if each step of the sequence has its own tolerance
 
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: emit the QP of a case on the
-* MPI ranks (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
+  MPI ranks (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
   If the request has the entry ``first``, the ranks emit the case in that entry
   beforehand. If ``source`` is "ranks", the ranks also evaluate the answer. The event
   ``emitted`` contains the ``sizes`` and the ``digest`` of the QP; the event
