@@ -248,9 +248,7 @@ def _in_foreign_wheel(path: str) -> bool:
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry of threadpoolctl, with the owner of the library instead of its
-    path.
-    """
+    """Return an entry of threadpoolctl with the library's owner instead of its path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],

@@ -67,7 +67,7 @@ class Footprint:
                     self._created[name] = new[name]
 
     def remove_shared(self) -> None:
-        """Remove the files that a tree left in SHARED after its processes have ended."""
+        """Remove the files that the ended processes of the tree left in SHARED."""
         for path in self._remaining():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():

@@ -201,7 +201,7 @@ def _copy_environments(
     records: Iterable[Record],
     tell: Callable[[str], None],
 ) -> None:
-    """Store the environments of all records; store the first also as environment.json."""
+    """Store the environments of all records, the first also as environment.json."""
     stored: list[Mapping[str, Any]] = []
     for digest in dict.fromkeys(r.environment for r in records):
         environment = _environment(folders, digest)

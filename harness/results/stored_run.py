@@ -157,7 +157,7 @@ def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
 def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
-    """Return `spec` with those options of the record that differ from current defaults."""
+    """Return `spec` with the record's options that differ from current defaults."""
     default = replace(spec, options={})
     if spec.name not in solvers and f"{spec.name.rpartition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")

@@ -305,11 +305,9 @@ class Executor:
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
         is_limited = block.warm_up is not None
-        for _ in range(
-            2
-            # retry once: the process may have been killed from outside, or an earlier case
-            # may have crashed it
-        ):
+        # retry once: the process may have been killed from outside, or an earlier case
+        # may have crashed it
+        for _ in range(2):
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)},
                 time_limit=block.time_limit if is_limited else inf,

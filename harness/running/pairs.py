@@ -90,8 +90,7 @@ def unpaired_ratio(
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Return the paired ratio of two solvers' times if possible, else the unpaired
-    ratio.
+    """Return the paired ratio of times if possible, otherwise the unpaired ratio.
 
     If there are too few times for either ratio, return None.
 

@@ -105,9 +105,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Mark all cases of a block as unbuilt; return False if all were already
-        marked.
-        """
+        """Mark the cases of a block as unbuilt; return False if none is new."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)
@@ -159,8 +157,7 @@ class Schedule:
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
-        """Return a block with its remaining turns in random order, or None without
-        turns.
+        """Return a block with its remaining turns in random order; None if none remain.
 
         If any step of a sequence is missing, all steps are measured again, because a
         solver carries data from step to step.
