@@ -1,4 +1,4 @@
-"""Bounds on user input: a message of one line states the admissible values."""
+"""Limits of user input: messages of one line state the admissible values."""
 
 import json
 import os
@@ -32,7 +32,9 @@ def record(run_id="a", **changes):
 
 @pytest.fixture
 def journal(tmp_path):
-    """Write lines, records or changed fields of one, into a journal; its folder."""
+    """Write lines, records or changed fields of a record to a journal; return its
+    folder.
+    """
 
     def journal(*entries):
         (tmp_path / "journal").mkdir(exist_ok=True)
@@ -50,7 +52,7 @@ def journal(tmp_path):
 
 @pytest.fixture
 def refused(capsys, monkeypatch, tmp_path):
-    """Run a command that must end with exit code 2; returns its one line."""
+    """Run a command that must exit with code 2; return its message of one line."""
     monkeypatch.chdir(tmp_path)
     registries = Registries()
 

@@ -1,4 +1,4 @@
-"""The telemetry of the in-house solvers."""
+"""Histories of the in-house solvers."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A QP from arrays: accepted input, and the message of every refusal."""
+"""QPs from arrays: accepted input, and error messages."""
 
 import doctest
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Conformance: every solver passes every check; every check catches its fault."""
+"""Conformance checks: solvers pass all checks, and each check detects its fault."""
 
 import gc
 import json
@@ -106,7 +106,7 @@ ONCE = ", sparse"
 
 
 def is_for_all(name, check):
-    """Return True if a check runs by default; for our own solver, all do."""
+    """Return True if a check runs by default; all checks run for `smalbe`."""
     planted = PLANTED.match(check)
     return name == "smalbe" or planted is None or (
         planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
@@ -145,7 +145,7 @@ def test_variants_and_other_backends_conform(name, check):
 
 
 def weaknesses(solver):
-    """Return each (form, change) with a weakness, and the number of solved ones."""
+    """Return each (form, change) with a weakness, and the number of solved pairs."""
     weak, solved = [], 0
     for form in FORMS:
         old = None
@@ -171,7 +171,9 @@ def weaknesses(solver):
     ],
 )
 def test_weaknesses_are_documented(name):
-    """`make weaknesses` writes the page; it may list weaknesses that are gone."""
+    """The page, written by `make weaknesses`, may also list weaknesses that
+    are gone.
+    """
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
 
@@ -190,7 +192,7 @@ def test_our_own_solvers_have_no_weakness():
 
 @dataclass(frozen=True)
 class Sound:
-    """PIQP under another name, base class of the faulty solvers."""
+    """PIQP under another name; base class of the faulty solvers."""
 
     spoilt: str = ""
 
@@ -248,7 +250,7 @@ class Wanders(Sound):
 
 
 class Scales(Sound):
-    """Correct answers, after scaling the read-only data in place."""
+    """Solver that scales read-only data in place but returns correct answers."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -288,7 +290,9 @@ class TakesOperatorsForZero(Sound):
 
 
 class StopsAtTheStart(Sound):
-    """Claim of optimality at the first point, as by HiGHS 1.15.1 for bounds only."""
+    """Solver that claims that its first point is optimal, like HiGHS 1.15.1 without
+    rows.
+    """
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -302,7 +306,7 @@ class Slow(Sound):
 
 
 class MindsUnits(Sound):
-    """Failure for large numbers, like with an absolute tolerance."""
+    """Solver that fails for large numbers, as with an absolute tolerance."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -310,7 +314,7 @@ class MindsUnits(Sound):
 
 
 class SlowInNewtons(Sound):
-    """49 times the iterations for large unknowns, as OSQP takes."""
+    """Solver that takes 49 times the iterations for large unknowns, like OSQP."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -319,7 +323,7 @@ class SlowInNewtons(Sound):
 
 
 class MindsTheOrder(Sound):
-    """Failure if the first unknown has the lower bound zero."""
+    """Solver that fails if the first unknown has the lower bound zero."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -405,7 +409,7 @@ def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
 
 
 def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
-    """The line of the message, inserted at its place, makes the check pass."""
+    """If the line quoted in the message is inserted, the check passes."""
     check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
     ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)

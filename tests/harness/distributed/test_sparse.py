@@ -53,7 +53,7 @@ def test_other_formats_and_vectors_are_refused():
 
 @pytest.fixture
 def M():
-    """Seven rows, of which two are empty, on five columns, of which one is empty."""
+    """Return a matrix (7, 5) with two empty rows and one empty column."""
     dense = random_array((7, 5), density=0.6, rng=np.random.default_rng(SEED)).toarray()
     dense[[2, 6]], dense[:, 3] = 0, 0
     return dense
@@ -118,7 +118,7 @@ def grid(cells):
 
 @pytest.fixture(params=["array", "library"])
 def way(request, monkeypatch):
-    """Factorise small matrices in an array, or as large ones."""
+    """Factorise small matrices by compiled code, or by the library like large ones."""
     if request.param == "library":
         monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
 
@@ -151,7 +151,9 @@ def test_a_factor_with_a_border_solves(last):
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("shift", [0.5, 1e-3, 1e-14])
 def test_changes_of_the_border_are_changes_of_the_matrix(shift):
-    """All of A on two rows of the border is removed: the shift is left there."""
+    """All of A on the two rows of the border is subtracted, so only the
+    shift remains.
+    """
     rng = np.random.default_rng(SEED)
     free, held = rng.standard_normal((6, 12)), np.zeros((6, 4))
     held[[1, 4]] = rng.standard_normal((2, 4))
@@ -190,7 +192,7 @@ def test_dependent_rows_have_no_factor(last):
 
 
 def test_a_row_with_many_entries_is_eliminated_late():
-    """The hub of a star is first: eliminated first, it would couple all others."""
+    """Early elimination of the hub of a star would couple all other rows."""
     A = csc_array(5 * eye_array(40)).tolil()
     A[0, 1:], A[1:, 0] = 0.1, 0.1
     L = BorderedFactor.of_array(A.toarray(), np.array([20]))

@@ -1,4 +1,4 @@
-"""The environment contains what times depend on, and nothing about the user."""
+"""Environments contain values that affect times, but no data about the user."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""Arrays that are mapped, operators that travel as arrays."""
+"""Mapped arrays, and operators that are stored as arrays."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def operator_of(d):
 
 @pytest.fixture
 def operator_qp():
-    """A QP whose P is the operator diag(1, 2); BUILT counts how often it was made."""
+    """Return a QP with the operator diag(1, 2); BUILT records each build."""
     BUILT.clear()
     return operator_of(np.array([1.0, 2.0]))
 

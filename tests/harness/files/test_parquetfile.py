@@ -1,4 +1,4 @@
-"""A QP in Parquet is the one that qpbenchmark's test sets load."""
+"""QPs in Parquet files have the format of qpbenchmark's test sets."""
 
 import subprocess
 import sys
@@ -28,10 +28,10 @@ def make_qp(P=P, **changes):
 
 
 def problem_of(row):
-    """Build a problem as the documentation of qpbenchmark's ParquetTestSet says.
+    """Build a problem like qpbenchmark's ParquetTestSet, following its documentation.
 
-    Every entry is an array, a string or None; P, G and A are reshaped to as many
-    columns as q has components.
+    Every entry is an array, a string or None. P, G and A are reshaped such that their
+    number of columns is the size of q.
     """
     n = row["q"].size
     arrays = {key: row[key] for key in COLUMNS if isinstance(row[key], np.ndarray)}
@@ -78,7 +78,9 @@ def test_matrices_come_back_sparse_or_dense_as_they_were(path):
 
 
 def test_a_problem_that_somebody_else_wrote_is_dense(path):
-    """A file of pandas has flattened matrices, None for absent ones and no metadata."""
+    """A file of pandas has flattened matrices, None for absent data, and no
+    metadata.
+    """
     row = {"P": P.ravel(), "q": np.ones(3), "G": None, "h": None, "name": "theirs"}
     row |= {"A": np.ones(3), "b": np.array([2.0]), "lb": None, "ub": np.ones(3)}
     pd.DataFrame({k: [v] for k, v in row.items()}).to_parquet(path, index=False)
@@ -150,7 +152,7 @@ def test_files_that_are_none_are_refused(path, tmp_path):
 
 
 def test_reading_starts_no_threads_that_could_outlive_python(path):
-    """Threads of arrow occasionally abort a process at its exit."""
+    """Threads of Arrow occasionally abort a process at its exit."""
     save_parquet(path, make_qp(), {})
     program = (
         "import os, pathlib, sys; import pyarrow.parquet; "

@@ -22,7 +22,7 @@ def make_qp(P, A=None):
 
 @pytest.fixture
 def saved(tmp_path):
-    """A good file, and a way to spoil one array of it."""
+    """Write a valid file; return it with a function that damages one of its arrays."""
     path = tmp_path / "qp.npz"
     save_qp(path, make_qp(csr_array(P)), {"name": "three"})
 
@@ -130,7 +130,7 @@ def test_other_files_are_refused_and_never_unpickled(tmp_path):
 
 
 def plain(**changes):
-    """Every kind of constraint, as arrays of numpy."""
+    """Return arrays with constraints of every type."""
     arrays = {
         "P": np.diag([2.0, 3.0]), "q": np.ones(2), "G": np.ones((1, 2)), "h": [4.0],
         "A": np.array([[1, -1]]), "b": [0], "lb": [-np.inf, 0], "ub": [1.0, np.inf],

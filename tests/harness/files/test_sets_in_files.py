@@ -1,4 +1,4 @@
-"""Files hold discs and cones: the same QP is read again, and half a set is refused."""
+"""Discs and cones in files: round trips, and refusal of incomplete sets."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_sizes_count_the_blocks_of_every_kind():
 
 
 def test_digests_tell_sets_apart():
-    """Another radius, block, kind or order is another problem."""
+    """A different radius, block, class or order defines a different problem."""
     discs, cones = mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]), mb.Cones([[0, 5]], [0.5])
     one = qp_digest(qp_over(discs, cones))
     assert qp_digest(qp_over(cones, discs)) == one

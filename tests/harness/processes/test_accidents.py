@@ -1,4 +1,4 @@
-"""Solvers that disturb a run by accident, and the verdicts of their neighbours."""
+"""Solvers that disturb a run by accident, and verdicts on other solvers of the run."""
 
 import fcntl
 import itertools
@@ -82,7 +82,7 @@ RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchesthe
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Mark the processes that this test starts, by a variable of their environment."""
+    """Mark the processes that this test starts with an environment variable."""
     name = secrets.token_hex(8)
     monkeypatch.setenv("WATCHED", name)
     return name
@@ -90,7 +90,7 @@ def watched(monkeypatch):
 
 @pytest.fixture(scope="module")
 def beside_a_witness(tmp_path_factory):
-    """Measure a solver beside a witness, a worker that looks for leftover processes."""
+    """Measure a solver together with a worker that searches for leftover processes."""
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
@@ -132,7 +132,7 @@ def processes_of(watched):
 
 
 class Bench:
-    """Measuring of solvers on a tiny QP, each by a worker of its own."""
+    """Measurements of solvers on a tiny QP, each in a separate worker."""
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}

@@ -15,7 +15,7 @@ def name(**params):
 
 @pytest.fixture
 def get(tmp_path):
-    """Return a function that looks up a case; its ``made`` lists those it built."""
+    """Return a function that looks up a case; its ``made`` lists the built cases."""
 
     def get(case, *, environment="here", content=b"content", slowly=0.0):
         def make(path):

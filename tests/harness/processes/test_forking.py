@@ -1,4 +1,4 @@
-"""Forked workers: isolated and killed like those that a command starts."""
+"""Forked workers are isolated and killed like workers started by a command."""
 
 import json
 import os

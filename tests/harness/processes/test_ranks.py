@@ -1,4 +1,4 @@
-"""Solves on several MPI ranks: comparison with one process, and failing ranks."""
+"""Solves on several MPI ranks, compared with one process; failures of ranks."""
 
 import json
 import os
@@ -93,7 +93,7 @@ def test_the_solution_on_ranks_is_that_of_one_process(rank_results, case):
 
 @pytest.fixture(scope="module")
 def answers():
-    """Solve twice on two ranks, and once on one."""
+    """Solve twice on two ranks and once on one rank."""
     case = mb.build(CASE)
     return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
 
@@ -110,7 +110,9 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
 
 
 def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
-    """On free components, some rows are smaller than the rounding of their sum."""
+    """On free components, some rows are smaller than the rounding errors of
+    their sum.
+    """
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
     assert answer.record.claimed in ("solved", "iteration_limit")
@@ -152,7 +154,7 @@ def test_bodies_in_space_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_p
     ],
 )
 def test_friction_in_space_has_the_same_displacement_on_all_numbers_of_ranks(name):
-    """Spectral steps amplify rounding, so that later steps may differ."""
+    """Spectral steps amplify rounding, so later steps may differ."""
     whole = mb.solve(name.replace("/feti=2", ""), "smalbe", tol=TOL).record.quantities
     for ranks in (1, 2, 4):
         answer = mb.solve(name, "smalbe", tol=TOL, ranks=ranks)
@@ -167,7 +169,9 @@ def test_friction_in_space_has_the_same_displacement_on_all_numbers_of_ranks(nam
 
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
-    """Node-to-segment rows do not resist rolling, so equality rows are dependent."""
+    """Node-to-segment rows do not resist rolling, so the equality rows are
+    dependent.
+    """
     description = described(tmp_path)
     text = description.read_text().replace('"mortar"', '"nts"')
     held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
@@ -288,7 +292,7 @@ def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path)
 def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
     tmp_path, monkeypatch
 ):
-    """In suites and single solves; ranks use the original family."""
+    """Test suites and single solves; the ranks use the original family."""
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
         SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
@@ -417,7 +421,7 @@ def resident_mib(pid):
 
 
 def busy_rank(mark):
-    """Return [rank 1] once it has its share of the QP, [] before that."""
+    """Return [rank 1] when it has its share of the QP, and [] before."""
     return [
         pid
         for pid, command, environment in processes(mark)

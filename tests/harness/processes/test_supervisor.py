@@ -77,7 +77,7 @@ def ignores_sigterm(process):
 
 @pytest.fixture
 def ask(tmp_path):
-    """Return a function that starts a worker and lets it solve the tiny QP."""
+    """Return a function that starts a worker and requests a solve of the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
     save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})

@@ -149,7 +149,7 @@ def test_closing_twice_does_not_close_another_file(worker, tmp_path):
 
 
 def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
-    """From the start of a worker to its end, including stops of other workers."""
+    """Test from the start of a worker to its end, including stops of other workers."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
     def refuse(*what):
@@ -167,7 +167,7 @@ def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
 
 
 def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
-    """Its number may have belonged to one of ours a moment before."""
+    """The process may have the reused ID of a process of a worker."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
@@ -294,7 +294,7 @@ SOLVERS = {"hangs": Hangs()}
 
 
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
-    """Test with SIGHUP, which nohup ignores."""
+    """Test SIGHUP, which nohup ignores."""
     script = (
         "import os, signal; from mortarbench.harness.processes.termination import *\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
@@ -308,7 +308,7 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
 
 
 def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
-    """The signal arrives while its case is built."""
+    """The signal arrives while the case is built."""
     plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
     plugin.write_text(SLOW)
     out.mkdir()

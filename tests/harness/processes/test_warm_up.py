@@ -1,4 +1,4 @@
-"""Times of dualising exclude first calls: the first dual case is built twice."""
+"""Times of dualising exclude effects of first calls, since a case is built twice."""
 
 import time
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from mortarbench.harness.processes.case_worker import CaseWorker
 
 @dataclass(frozen=True)
 class Slow(Family):
-    """Family whose first dual case takes longer, because of first calls."""
+    """Family whose first dual case takes longer because of first calls."""
 
     name: str = "slow"
     forms: tuple = ("primal", "dual")

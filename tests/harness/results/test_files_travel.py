@@ -1,4 +1,4 @@
-"""Files of QPs are copied into the result folder, which suffices to continue a run."""
+"""Files of QPs are copied to the result folder, from which a run can be continued."""
 
 import json
 import shutil
@@ -30,7 +30,9 @@ params = {{ path = {} }}
 
 
 def write_qp(path, bound):
-    """Write  min ½xᵀx − 3·1ᵀx, x ≤ bound < 3;  both components of x are the bound."""
+    """Write min ½xᵀx − 3·1ᵀx, x ≤ bound < 3; at the solution, both xᵢ equal
+    the bound.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, P=np.eye(2), q=-3 * np.ones(2), ub=np.full(2, bound))
 

@@ -42,7 +42,7 @@ def record(path, **changes):
 
 @pytest.fixture
 def sent(tmp_path):
-    """Write a result folder of some records."""
+    """Write a result folder with given records."""
 
     def write(*records):
         folder = tmp_path / "sent"
@@ -74,7 +74,9 @@ def command(capsys, monkeypatch, tmp_path):
 
 
 def everything(folder):
-    """Return names and content of all files in a folder, without following links."""
+    """Return the names and contents of all files in a folder, without
+    following links.
+    """
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))

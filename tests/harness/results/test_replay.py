@@ -76,7 +76,7 @@ def cli(registries, capsys, monkeypatch, tmp_path):
 
 @pytest.fixture
 def stored(finished, tmp_path):
-    """Return the records of the run in folder `done`, by solver, depth and repeat."""
+    """Return the records of the run in folder `done` by solver, depth and repeat."""
     shutil.copytree(finished, tmp_path / "done")
     records = read_journal(tmp_path / "done")
     return {(r.solver, r.params["depth"], r.repeat): r for r in records}
@@ -108,7 +108,7 @@ def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
 
 
 def test_the_ratio_of_times_names_its_times(cli, stored):
-    """The median of the repeats, not the time of the stored repeat beside it."""
+    """The ratio uses the median of the repeats, not the time of the stored repeat."""
     then = stored["half", 1, 0]
     out = cli("replay", "done", then.run_id)[1]
     (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]

@@ -44,7 +44,7 @@ forms = ["dual"]
 
 
 class Cluster:
-    """Dask scheduler with workers that can be killed."""
+    """Dask scheduler with workers that tests can kill."""
 
     def __init__(self, folder, forks, *options):
         self.folder = folder
@@ -100,7 +100,9 @@ def cluster(tmp_path, forks):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line on the toy problem in an empty folder: code, out, err."""
+    """Run a command line on the toy problem in an empty folder; return
+    code, out, err.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
@@ -122,7 +124,9 @@ def cli(capsys, monkeypatch, tmp_path):
 
 
 def measured(folder):
-    """Return the verdicts in a journal by run_id; assert that none is there twice."""
+    """Return the verdicts in a journal by run_id; assert that no run_id
+    occurs twice.
+    """
     records = read_journal(Path(folder))
     found = {r.run_id: r.verdict for r in records}
     assert len(found) == len(records)
@@ -130,7 +134,7 @@ def measured(folder):
 
 
 def partial_blocks(folder):
-    """Return the numbers of blocks that are only partly in a journal."""
+    """Return the numbers of blocks of which a journal has only some measurements."""
     with suppress(InputError):
         counts = Counter(r.block for r in read_journal(Path(folder)))
         return [number for number, count in counts.items() if count < SOLVERS]
@@ -138,7 +142,7 @@ def partial_blocks(folder):
 
 
 def node_of(solver):
-    """Return the Dask worker of a solver process, the parent of its sub-reaper."""
+    """Return the Dask worker of a solver process, which is its sub-reaper's parent."""
     reaper = parent(solver)
     return None if reaper is None else parent(reaper)
 
@@ -161,7 +165,7 @@ def meanwhile(action):
 
 @pytest.fixture
 def all_cpus():
-    """Allow all CPUs of the machine, instead of those of a worker of pytest."""
+    """Allow all CPUs of the machine instead of the CPUs of a pytest worker."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(os.cpu_count()))
     yield
@@ -251,7 +255,7 @@ def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
 
 
 def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
-    """Not even with --fresh, which deletes the content of a folder."""
+    """Test also --fresh, which deletes the content of a folder."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
@@ -264,7 +268,7 @@ def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeyp
 
 @pytest.fixture
 def ctrl_c_enabled():
-    """Restore the effect of Ctrl-C, which is ignored in a shell's background jobs."""
+    """Restore the effect of Ctrl-C, which background jobs of a shell ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -321,7 +325,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
 
 
 def descendants(process):
-    """The processes that one has started, and those that these have started."""
+    """Return all descendants of a process."""
     tasks = Path(f"/proc/{process}/task").glob("*/children")
     children = [int(child) for task in tasks for child in task.read_text().split()]
     return [*children, *(d for child in children for d in descendants(child))]
@@ -382,7 +386,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
 
 @pytest.fixture
 def one_cpu():
-    """Restrict processes started here to one CPU."""
+    """Restrict processes started by the test to one CPU."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(before)})
     yield
@@ -394,9 +398,9 @@ def one_cpu():
 def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_missed_yet(
     cli, cluster, tmp_path
 ):
-    """A scheduler learns of a dead client later, on a busy machine after the next run.
+    """A scheduler may detect a dead client only after the start of the next run.
 
-    A parent that stands still looks the same to it.
+    A stopped parent imitates this delay.
     """
     worker = cluster.join(serves=False)
     run = start("--out", "d", "--dask", cluster.address)
@@ -469,7 +473,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 
 @pytest.fixture
 def meet():
-    """Pass the environment of a node to `Nodes`; record its files and warnings."""
+    """Pass the environment of a node to `Nodes`; record stored files and warnings."""
     from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []

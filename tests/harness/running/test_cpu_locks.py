@@ -1,4 +1,4 @@
-"""Locks of CPUs are in a folder that all users may write; others cannot plant them."""
+"""Locks of CPUs in a shared folder, in which other users cannot create them."""
 
 import os
 import tempfile
@@ -17,7 +17,7 @@ def claim_cpu(stack):
 
 @pytest.fixture
 def shared(tmp_path, monkeypatch):
-    """Set a folder of temporary files that only this test uses."""
+    """Set a folder of temporary files that is used only by this test."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 

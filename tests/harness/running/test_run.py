@@ -39,7 +39,7 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Watcher:
-    """Progress that records its calls, and may act after some records."""
+    """Progress that records its calls and may act after given records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None
@@ -86,7 +86,7 @@ def suite(*solvers, cases=({},), **changes):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite in worker processes, and return the watcher of its progress."""
+    """Run a suite in worker processes; return the watcher of its progress."""
 
     def measure(
         suite,
@@ -269,7 +269,7 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
 
 
 def test_steps_of_a_tightening_sequence_have_their_own_tolerance(measure, tmp_path):
-    """The tolerance is max(tol, θ·δ), at most 1e-2; here δ is 1e-3·h."""
+    """The tolerance is max(tol, min(θ·δ, 1e-2)); in this test, δ is 1e-3·h."""
     names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (500, 1.0, 1e-3)]
     solvers = ("tightens", "chains", "honest")
     asked = suite(
@@ -680,7 +680,7 @@ def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
 
 
 def once_each(folder, count):
-    """The records of a journal, of which no measurement is there twice."""
+    """Return the records of a journal; assert that no measurement occurs twice."""
     records = read_journal(folder)
     assert len({r.run_id for r in records}) == len(records) == count
     return records
@@ -760,7 +760,9 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
 def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
     measure, tmp_path, size
 ):
-    """A point needs more than 600 bytes, a case more than 4000; other files less."""
+    """A point needs more than 600 bytes and a case more than 4000; other files need
+    less.
+    """
     whole = suite("honest", "prints")
     if size == 600:
         measure(suite("zero"))
@@ -781,7 +783,7 @@ def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
 
 @pytest.fixture
 def faults(monkeypatch):
-    """Let measurements for which `prevented` returns True fail by a fault."""
+    """Cause a fault in measurements for which `prevented` returns True."""
 
     def faults(prevented):
         def measured(worker, qp, record, request, **limits):
@@ -861,12 +863,12 @@ def family(process):
 
 @pytest.fixture
 def own_interpreters(monkeypatch):
-    """Start processes by their commands: forks show no command in /proc."""
+    """Start processes by their commands, since forks show no command in /proc."""
     monkeypatch.setattr(supervisor, "subprocess", subprocess)
 
 
 def kill_worker(solver):
-    """Kill the worker of a solver, a process with its name as an argument."""
+    """Kill the worker of a solver, which has the solver's name as an argument."""
     for process in list(family(os.getpid()))[1:]:
         with suppress(OSError):
             words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")

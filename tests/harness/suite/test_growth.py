@@ -1,4 +1,4 @@
-"""A suite with a result folder may only ask for more measurements."""
+"""A suite with a result folder may only add measurements."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Residuals and certificates by several ranks: what one process finds of the whole."""
+"""Residuals and certificates on several ranks, compared with one process."""
 
 import json
 import os
@@ -139,7 +139,7 @@ def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
 
 
 def test_an_exact_solution_is_recovered_across_subdomains(found):
-    """The patch test: uniaxial stress everywhere, though no rank has all of a body."""
+    """In the patch test, stress is uniaxial, and no rank has an entire body."""
     answer = found[PATCH][-2]["by_ranks"]["quantities"]
     # plane strain, ν = 0.3: σ_z = −0.3p, and σ_vM = √(1 − ν + ν²)·p
     exact = (1 - 0.3 + 0.3**2) ** 0.5 * 1e6
@@ -206,9 +206,9 @@ def test_a_load_that_nothing_balances_is_refused_in_the_words_of_one_process():
 
 
 def quantities_of_both(answer):
-    """Numbers by ranks and by one process, but for the memory of blocks.
+    """Return the numbers from ranks and from one process, without the memory of blocks.
 
-    Each rank has blocks of its own of the kinds that it has.
+    The memory differs, since each rank stores separate blocks of its classes.
     """
     both = [flat(answer[one]["quantities"]) for one in ("by_ranks", "by_one")]
     for found in both:
@@ -217,7 +217,7 @@ def quantities_of_both(answer):
 
 
 def flat(quantities, prefix=""):
-    """Numbers by their places in nested tables and lists."""
+    """Return numbers by their paths in nested tables and lists."""
     match quantities:
         case dict():
             items = quantities.items()

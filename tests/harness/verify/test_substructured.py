@@ -1,7 +1,7 @@
-"""The certificate from subdomains: no error above its bound, no factor of the whole.
+"""Certificates from subdomains: no error exceeds its bound, no whole factorisation.
 
-Bodies are cut into boxes. The truth is the reference solution of the whole, known to
-rounding.
+Bodies are cut into boxes. Errors are relative to the reference solution of the whole
+problem, which is accurate up to rounding.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def bodies_of(name: str) -> Bodies:
 
 
 def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
-    """Label cells by boxes around their centres, body by body."""
+    """Label the cells of each body by the boxes that contain their centres."""
     centres = bodies.mesh.points[bodies.mesh.cells].mean(axis=1)
     label = np.zeros(len(centres), dtype=np.int64)
     for b in range(len(bodies.names)):
@@ -76,14 +76,14 @@ def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A small torn problem with its solution to rounding."""
+    """A small problem with subdomains, and its solution up to rounding."""
 
     mechanics: Mechanics
     exact: ReferencePoint
     own: LocalBodies
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.to_primal` would give it."""
+        """Return the solution in the form of `Mechanics.to_primal`."""
         m, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + m.rows.T @ lam)
@@ -93,14 +93,14 @@ class Known:
         return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
 
     def pair_error(self, c: Certificate) -> float:
-        """√(‖û − u*‖² + ‖u_λ − Tu*‖²), the second one of torn displacements."""
+        """Return √(‖û − u*‖² + ‖u_λ − Tu*‖²); u_λ is a displacement of subdomains."""
         parts = self.own.parts
         jump = parts.spread.astype(Real) @ (c.u - self.exact.u) - c.off
         torn = float(np.sqrt(jump @ parts.product(jump)))
         return float(np.hypot(self.error(c.u), torn))
 
     def error(self, u: Extended) -> float:
-        """‖u − u*‖_K."""
+        """Return ‖u − u*‖_K."""
         return self.mechanics.whole.norm(u - self.exact.u)
 
 
@@ -126,7 +126,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Return whether every error is within the bound stated by the certificate."""
+    """Return True if all errors are within the bounds of the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     worst = max(problem.error(found.u), problem.error(s.x.astype(Real)))
     within = min(found.error, found.bound * problem.exact.norm)
@@ -142,7 +142,9 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
 
 
 def violations(name: str, count: int) -> tuple[list[str], list[float]]:
-    """Disturb the solution at random; tell when a bound did not hold, and how sharp."""
+    """Disturb the solution at random; return messages on violated bounds,
+    and ratios.
+    """
     problem, told, sharp = known(name), list[str](), list[float]()
     rng = np.random.default_rng(sum(map(ord, name)))
     for i in range(count):
@@ -208,7 +210,7 @@ MORE_ACCURATE = (
 
 
 def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
-    """Solve to such tolerances; the largest error over its bound, of each answer."""
+    """Solve at given tolerances; return the largest error/bound of each answer."""
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole, ratios = case.mechanics.whole, list[float]()
