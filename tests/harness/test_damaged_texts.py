@@ -373,7 +373,7 @@ def test_damaged_options_are_taken_or_refused(count):
         )
 
 
-#: what a Python program may pass by mistake
+#: values that a Python program may pass by mistake
 ODD = (
     None, True, False, 0, 3, -1, 2.5, float("nan"), float("inf"), 10**400, 1j, "", "x",
     "a b", "\0", "\ud800", "x" * 5000, "nowhere/x", "/dev/zero", "/proc/self/mem", "-",
@@ -381,7 +381,7 @@ ODD = (
     frozenset({"x"}), frozenset(), range(3), str, InputError, np.float64(0.5),
     np.int64(2), np.bool_(True), np.str_("x"), Decimal(1), Fraction(1, 3), ...,
 )  # fmt: skip
-#: functions, sound arguments by position and by name
+#: functions, with valid arguments by position and by name
 ENTRIES = (
     (mb.build, ["obstacle/dim=1/n=4/primal"], {"plugins": ()}),
     (mb.load, ["run"], {"warn": len}),

@@ -315,7 +315,7 @@ def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
         merged("solver", {"a": 1}, {"a": 2})
 
 
-# plug-ins in two versions, and with neighbours
+# two versions of plug-ins, and plug-ins with neighbours
 
 WITH_NEIGHBOURS = """
 import helper

@@ -94,7 +94,7 @@ def test_what_is_not_admissible_has_no_bounded_work(one):
         if not one.admissible(z).any():
             reached = max(z @ one.project(1e9 * z + x) for x in points(5))
             assert reached > 1e8
-    for z in points(50):  # so is the rest of any vector: it is a direction of the set
+    for z in points(50):  # the inadmissible part of any z is a direction of the set
         rest = z - one.admissible(z)
         far = one.project(1e9 * rest)
         assert far == pytest.approx(1e9 * rest + one.project(0 * z), abs=1e-5)
@@ -358,7 +358,7 @@ def test_a_planted_solution_has_no_residual_and_others_have(seed):
     assert kkt_residuals(qp, replace(s, z_box=wrong_sign)).worst > 1e-2
     inside = s.z_box.copy()
     inside[index[1]] = 0.3 * np.linalg.norm(s.z_box[first])
-    q = qp.q - inside + s.z_box  # so that it is stationary
+    q = qp.q - inside + s.z_box  # makes the point stationary
     r = kkt_residuals(replace(qp, q=q), replace(s, z_box=inside))
     assert r.complementarity > 1e-5
     assert r.dual <= 1e-14

@@ -48,7 +48,7 @@ OTHERS = {
 }
 
 
-#: variants of a solver that stands for them
+#: variants, each represented by another solver
 VARIANTS = ("proxqp-dense", "proxqp-sparse", "piqp-dense", "piqp-sparse", "scs-qdldl")
 
 
@@ -65,11 +65,11 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: equivalent formulations are not a condition of conformance; they have their own test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-#: take seconds for all equivalent formulations
+#: solvers that take seconds for all equivalent formulations
 REWRITTEN = {
     "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
 }  # fmt: skip
-#: accepts only equations, and so none of these QPs
+#: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
@@ -92,12 +92,14 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 
 UNBOUNDED = "claims no success: unbounded"
-#: iterate to their limit, for many seconds; `smalbe` represents its variants
+#: solvers that take many seconds to reach the iteration limit; `smalbe` represents its
+#: variants
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
     ("projected-gradient", UNBOUNDED),
 ]  # fmt: skip
-#: planted solutions for all solvers: each shape once, and one of them in every storage
+#: planted solutions for all solvers: each shape once, and one shape in all storage
+#: formats
 PLANTED = re.compile(
     r"(finds the planted solution|reaches the tolerance [\d.e-]+): (.*)"
 )
@@ -167,7 +169,8 @@ def weaknesses(solver):
         pytest.param(
             name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
         )
-        for name in CONCRETE  # the others pass the same QPs to libraries of these
+        # other solvers pass the same QPs to the libraries of these
+        for name in CONCRETE
     ],
 )
 def test_weaknesses_are_documented(name):
@@ -417,7 +420,7 @@ def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
     exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
     told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
 
-    # it declines, and the harness multiplies the operator out
+    # the solver declines, and the harness assembles the operator
     assert run_check(check, told()) == (Grade.PASS, "", None)
 
 
@@ -442,7 +445,7 @@ def test_a_form_that_is_not_solved_has_no_weakness():
 
 
 def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
-    # a fake clock: real threads need idle cores to show
+    # a fake clock, since real threads are detected only with idle cores
     monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
     slow = Slow()
     assert run_check("computes in one thread", slow).grade is Grade.FAIL
@@ -453,7 +456,7 @@ def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
 def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
-    assert Grade.PASS in grades  # its options
+    assert Grade.PASS in grades  # the check of options
     result = run_check("gives multipliers our signs", DeclinesAll())
     assert result == (Grade.DECLINE, "never on a Monday", None)
 

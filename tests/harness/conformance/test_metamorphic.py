@@ -176,7 +176,7 @@ def preimage(qp, new):
 
     zero = back(np.zeros(sum(sizes)))
     columns = np.array([back(e) - zero for e in np.eye(sum(sizes))]).T
-    to = abs(columns).argmax(axis=0)  # monomial: one entry in each row and column
+    to = abs(columns).argmax(axis=0)  # one entry in each row and column
     entry = columns[to, np.arange(to.size)]
 
     def there(old):

@@ -120,7 +120,7 @@ def disturbed(case, s, size):
         v[case.mechanics.exact.fixed] = 0
     else:
         v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
-        if case.qp.b.size:  # what the rigid motions do not feel
+        if case.qp.b.size:  # a part that is orthogonal to the rigid motions
             A = np.asarray(case.qp.A)
             v = v - np.linalg.pinv(A) @ (A @ v)
     return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)
@@ -251,7 +251,7 @@ def test_penetration_is_measured_in_mesh_sizes_and_balance_per_body(truths):
 
     assert found.penetration == pytest.approx(np.max(B @ deep.x - c) / h)
     assert found.penetration >= 0.5 * (1 - 1e-9)
-    assert unheld.balance == 1  # nothing holds the load
+    assert unheld.balance == 1  # no support balances the load
     assert exact.balance < 1e-9
     assert exact.penetration < 1e-12
 
@@ -353,7 +353,7 @@ def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
 def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     duplicate, monkeypatch
 ):
-    def back(s):  # which leads astray, while nothing is known for sure
+    def back(s):  # a wrong map, before any answer is certified
         return replace(s, x=s.x + 1) if s.iterations else s
 
     def doubtful(*args):
@@ -455,14 +455,15 @@ def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
     rows = {(r["solver"], r["tol"]): r for r in verdict["solvers"]}
     assert next(iter(rows)) == ("smalbe", 1e-4)
     assert rows["b", 1e-4]["primal_dual"] == pytest.approx(1e-3, rel=1e-3)
-    assert rows["c", 1e-4]["primal_dual"] is None  # dual forms only
+    assert rows["c", 1e-4]["primal_dual"] is None  # only dual forms
     assert rows["b", 1e-4]["from_ours"] == pytest.approx(1e-3, rel=1e-3)
     assert rows["b", 1e-6]["from_ours"] < 1e-8
     assert rows["smalbe", 1e-4]["from_ours"] is None  # alone
-    assert verdict["counts"]["pairs"] == 10 + 3  # of answers at one tolerance
+    # pairs of answers at the same tolerance
+    assert verdict["counts"]["pairs"] == 10 + 3
 
 
-@pytest.mark.slow  # the solve; those of HiGHS and of a candidate by hand are quick
+@pytest.mark.slow  # slow solve; HiGHS and a manual candidate are quick
 def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
     text = "obstacle/n=16/primal"
     case = built(text)

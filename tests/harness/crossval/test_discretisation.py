@@ -106,7 +106,7 @@ def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n)
     assert found.kind == "limit"
     assert found.rate == pytest.approx(2, abs=0.1)
     assert found.error == pytest.approx(error / norm, rel=0.03)
-    assert found.change < found.error  # the next mesh has an error, too
+    assert found.change < found.error  # the next mesh also has an error
 
 
 @pytest.mark.parametrize(

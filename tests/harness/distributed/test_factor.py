@@ -198,7 +198,7 @@ def test_the_factor_of_a_chain_of_springs_is_that_of_the_whole(changing):
 
     least = on_threads(size, work)
     assert len(set(least)) == 1
-    # the determinant of the whole is the product of all pivots, squared
+    # the determinant of the whole matrix is the squared product of all pivots
     assert 0 < least[0] <= np.linalg.det(whole) ** (0.5 / n) + 1e-12
 
 

@@ -119,7 +119,7 @@ def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
     with lines() as file:
         file.append("a" * 50)
         with full(80), pytest.raises(OSError, match="File too large"):
-            file.append("b" * 50)  # 29 bytes of it fit
+            file.append("b" * 50)  # only 29 bytes fit
         assert lines.path.read_text() == "a" * 50 + "\n"
         file.append("c" * 50)
 
@@ -274,7 +274,7 @@ def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_pa
 
 def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
     FolderLock(tmp_path).close()
-    (tmp_path / "suite.toml").write_text("")  # and no environment.json yet
+    (tmp_path / "suite.toml").write_text("")  # environment.json is missing
     refuse_foreign(tmp_path)
 
     (tmp_path / ".lock").write_text("somebody else's")

@@ -31,7 +31,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.damaged_files import MSH_41, QPS, fuzz, msh_22, tiny_qp
 
-ADDRESS_SPACE = 2**29  #: bytes that refusing may take at most
+ADDRESS_SPACE = 2**29  #: largest number of bytes that a refusal may need
 
 
 def build(path):
@@ -66,7 +66,7 @@ def command(capsys):
     return run
 
 
-# code from data
+# data that would execute code
 
 
 def hostile(path, maker):
@@ -127,7 +127,7 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     assert "P as an operator" in done.stderr.splitlines()[-1]
 
 
-# what is no regular file
+# files that are not regular
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_odd_names_are_refused_as_input(name):
         build(name)
 
 
-# more than it holds
+# files that declare more data than they contain
 
 
 def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
@@ -489,7 +489,7 @@ def test_the_limit_can_be_raised_and_is_checked(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=f"set {VARIABLE} to allow more"):
         build(tmp_path / "a.npz")
     monkeypatch.setenv(VARIABLE, "4")
-    with pytest.raises(InputError, match="missing"):  # all the other arrays
+    with pytest.raises(InputError, match="missing"):  # all other arrays are missing
         build(tmp_path / "a.npz")
     for odd in ("0", "-1", "many", "1e400"):
         monkeypatch.setenv(VARIABLE, odd)
@@ -585,7 +585,7 @@ def test_the_mesh_that_these_are_made_of_is_read(tmp_path):
     assert len(read_msh(tmp_path / "a.msh").cells) == 2
 
 
-# damaged at random
+# random damage
 
 KINDS = ("npz", "mat", "qps", "msh", "inp", "med", "parquet")
 
@@ -600,4 +600,4 @@ def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
 def test_of_a_thousand_damaged_files_none_raises_or_hangs(tmp_path, kind):
     survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
 
-    assert 0 < survived < 500  # or the damage is none, or all there is
+    assert 0 < survived < 500  # some files survive the damage, others do not

@@ -86,9 +86,9 @@ def operator_qp():
 
 def test_an_operator_travels_as_arrays_and_is_the_same_operator(operator_qp, tmp_path):
     save_qp(tmp_path / "qp.npz", operator_qp, {}, serialised=True)
-    assert BUILT == []  # nothing is multiplied out to write it
+    assert BUILT == []  # the operator is not assembled for writing
     qp, _ = load_qp(tmp_path / "qp.npz", operators=MAKERS)
-    assert BUILT == []  # nor to read it
+    assert BUILT == []  # the operator is not built for reading
 
     np.testing.assert_array_equal(qp.P @ np.eye(2), np.diag([1.0, 2.0]))
     assert not qp.is_explicit

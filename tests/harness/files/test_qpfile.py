@@ -70,7 +70,7 @@ def test_the_file_is_what_the_interface_promises(saved):
 
         assert set(stored.files) == {"q", "h", "b", "lb", "ub", "meta"} | parts
         assert json.loads(str(stored["meta"]))["name"] == "three"
-        # by columns: (2, 1), (1, 3), and an empty one; both triangles
+        # columns (2, 1), (1, 3) and an empty one; both triangles
         assert stored["P_data"].tolist() == [2, 1, 1, 3]
         assert stored["P_indices"].tolist() == [0, 1, 0, 1]
         assert stored["P_indptr"].tolist() == [0, 2, 4, 4]
@@ -126,7 +126,7 @@ def test_other_files_are_refused_and_never_unpickled(tmp_path):
         load_qp(tmp_path / "nowhere")
 
 
-# what somebody saves by numpy alone
+# files saved by NumPy
 
 
 def plain(**changes):

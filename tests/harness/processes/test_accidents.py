@@ -53,7 +53,7 @@ CASE = assemble(TINY, {}, "plain")
 FOREIGN = "came, expected 'timed'"
 SUSPECT = "results are cached between measurements"
 PARENTS_TIME = "the parent's time is recorded"
-#: expected verdict, and a pattern of the message
+#: expected verdict and pattern of the message, by solver
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
     "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
@@ -71,7 +71,7 @@ OUTCOMES = {
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
 }
-#: one of each kind; the others are slow tests
+#: one solver of each type; the others are slow tests
 QUICK = {
     "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
     "hoardsinadaemon", "closesall", "sharespages",
@@ -406,7 +406,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     assert bench("honest").verdict is Verdict.VERIFIED
 
 
-#: reports on a measurement that ended early, and measures again
+#: program that reports a measurement that ended early, and measures again
 RUNS = f"""
 import sys
 from pathlib import Path

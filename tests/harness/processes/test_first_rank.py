@@ -10,7 +10,7 @@ import pytest
 from tests.support import ROOT, SUPPORT
 from tests.support.dying_ranks import WAYS
 
-#: keeps CPUs busy until its standard input is closed
+#: program that keeps CPUs busy until its standard input is closed
 BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]: pass"
 
 

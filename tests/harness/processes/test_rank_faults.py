@@ -34,7 +34,7 @@ params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
 """
 MEASURING = ("emission", "prepare", "solve")
 EVALUATING = ("residuals", "certificate", "quantities")
-#: s; limit of each stage, long enough for the stages before the planted failure
+#: time limit of each stage in s, sufficient for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
 RAISED = "rank 1 of 2: ValueError: planted"

@@ -64,7 +64,7 @@ def test_operations_on_a_slice_alone_are_refused(rank_results):
 def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(rank_results):
     for error, refused, shared in rank_results["factors"]:
         assert error < 1e-12
-        assert refused  # on all ranks, though one alone has dependent rows
+        assert refused  # raised on all ranks, although only one has dependent rows
         assert shared == list(range(0, 24, 3))
 
 
@@ -116,7 +116,7 @@ def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
     assert answer.record.claimed in ("solved", "iteration_limit")
-    # No rank has the assembled K, so the bound holds for every rounding of it.
+    # No rank has the assembled K, so the bound holds for every rounding of K.
     assert answer.energy_bound <= 1e-3
 
 
@@ -191,11 +191,11 @@ def test_records_contain_the_cost_of_each_rank(answers):
     assert set(seconds) == {"products", "exchange", "coarse", "waiting"}
     for mean, largest in [*seconds.values(), *counts.values()]:
         assert 0 < mean <= largest
-    # the parts do not overlap, so that no rank has spent more than all of it
+    # the categories do not overlap, so their sum is at most the total time of a rank
     assert sum(mean for mean, _ in seconds.values()) < first.record.solve_seconds
     products = first.record.counts["P_products"]
     applies = first.record.counts["preconditioner_applies"]
-    # to its one neighbour, and back; those of preparing are not counted
+    # messages to the only neighbour and back; messages of `prepare` are not counted
     assert 0 <= 2 * (products + applies) - counts["messages"][0] <= 2 * LANCZOS
     assert counts["bytes"][1] % 8 == 0
     read = Record.from_json(first.record.to_json())
@@ -286,7 +286,7 @@ def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path)
     assert found["smalbe copies=2"].verdict == "verified"
     alone, copies = found["smalbe"], found["smalbe copies=2"]
     assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
-    assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
+    assert copies.peak_mib > 1.5 * alone.peak_mib  # peak memory of both copies
 
 
 def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
@@ -355,8 +355,8 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-#: first of two load steps; one process emits it, so a rank that has its share is
-#: preparing or solving
+#: first of two load steps; a single process emits its QP, so a rank that has its share
+#: is preparing or solving
 LARGE = (
     SUITE.replace(
         "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"

@@ -21,7 +21,7 @@ from tests.support.waiting import soon
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
 CASE = "string/n=10/primal"
-#: solves in several threads, in a session of its own, and prints the results
+#: program that solves in several threads, in a separate session, and prints the results
 THREADS = """
 import gc, json, os, sys, tempfile
 from pathlib import Path
@@ -183,7 +183,7 @@ def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
     first = worker.ask({}, **LIMITS).answer["pid"]
     os.kill(first, signal.SIGKILL)
     with suppress(ChildProcessError):
-        os.waitpid(worker._process.pid, 0)  # a handler of SIGCHLD would do that
+        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD would do
 
     second = worker.ask({}, **LIMITS)
     assert second.answer["pid"] != first
@@ -256,13 +256,13 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
          "--plugin", str(plugin)],
         env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
         stderr=subprocess.PIPE, text=True,
-        # a shell that runs the tests in the background makes them ignore Ctrl-C
+        # tests that run in the background of a shell ignore Ctrl-C
         preexec_fn=partial(signal.signal, number, signal.SIG_DFL),
     )  # fmt: skip
     assert soon((tmp_path / "started").exists)
     process = int((tmp_path / "started").read_text())
     solve.send_signal(number)
-    solve.send_signal(number)  # cleaning up is not interrupted
+    solve.send_signal(number)  # the second signal does not interrupt the cleanup
     said = solve.communicate()[1]
 
     assert solve.returncode == code
@@ -346,8 +346,8 @@ PROBLEMS = {"slow": Slow()}
 """
 
 
-#: a worker that creates and fills a System V segment of 64 MiB, and writes its number,
-#: since other programs create segments at the same time
+#: worker that creates and fills a System V segment of 64 MiB, and writes the number of
+#: the segment, since other programs may create segments at the same time
 SEGMENT = SHOWS.replace(
     '    reply(event="start")\n',
     '    reply(event="start")\n'

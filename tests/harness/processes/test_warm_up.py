@@ -77,5 +77,6 @@ def test_after_another_case_a_case_is_built_once_and_its_memory_is_reported(tmp_
     meta = worker.answer(request)["meta"]
 
     assert family.built == ["dual", "dual"]
-    assert meta["build_seconds"] >= 0.05  # of the case with n = 3, not of the first
+    # time of the case with n = 3, not of the first case
+    assert meta["build_seconds"] >= 0.05
     assert meta["build_peak_mib"] > 10

@@ -19,7 +19,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support.bounded import bounded
 
-pytestmark = pytest.mark.together  # one result folder for all of them
+pytestmark = pytest.mark.together  # all tests use the same result folder
 
 SUITE = """
 name = "s"

@@ -17,7 +17,7 @@ from mortarbench.harness.plugin import SourceFile
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 
-pytestmark = pytest.mark.together  # one run for all of them
+pytestmark = pytest.mark.together  # all tests use the same run
 
 SUITE = """
 name = "s"
@@ -201,7 +201,7 @@ def test_a_file_that_is_put_back_is_taken(measured, here, copy):
 
     mb.run("run/suite.toml", out="run", repeats=2)
 
-    assert copy.exists()  # and is copied again
+    assert copy.exists()  # the file is copied again
 
 
 def test_a_damaged_copy_is_replaced_where_the_original_is_here(measured, here, copy):
@@ -249,7 +249,7 @@ def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
         sources.append(SourceFile(path=f"{i}.mat", sha256=digest(path), suffix=".mat"))
     said = []
 
-    for _ in range(2):  # a second run copies nothing again
+    for _ in range(2):  # the second run copies no file
         keep_copies(tmp_path / "run", sources, said.append)
 
     kept = {p.name for p in (tmp_path / "run" / "files").glob("*.mat")}
@@ -272,7 +272,7 @@ def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
     )  # fmt: skip
     shutil.rmtree(tmp_path / "other")
 
-    for _ in range(2):  # a merge that is done again changes nothing
+    for _ in range(2):  # the second merge changes nothing
         mb.merge("one", "two", out="both")
 
     (kept,) = (tmp_path / "both" / "files").glob("*.npz")

@@ -87,7 +87,7 @@ def one_line(err):
     return len([line for line in err.splitlines() if line.startswith("mortar")]) == 1
 
 
-# code
+# execution of code
 
 
 def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path):
@@ -114,7 +114,7 @@ def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path
     assert not (tmp_path / "SENTINEL").exists()
 
 
-# paths
+# paths that lead out of the folder
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ def test_commands_on_records_whose_digests_lead_out_read_nothing_there(
         assert one_line(err)
 
 
-# links, pipes
+# links and pipes
 
 
 LINKS = (

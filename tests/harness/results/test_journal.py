@@ -210,9 +210,7 @@ def test_a_record_that_the_disk_takes_in_part_only_is_not_in_the_journal(tmp_pat
     file = tmp_path / "journal" / "here.jsonl"
     with Journal(tmp_path, "here") as journal:
         journal.append(record("a"))
-        limit = (
-            file.stat().st_size + 50
-        )  # bytes of the next line that there is room for
+        limit = file.stat().st_size + 50  # only 50 bytes of the next line fit
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
         try:
             with pytest.raises(OSError, match="File too large"):

@@ -17,7 +17,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
-#: one process makes the run that all tests replay
+#: all tests replay the same run, in one process
 pytestmark = pytest.mark.together
 
 PLUGIN = load_plugin(TOY_PROBLEM)
@@ -303,7 +303,8 @@ def test_equal_qps_have_one_digest_and_others_another(manufactured, tmp_path, sh
     digest = save_qp(file, qp, {"name": "whatever"})
     loaded, _ = load_qp(file)
 
-    assert save_qp(file, loaded, {}) == digest  # over the file that it is mapped from
+    # overwrites the file from which the QP is mapped
+    assert save_qp(file, loaded, {}) == digest
     assert (loaded.q == qp.q).all()
     for change in ({"q": 2 * qp.q}, {"P": 2 * qp.P}, {"ub": qp.ub + 1}):
         assert save_qp(file, replace(qp, **change), {}) != digest

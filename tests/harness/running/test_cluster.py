@@ -51,7 +51,8 @@ class Cluster:
         self._forks = forks
         self.starts = folder / "starts"
         self.starts.touch()
-        locks = folder / "locks"  # of CPUs: another cluster of tests has its own
+        # locks of CPUs; another test cluster has a separate folder
+        locks = folder / "locks"
         locks.mkdir(exist_ok=True)
         self._env = os.environ | {
             "STARTS": str(self.starts), "TMPDIR": str(locks),
@@ -172,7 +173,7 @@ def all_cpus():
     os.sched_setaffinity(0, before)
 
 
-@pytest.mark.usefixtures("all_cpus")  # each node takes one
+@pytest.mark.usefixtures("all_cpus")  # each node needs a CPU
 def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cli, cluster, tmp_path
 ):
@@ -194,15 +195,15 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     slow = [r for r in records if r.solver == "slow"]
 
     assert code == 0, err
-    assert len(cluster.started_solvers()) > len(slow)  # a lost one was made again
+    assert len(cluster.started_solvers()) > len(slow)  # a lost measurement was repeated
     assert measured("both") == measured("alone")
     assert victim.poll() == -signal.SIGKILL
     assert {r.node for r in records} == {os.uname().nodename}
-    assert len(cpus) == min(2, len(os.sched_getaffinity(0)))  # a CPU for each
+    assert len(cpus) == min(2, len(os.sched_getaffinity(0)))  # a CPU for each worker
     (there,) = {r.environment for r in records}
     stored = environment_of(tmp_path / "both", there)
     assert stored.pop("digest") == digest(stored) == there
-    for number in {r.block for r in records}:  # blocks are of one case
+    for number in {r.block for r in records}:  # each block has a single case
         assert len({r.case for r in records if r.block == number}) == 1
 
 
@@ -214,7 +215,7 @@ def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
 
     def kill():
         assert soon(lambda: cut or cut.extend(partial_blocks("d")))
-        victim.kill()  # the turns that it returned are in the journal
+        victim.kill()  # the turns that it has returned are in the journal
         cluster.join()
 
     with meanwhile(kill):
@@ -333,7 +334,7 @@ def descendants(process):
 
 def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     worker = cluster.join()
-    assert soon(lambda: descendants(worker.pid))  # what forks, and outlives the run
+    assert soon(lambda: descendants(worker.pid))  # processes that would outlive the run
     before, idle = set(descendants(worker.pid)), []
 
     def look():

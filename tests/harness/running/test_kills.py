@@ -117,7 +117,7 @@ def ask_to_end(run, rng, out):
 
 def fill_by_limit(run, rng, out):
     """Set a file size limit of zero for all processes of the run."""
-    for process in family(run.pid):  # processes that they start inherit the limit
+    for process in family(run.pid):  # new child processes inherit the limit
         with suppress(ProcessLookupError, PermissionError):
             hard = resource.prlimit(process, resource.RLIMIT_FSIZE)[1]
             resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
@@ -154,11 +154,12 @@ def disturb(suite, out, events, rng, longest):
             event(run, rng, out)
         if run.poll() is None:
             continue
-        if not run.stderr.closed:  # it ended by itself
+        if not run.stderr.closed:  # the run ended by itself
             assert end_of(run) == (0, ANY)
         run = start(suite, out)
     assert end_of(run)[0] == 0
-    assert end_of(start(suite, out))[0] == 0  # what could not be built, again
+    # cases that could not be built are built again
+    assert end_of(start(suite, out))[0] == 0
 
 
 def check(tmp_path, events, seed, out=None, repeats=4):
@@ -182,7 +183,7 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     changed = [r for r in got if r.verdict != verdicts[r.run_id]]
     assert len(changed) <= 3 * events.count(
         kill_one
-    )  # those whose worker was killed: a sequence at most
+    )  # measurements of a killed worker: at most a sequence
     for record in changed:
         assert record.message.endswith("SIGKILL"), record
     assert not list(out.glob(".scratch/*"))

@@ -158,7 +158,7 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: of those that are waited for to the time limit, one is enough by default
+#: solvers that exhaust the time limit; by default, a single one is tested
 WAITED_FOR = {"printsendlessly"}
 
 
@@ -186,7 +186,8 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
             assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
             said = got[solver].message
-            if not said.startswith("took "):  # a pause of a busy machine is noted, too
+            # a pause of a busy machine also causes a note
+            if not said.startswith("took "):
                 assert message in (None, said)
 
 
@@ -218,7 +219,8 @@ def test_a_record_contains_phases_and_the_place_of_measurement(measure, tmp_path
     records = read_journal(tmp_path)
 
     slow = next(r for r in records if r.solver == "sleeps")
-    # a measurement that waited for its CPU is not repeated; one of five did not wait
+    # a measurement that waited for its CPU is not repeated; at least one of five did
+    # not wait
     quick = max(
         (r for r in records if r.solver == "honest"), key=lambda r: r.inner_loops
     )
@@ -305,7 +307,7 @@ def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_pa
         assert [str(r.verdict) for r in steps] == 2 * ["verified"] + 2 * ["declined"]
         assert "there is no further problem" in steps[2].message
     measure(asked)
-    assert len(read_journal(tmp_path)) == 8  # nothing is left to be measured
+    assert len(read_journal(tmp_path)) == 8  # no measurement is missing
 
 
 def test_a_broken_sequence_names_the_step(measure, tmp_path):
@@ -452,7 +454,7 @@ def test_run_ids_are_distinct_for_distinct_cells_and_equal_for_equal_ones(
     (other,) = read_journal(tmp_path)
 
     assert len(first) == 2 * 2 * 2 * 3
-    assert other.run_id not in first  # other options, same label
+    assert other.run_id not in first  # different options, same label
 
 
 @pytest.mark.parametrize("cut", [1, 50, 3000])
@@ -549,7 +551,7 @@ def test_the_folder_contains_suite_and_environment(measure, tmp_path):
 def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path):
     measure(suite("honest"))
     (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "validation.json").write_text("{}")  # what was concluded from it
+    (tmp_path / "validation.json").write_text("{}")  # a result of `validate`
     (tmp_path / "references").mkdir()
 
     other = suite("zero", text='name = "other"\n')
@@ -753,7 +755,7 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
     assert said == {"free some space, and the same command continues"}
     records = once_each(tmp_path, 2)
     assert {r.verdict for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
-    assert writes > 6  # suite and environment alone are four
+    assert writes > 6  # suite and environment need four writes
 
 
 @pytest.mark.parametrize("size", [600, 4000])

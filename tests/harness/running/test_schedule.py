@@ -145,7 +145,7 @@ def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     failed = next(blocks)
 
     assert schedule.give_up(failed)
-    assert not schedule.give_up(failed)  # known by now
+    assert not schedule.give_up(failed)  # it was marked before
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
@@ -225,7 +225,8 @@ def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0
     for _ in range(2000):
-        drift = np.exp(rng.standard_normal(8))  # of the machine: whole blocks
+        # drift of the machine, which affects whole blocks
+        drift = np.exp(rng.standard_normal(8))
         a, b = (drift * np.exp(0.1 * rng.standard_normal(8)) * s for s in (3.0, 1.0))
         r = paired_ratio(dict(enumerate(a)), dict(enumerate(b)))
         hits += r.low <= 3.0 <= r.high

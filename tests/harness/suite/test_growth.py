@@ -14,7 +14,7 @@ SUITE = {
     "more",
     [
         {},
-        {"time_limit": 60.0, "memory_limit": 4096},  # what holds anyway
+        {"time_limit": 60.0, "memory_limit": 4096},  # equal to the defaults
         {"solvers": [*SUITE["solvers"], "c"]},
         {"solvers": SUITE["solvers"][::-1]},
         {"tolerances": [1e-4, 1e-6, 1e-8]},

@@ -608,7 +608,7 @@ def test_a_growing_series_knows_its_next_smaller_case_and_a_case_to_warm_up(load
 
     growth = suite.growing["well/n=8/kind=hard/dual"]
     assert growth.smaller == "well/n=4/kind=hard/dual"
-    assert growth.warm_up.name == "well/kind=hard/dual"  # n of the family's defaults
+    assert growth.warm_up.name == "well/kind=hard/dual"  # n has its default value
     assert suite.growing["well/n=2/primal"].smaller == ""
     assert set(suite.growing) == set(names(suite))
     assert not load(MINIMAL).growing

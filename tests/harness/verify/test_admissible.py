@@ -23,7 +23,7 @@ def moved(B, c, u, *, R=None, softness=None, closed=None):
     R = np.zeros((n, 0)) if R is None else np.array(R, dtype=float)
     softness = np.ones(n) if softness is None else np.array(softness, dtype=float)
     closed = np.zeros(m, dtype=bool) if closed is None else np.array(closed)
-    with np.errstate(all="ignore"):  # as `certify` does
+    with np.errstate(all="ignore"):  # as in `certify`
         return feasible_at_rows(exact, R, softness, u, closed)
 
 

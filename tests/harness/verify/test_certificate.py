@@ -42,7 +42,7 @@ CASES = (
     "hertz-sphere/n=1",
 )
 PERTURBATIONS = 10_000
-ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
+ROUNDED = 1 + 1e-12  #: the bound often equals the error up to rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,8 @@ def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
             c = certify(case.mechanics, s)
             assert holds(problem, s, c)
             true = np.hypot(problem.error(c.u), problem.error(c.equilibrium))
-            if true > 10 * problem.slack:  # below, the reference is no measure
+            # for smaller errors, the reference is too inaccurate
+            if true > 10 * problem.slack:
                 found.append(c.pair / true)
     return found
 
@@ -227,7 +228,7 @@ def test_so_are_those_of_the_fleet(name):
 @pytest.mark.parametrize(
     "name",
     [
-        "hertz-cylinder/dual",  # supports dominate the gradient's scale
+        "hertz-cylinder/dual",  # forces of supports dominate the scale of the gradient
         "hertz-cylinder/slave=lower/dual",
         "beam-ring/Nr=8/Nh=4/step=1/dual",
         "obstacle/n=10/dual-bounds",

@@ -24,7 +24,7 @@ from tests.harness.verify.test_verdicts_over_discs_and_cones import (
     ExactProblem,
 )
 
-#: these keep the eigenvalues above one; rows are removed
+#: traps that keep the eigenvalues above one; rows are removed
 KEPT = [t for t in TRAPS if t not in ("singular", "weak", "touching", "units")]
 
 

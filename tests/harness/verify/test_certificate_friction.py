@@ -34,7 +34,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import block_on_incline
 
 INCLINE = "a block that friction alone holds"
-#: a problem and its twin without friction
+#: problems with friction, each with the same problem without friction
 CASES = {
     "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7": (
         "beam-ring/Nr=3/Nh=2/steps=2"
@@ -61,8 +61,8 @@ IN_SPACE = (
     "greco/n=4/dim=3/feti=2",
 )
 PERTURBATIONS = 10_000
-ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
-NOISE = 1e-7  #: relative error from which on effectivities are measured
+ROUNDED = 1 + 1e-12  #: the bound often equals the error up to rounding
+NOISE = 1e-7  #: smallest relative error for which effectivities are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
     """Return True if all errors are within the bounds of the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     of_u, of_equilibrium = problem.error(found.u), 0.0
-    if found.off.shape == found.u.shape:  # of subdomains, u_λ jumps
+    if found.off.shape == found.u.shape:  # with subdomains, u_λ has jumps
         of_equilibrium = problem.error(found.equilibrium)
     of_answer = problem.error(s.x.astype(Real))
     return bool(
@@ -130,7 +130,7 @@ def _noise(s: Solution, size: float, rng: np.random.Generator, m: int) -> Soluti
     """
     del m
     x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
-    # of rows, not of their number: the twin's are disturbed by the same numbers
+    # drawn per row, so that both problems are disturbed by the same numbers
     z = s.z + size * np.abs(s.z).max() * rng.standard_normal(s.z.size)
     return replace(s, x=x, z=z)
 
@@ -323,7 +323,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
     along = np.where(np.arange(s.x.size) % 2 == 0, far * np.abs(s.x).max(), 0)
     of_block = mechanics.kernel @ (mechanics.kernel.T @ along)
     certify(mechanics, replace(s, x=s.x + of_block.astype(np.float64)))
-    held, allowed = seen[0]  # by the pair that has slid as far
+    held, allowed = seen[0]  # the pair at which the body has slid
     off = np.abs(held.T @ (mechanics.motions.constrained.T @ of_block))
 
     assert off.max() > 0

@@ -64,7 +64,7 @@ MAKERS: dict[str, Callable[[], Case]] = {
     "stiff disc": disc(E=(70e6, 70e14, 70e6)),
     "soft plate": disc(E=(70e3, 70e9, 70e12)),
 }  # fmt: skip
-#: its solution in rational arithmetic takes many seconds: a slow test
+#: slow test, since a solution in rational arithmetic takes many seconds
 LONG = "hertz-plane/n=3"
 NAMES = [n if n != LONG else pytest.param(n, marks=pytest.mark.slow) for n in MAKERS]
 
@@ -155,7 +155,7 @@ def attack(name: str, count: int) -> tuple[list[str], list[float]]:
             told.append(
                 f"{kind.__name__} {size:.0e}: {errors} > {found.bound * length}"
             )
-        if found.bound > 1e-7:  # below, rounding is what is bounded
+        if found.bound > 1e-7:  # smaller bounds consist of rounding
             sharp.append(found.bound * length / max(errors))
     return told, sharp
 
@@ -295,7 +295,7 @@ def test_the_charge_of_rounding_solves_its_inequality():
         gamma = 2 * np.sqrt(s)
         needed = 2 * gamma * rho + 4 * np.sqrt(s) * gamma * sigma + 2 * gamma**2 * kappa
         assert needed <= s - 1 <= 1.05 * needed
-    assert charge(0, 0, 1.0) == np.inf  # it is stronger than all that holds the motion
+    assert charge(0, 0, 1.0) == np.inf  # rounding outweighs the contact forces
 
 
 def test_a_gap_that_is_closed_from_the_start_lets_nothing_shrink():
@@ -399,7 +399,7 @@ def test_the_pair_near_zero_is_evaluated_where_no_other_one_proves_anything():
 def test_an_answer_whose_own_pair_proves_nothing_has_a_sharp_bound(name, size, reason):
     mechanics, u, lam, length = known(name)
     far = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
-    with np.errstate(over="ignore"):  # as `certify` has it
+    with np.errstate(over="ignore"):  # as in `certify`
         tried = list(certificate._certificates(Undivided(mechanics), far))
     found = certify(mechanics, far)
     off, *others = errors_of(mechanics, u, far, found)
@@ -533,9 +533,9 @@ def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
     ("name", "bound", "count"),
     [
         ("tilted disc", 1e-4, 3),
-        ("tilted disc", 1e-2, 2),  # not near: closed rows may be those of another one
-        ("tilted disc", 1e-8, 1),  # good enough
-        ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # which supports hold
+        ("tilted disc", 1e-2, 2),  # the error is too large for an exchange
+        ("tilted disc", 1e-8, 1),  # the bound is small enough
+        ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # supports fix all bodies
     ],
 )
 def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(

@@ -79,9 +79,10 @@ ON_RANKS = (
     "plate/Sx=12/Sy=1/n=2", "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
 DISTURBED = 10_000
-#: what arithmetic of doubles may take off a bound, which is a sum and a root of doubles
+#: factor for rounding in the evaluation of a bound, a sum and a root of doubles
 ROUNDED = 1 + 1e-9
-#: errors between which effectivities are measured: below, bounds are those of rounding
+#: range of errors for which effectivities are measured; bounds of smaller errors
+#: consist of rounding
 SHARP = (1e-7, 0.1)
 
 
@@ -89,7 +90,7 @@ class Found(NamedTuple):
     """Certificates of answers to one problem."""
 
     faults: list[str]  #: errors that exceed their bounds
-    sharp: list[float]  #: bound over error
+    sharp: list[float]  #: ratios of bound to error
     bounds: list[float]
 
 
@@ -133,7 +134,7 @@ def solved(name: str, labels=tuple(SOLVERS)):
             try:
                 s = solver.prepare(case.qp, tol)()
             except (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError):
-                continue  # a crash is no answer, and for other tests
+                continue  # crashes are tested elsewhere
             s = case.mechanics.to_primal(s)
             if np.isfinite(s.x).all() and np.isfinite(s.z).all():
                 yield f"{label} to {tol}", s

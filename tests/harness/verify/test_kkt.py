@@ -123,10 +123,12 @@ def at(x, y=(), z_box=(0, 0)):
 @pytest.mark.parametrize(
     ("qp", "s"),
     [
-        # x₂ appears nowhere: its size must not excuse x₁ ≥ 1, or x₁ = 1, violated by 1
+        # x₂ occurs in no term: its size must not hide that x₁ ≥ 1 or x₁ = 1 is violated
+        # by 1
         (diagonal([1, 0], [0, 0], lb=[1, -np.inf]), at([0, 1e12])),
         (diagonal([1, 0], [0, 0], A=[[1, 0]], b=[1]), at([0, 1e12], [0])),
-        # y and z_box cancel: their size must not excuse x₂ = 0 where x₂* = 1
+        # y and z_box cancel: their size must not hide the error of x₂ = 0, since x₂* =
+        # 1
         (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[0], lb=[0, -np.inf]),
          at([0, 0], [1e12], [-1e12, 0])),
         (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[1], lb=[1, -np.inf], ub=[1, np.inf]),
@@ -214,7 +216,8 @@ def test_the_trivial_solution_of_a_trivial_problem_is_verified():
     ("claimed", "worst", "expected"),
     [
         (Status.SOLVED, 9e-8, Verdict.VERIFIED),
-        (Status.ITERATION_LIMIT, 9e-8, Verdict.VERIFIED),  # it knew less than it had
+        # the point is better than the claim
+        (Status.ITERATION_LIMIT, 9e-8, Verdict.VERIFIED),
         (Status.SOLVED, 2e-7, Verdict.INACCURATE),
         (Status.SOLVED, 3e-4, Verdict.INACCURATE),  # half of the digits: √1e-7
         (Status.SOLVED, 4e-4, Verdict.WRONG),
@@ -325,7 +328,7 @@ def test_the_least_scale_of_energy_is_a_hundredth_of_what_a_variable_gains_alone
     qp, expected
 ):
     nowhere = at(0 * qp.q, z_box=0 * qp.q)
-    with np.errstate(invalid="ignore"):  # 0·∞, where there is no bound
+    with np.errstate(invalid="ignore"):  # 0·∞ for absent bounds
         found = energy_at(qp, nowhere)
 
     assert found == pytest.approx(expected / 100)

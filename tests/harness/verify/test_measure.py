@@ -18,7 +18,7 @@ from tests.support import ADVERSARIES
 
 PLUGIN = load_plugin(ADVERSARIES)
 
-#: places in the file of these solvers, as messages name them
+#: line references to this file in messages
 AT = {
     code: f" ({ADVERSARIES.name}:{line})"
     for line, text in enumerate(ADVERSARIES.read_text().splitlines(), start=1)
@@ -121,7 +121,7 @@ def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
     message = measure(load_plugin(path).solvers["admm"], qp, 1e-6).solution.message
 
     assert message.endswith(".py:6)")
-    assert len(message) < 2000  # of the protocol
+    assert len(message) < 2000  # limit of the protocol
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_both_phases_are_timed_and_add_up(qp):
     assert m.prepare_seconds > 0
     assert m.solve_seconds > 0
     assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
-    assert m.inner_loops == 1  # nobody has asked for a longer sample
+    assert m.inner_loops == 1  # no longer sample was requested
 
 
 @pytest.mark.parametrize("sample_seconds", [0.0, 0.009, 0.011, 0.1])
@@ -319,8 +319,9 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
     monkeypatch.setattr(measuring, "perf_counter", lambda: next(clock))
     m = measure(Asks(), qp, 1e-6).cost
 
-    assert asked == [1]  # the clock had been read once
-    assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked
+    assert asked == [1]  # the clock was read once before
+    # the clock advances at each reading and at each call of `declines`
+    assert m.prepare_seconds == 2
 
 
 class ReadsEntries:

@@ -21,7 +21,7 @@ from tests.support.balls import Balls
 
 INF = np.inf
 PAIRS = [(3, 4, 5), (5, 12, 13), (8, 15, 17), (-7, 24, 25), (4, -3, 5)]
-#: ways to deceive, each alone and all of them in pairs
+#: traps, which are tested singly and in pairs
 TRAPS = ("singular", "cancelled", "tiny ball", "wide ball", "weak", "units", "point")
 
 

@@ -14,7 +14,7 @@ from tests.support import ROOT, SUPPORT
 
 pytestmark = pytest.mark.together
 
-#: some discs slip and others stick
+#: case in which some discs slip and others stick
 SPACE = "greco/n=4/dim=3/depth=2/feti=2/dual"
 HELD = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
@@ -27,7 +27,7 @@ HELD = (
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 ELIMINATED = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
-#: some rows at its crosspoints depend on others
+#: case with dependent rows at crosspoints
 REDUNDANT = "plate/Sx=3/Sy=3/n=2/pattern=column/jump=10/glue=redundant/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
@@ -76,7 +76,7 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        # ranks allow for what rounding makes of any assembled K, one knows its own
+        # ranks bound the rounding of any assembled K, one process evaluates its own K
         assert bounds["energy_bound"] == pytest.approx(
             one["bound"], rel=ROUNDING, abs=1e-10
         )
@@ -91,7 +91,7 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        # how far û keeps out of the other body is rounding, and counts below 1e-8
+        # the distance of û from penetration is rounding, and affects terms below 1e-8
         assert bounds["energy_bound"] == pytest.approx(
             one["bound"], rel=ROUNDING, abs=1e-11
         )
@@ -102,7 +102,7 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
 
 def test_what_supports_eliminate_is_certified_in_subdomains_that_float(found):
     for answer in found[ELIMINATED]:
-        # u_λ of the whole is the nearest there is, which one process finds
+        # one process finds the nearest u_λ of the whole body
         bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
 
         assert answer["same"]
@@ -119,7 +119,7 @@ def test_quantities_by_ranks_are_those_of_one_process(found, case):
 
         assert list(by_ranks) == list(by_one)
         for name, value in by_one.items():
-            # the gap of a node that touches is what rounding makes of a zero
+            # the gap of a node in contact is zero up to rounding
             least = 1e-15 if name.endswith("smallest_gap") else 1e-6
             assert by_ranks[name] == pytest.approx(value, rel=1e-9, abs=least), name
 

@@ -85,7 +85,7 @@ UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
         (LONG, at([0, 1e12, 1e12], [-1, 1])),
         (PAID, at([0, 1e12, 1e12], [0, -1])),
         (PAID, at([0.5, 1e12, 1e12], [-0.5, -0.5])),
-        (UNITS, at([1, 0])),  # below its bound by all that there is of it
+        (UNITS, at([1, 0])),  # below its bound by the entire bound
     ],
 )
 def test_a_wrong_point_is_refuted_by_its_residuals(qp, s):
@@ -111,9 +111,9 @@ TINY = 6e-13  #: ½x² + ½x² = 4e-25
         (qp_of([1, 1], [0, 0], A=[[1, -1]], b=[0]), at([TINY, TINY], [0])),
         (qp_of([1, 1], [0, 0], G=[[1, 1]], h=[5]), at([TINY, TINY], z=[0])),
         (qp_of([1, 1], [1e-17, -3e-17], lb=0, ub=3), at([TINY, TINY])),
-        # a gradient of 1e-9 with a noise of 1e-10, beside one of 1
+        # a gradient of 1e-9 with a noise of 1e-10, together with a gradient of 1
         (qp_of([1, 1], [-1, -1e-9]), at([1, 9e-10])),
-        # x₂ rests at its bound, whose multiplier of 1e-9 is missing
+        # x₂ is at its bound, whose multiplier of 1e-9 is missing
         (qp_of([1, 0], [-1, 1e-9], lb=[-INF, 75]), at([1, 75])),
         (qp_of([1, 0], [-1, -1e-9], ub=[INF, -75]), at([1, -75])),
         (qp_of([1, 0], [-1e-6, 1e-15], lb=[-INF, 0]), at([1e-6, 0])),
@@ -142,11 +142,12 @@ def test_rows_tighten_the_widths_of_variables():
         assert ub - lb == pytest.approx(widths)
 
 
-#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 0 hold x at (0, 0): f* = 0
+#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 0 imply x* = (0, 0), f* = 0
 DELTA = 2.0**-34
 NEARLY = qp_of([1, 1], [0.5, 0], G=[[0, 1], [-DELTA, -1]], h=[0, 0])
 BETWEEN = at([-0.5, DELTA / 4], z=[0, 0])  # violates both by δ/4; f = −0.125
-#: the same moved by (1.5, 0): the second row's right-hand side tells its size
+#: the same problem, shifted by (1.5, 0); the right-hand side of the second row defines
+#: its scale
 MOVED = qp_of([1, 1], [-1, 0], G=[[0, 1], [-DELTA, -1]], h=[0, -1.5 * DELTA])
 
 #: curvature 4ε along (1, −1), where the slope at (½, ½) is 2γ: f* = −½ − γ²/2ε = −1
@@ -176,11 +177,11 @@ def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(a
     (a, b), (_, d) = ([Fraction(v) for v in row] for row in qp.P)
     p, q = map(Fraction, qp.q)
     value = -(d * p * p - 2 * b * p * q + a * q * q) / (a * d - b * b) / 2
-    assert a * d > b * b  # as stored: else it is unbounded
+    assert a * d > b * b  # in the stored numbers; otherwise, the QP is unbounded
     s = at(turn @ [-1, 0])
     error = decided(qp, s, kkt_residuals(qp, s), TOL, proves(reference_solution))
 
-    assert value < -0.6  # the point has -0.5
+    assert value < -0.6  # f = −0.5 at the point
     assert error is not None
     assert error > 1e-4
 
@@ -239,7 +240,7 @@ def test_where_the_reference_fails_residuals_stand():
     def fails(_):
         raise ArithmeticError
 
-    qp = qp_of(np.eye(MANY) + 1, [-1] * MANY)  # more than rational arithmetic takes
+    qp = qp_of(np.eye(MANY) + 1, [-1] * MANY)  # too large for rational arithmetic
     s = at([1 / (MANY + 1)] * MANY)
 
     assert decided(qp, s, kkt_residuals(qp, s), TOL, proves(fails)) is None
@@ -284,7 +285,8 @@ def test_a_point_that_is_no_optimum_has_no_exact_value():
     exact = exact_optimum(qp, right)
     assert exact is not None
     assert exact.value == Fraction(-3, 4)
-    assert exact_optimum(qp, wrong) is None  # the bound would pull
+    # the multiplier of the bound would have the wrong sign
+    assert exact_optimum(qp, wrong) is None
 
 
 BOUNDED = qp_of([1], [1], lb=0)  # x* = 0
@@ -296,8 +298,8 @@ BOUNDED = qp_of([1], [1], lb=0)  # x* = 0
         (BOUNDED, at([-1])),
         (qp_of([1], [-1], ub=0), at([1])),
         (qp_of([1], [-1], G=[[1]], h=[0]), at([1], z=[0])),
-        (qp_of([1], [1], G=[[1]], h=[0]), at([0], z=[1])),  # x* = −1: the row pulls
-        (qp_of([1], [-1], lb=0), at([0], z_box=[-1])),  # x* = 1: the bound pulls
+        (qp_of([1], [1], G=[[1]], h=[0]), at([0], z=[1])),  # x* = −1: wrong sign of z
+        (qp_of([1], [-1], lb=0), at([0], z_box=[-1])),  # x* = 1: wrong sign of z_box
         (qp_of([1, 1], [0, 0], A=[[1, 0], [1, 0]], b=[1, 2]), at([1, 0], [0, 0])),
     ],
     ids=["x < lb", "x > ub", "G x > h", "z < 0", "z_box > 0 at lb", "infeasible"],
@@ -321,7 +323,7 @@ def test_the_optimum_of_a_well_conditioned_qp_is_known_to_fourteen_digits():
     assert optimum.doubt <= 1e-14
 
 
-MANY = 45  #: variables, more than are solved for in rational arithmetic
+MANY = 45  #: number of variables, too large for rational arithmetic
 
 
 @pytest.mark.parametrize("unit", [2.0**-60, 1.0, 2.0**60])
@@ -415,14 +417,14 @@ def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
     assert optimum.energy <= 1e4 * 2.0**-20
 
 
-#: (½, ½, ½), f* = 1.5; between its bounds each variable could gain 1e12
+#: x* = (½, ½, ½), f* = 1.5; within its bounds, each variable could gain 1e12
 WIDE = qp_of(
     [0] * 3, [1] * 3, G=[[-1, -1, 0], [0, -1, -1], [-1, 0, -1]], h=[-1] * 3,
     lb=-1e12, ub=1e12,
 )  # fmt: skip
-#: (0, 0, 1), f* = −½; without its bound each of the first two could gain 1e12
+#: x* = (0, 0, 1), f* = −½; without bounds, each of x₁, x₂ could gain 1e12
 PUSHED = qp_of([1] * 3, [1e6, 1e6, -1], lb=[0, 0, -INF])
-#: (−3, 3.5), f* = −1.2e10: the row is worth nothing beside the bound
+#: x* = (−3, 3.5), f* = −1.2e10; the multiplier of the row is negligible
 BESIDE = qp_of([0, 0], [4e9, 1], A=[[0, 1]], b=[3.5], lb=[-3, -INF])
 
 
@@ -463,7 +465,7 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
     assert error == pytest.approx(1e-9, rel=3)
     further = at([1 + 4e-9, 1], [-1 - 4e-9], z_box=[0, 0.5])
     residuals = kkt_residuals(qp, further)
-    assert residuals.worst > 10 * TOL  # to the digits of f: they do not decide
+    assert residuals.worst > 10 * TOL  # relative to f, so residuals do not decide
     error = decided(qp, further, residuals, TOL, proves(reference_solution))
     assert error == pytest.approx(4e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
@@ -538,7 +540,7 @@ def with_idle(qp, rng, count):
     )  # fmt: skip
 
 
-#: how a planted QP is handed in: further variables, and P as an operator
+#: variants of a planted QP: number of further variables, and P as an operator or not
 WAYS = {"as it is": (0, False), "400 idle": (400, False), "operator": (0, True),
         "operator, 400 idle": (400, True)}  # fmt: skip
 
@@ -652,7 +654,7 @@ class Attack:
             case 5:  # down the objective, through the rows
                 slope = (qp.P @ x + qp.q) * unit
                 x = x - size * unit * slope / (np.linalg.norm(slope) or 1)
-            case _:  # multipliers alone
+            case _:  # only the multipliers
                 return self.with_noise(s, size, 1 / 3)
         if rng.random() < 0.5:
             x = np.clip(x, qp.lb, qp.ub)
@@ -853,7 +855,7 @@ def test_a_chain_of_idle_variables_is_as_long_as_its_first_row(rows, off):
 
 def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
     """x* = (512, −512) is 256 times the length over which the energy changes by E."""
-    soft = 2.0**-18  # along (1, −1), where x is long
+    soft = 2.0**-18  # curvature along (1, −1), in which x is long
     P = np.array([[1 + soft, 1 - soft], [1 - soft, 1 + soft]])
     x, off = np.array([512.0, -512.0]), 2.0**-17
     qp = qp_of(P, -(P @ x), A=[[1, 1]], b=[0])  # y* = 0
@@ -861,9 +863,9 @@ def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
 
     exact, near = ([Fraction(v) for v in point] for point in (x, s.x))
     error = objective(qp, near) - objective(qp, exact)
-    assert 0 < error <= Fraction(TOL) * 2  # of the terms, 4
-    assert sum(near) <= Fraction(2 * TOL) * 1024  # of its own terms
-    assert sum(near) > Fraction(10 * TOL) * 4 * 10  # of ten lengths
+    assert 0 < error <= Fraction(TOL) * 2  # relative to the terms, 4
+    assert sum(near) <= Fraction(2 * TOL) * 1024  # relative to its terms
+    assert sum(near) > Fraction(10 * TOL) * 4 * 10  # relative to ten lengths
     assert judge(qp, s) is Verdict.VERIFIED
     assert judge(qp, at(x + 100 * off, [-200 * off])) is not Verdict.VERIFIED
 

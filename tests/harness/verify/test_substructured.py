@@ -43,13 +43,13 @@ CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
     "beam-ring/Nr=2/Nh=3/step=6/contact=mortar/basis=standard",
     "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7",
-    "contact-patch/ratio=0.1",  # contact alone holds the upper block
+    "contact-patch/ratio=0.1",  # only contact supports the upper block
     "contact-patch/ratio=0.1/friction=coulomb/mu=0.2",
     "hertz-cylinder/n=3/m=2",
 )
 PERTURBATIONS = 6000
-ROUNDED = 1 + 1e-9  #: local solves are those of doubles
-NOISE = 1e-7  #: relative error from which on effectivities are measured
+ROUNDED = 1 + 1e-9  #: local solves are in double precision
+NOISE = 1e-7  #: smallest relative error for which effectivities are measured
 
 
 def bodies_of(name: str) -> Bodies:
@@ -199,7 +199,7 @@ def test_bounds_are_about_those_of_the_whole(name: str) -> None:
     assert np.median(found) <= 2.5
 
 
-#: answers as accurate as doubles are, where K and TᵀK_T T differ by as much
+#: answers accurate to rounding, for which the difference of K and TᵀK_T T matters
 ACCURATE = ("plate/Sy=2", "plate/Sx=8/Sy=1/n=4", "plate/Sx=8/Sy=2/n=2")
 MORE_ACCURATE = (
     "plate", "plate/Sx=2/Sy=2/n=8", "plate/Sx=4/Sy=4/n=2", "plate/Sx=12/Sy=1/n=2",
@@ -271,7 +271,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     together = split.averaged(split.spread(u) + 100 * apart)
     left = without_rigid_motion(
         split, together - u
-    )  # contact alone holds a body of the patch
+    )  # only contact supports a body of the patch
 
     assert np.abs(left).max() < 1e-9
 

@@ -238,7 +238,7 @@ def test_ranks_find_the_objective_and_no_residual_of_a_solution():
     assert values.pop("objective") == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
     assert max(values.values()) <= 1e-15
     assert found.pop("notes") == []
-    assert set(found.values()) == {None}  # nothing else was to be had
+    assert set(found.values()) == {None}  # no value is available
 
 
 def test_ranks_say_nothing_of_a_point_that_is_not_finite():
