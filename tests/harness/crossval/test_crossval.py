@@ -120,7 +120,7 @@ def disturbed(case, s, size):
         v[case.mechanics.exact.fixed] = 0
     else:
         v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
-        if case.qp.b.size:  # a part that is orthogonal to the rigid motions
+        if case.qp.b.size:  # keep the equality rows satisfied
             A = np.asarray(case.qp.A)
             v = v - np.linalg.pinv(A) @ (A @ v)
     return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)

@@ -158,7 +158,7 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: solvers that exhaust the time limit; by default, a single one is tested
+#: solvers that exhaust the time limit and are tested by default
 WAITED_FOR = {"printsendlessly"}
 
 

@@ -323,7 +323,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
     along = np.where(np.arange(s.x.size) % 2 == 0, far * np.abs(s.x).max(), 0)
     of_block = mechanics.kernel @ (mechanics.kernel.T @ along)
     certify(mechanics, replace(s, x=s.x + of_block.astype(np.float64)))
-    held, allowed = seen[0]  # the pair at which the body has slid
+    held, allowed = seen[0]  # of the first pair, in which the block has slid
     off = np.abs(held.T @ (mechanics.motions.constrained.T @ of_block))
 
     assert off.max() > 0

@@ -57,8 +57,8 @@ OTHERS = (
     "obstacle/n=8", "obstacle/n=8/feti=4", "membranes/S=2/n=3",
     "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
-#: linear ones, whose other solvers take very long; all but the first are soft in
-#: bending, or nearly move rigidly inside
+#: linear cases, for which other solvers take very long. All but the first are soft in
+#: bending or have nearly rigid internal motions
 PLATES = (
     "plate/Sx=12/Sy=1/n=2", "plate/Sx=40/Sy=1/n=1",
     "plate/Sx=20/Sy=1/n=1/width=20/height=0.05",
@@ -79,7 +79,7 @@ ON_RANKS = (
     "plate/Sx=12/Sy=1/n=2", "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
 DISTURBED = 10_000
-#: factor for rounding in the evaluation of a bound, a sum and a root of doubles
+#: factor for the rounding of bounds, which are evaluated in double precision
 ROUNDED = 1 + 1e-9
 #: range of errors for which effectivities are measured; bounds of smaller errors
 #: consist of rounding

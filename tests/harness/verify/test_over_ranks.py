@@ -32,7 +32,8 @@ REDUNDANT = "plate/Sx=3/Sy=3/n=2/pattern=column/jump=10/glue=redundant/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
 MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
-#: of a bound; K is the sum over subdomains on ranks, and the stored one elsewhere
+#: relative difference of bounds: ranks use the sum over subdomains, one process the
+#: stored K
 ROUNDING = 1e-4
 
 
@@ -91,7 +92,8 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        # the distance of û from penetration is rounding, and affects terms below 1e-8
+        # û is moved out of the other body by rounding errors, which affect terms below
+        # 1e-8
         assert bounds["energy_bound"] == pytest.approx(
             one["bound"], rel=ROUNDING, abs=1e-11
         )
