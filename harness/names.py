@@ -194,7 +194,7 @@ def unbuilt(name: object, e: BaseException) -> str:
         case InputError():
             why = str(e)
         case MemoryError():
-            why = "it needs more memory than there is"
+            why = "it needs more memory than is available"
         case _:
             why = f"{type(e).__name__}: {e}"
     return " ".join(f"{name} could not be built: {why}".split())

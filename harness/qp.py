@@ -130,7 +130,9 @@ class QP:
                 raise ValueError(f"QP.{name} has shape {array.shape}, expected {shape}")
         for name in ("q", "b", "h"):
             if not np.isfinite(arrays[name]).all():
-                raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
+                raise ValueError(
+                    f"QP.{name} contains NaN or inf, expected finite numbers"
+                )
         every = _without_intervals((box, *further[has_box:]), n)
         values = {**arrays, "sets": every, "structure": structure}
         for name, value in values.items():
@@ -208,13 +210,13 @@ class QP:
             isinstance(one, ConvexSet) and not isinstance(one, Box) for one in sets
         ):
             raise InputError(
-                f"sets = {shown(sets)}; expected a tuple of convex sets, beside lb and "
-                "ub for bounds"
+                f"sets = {shown(sets)}; expected a tuple of convex sets in addition "
+                "to lb and ub for bounds"
             )
         for M, rhs, name, side in ((G, h, "G", "h"), (A, b, "A", "b")):
             if (M is None) != (rhs is None):
                 here, absent = (name, side) if rhs is None else (side, name)
-                raise InputError(f"{absent} is missing beside {here}")
+                raise InputError(f"{absent} is missing, but {here} is present")
         vector = numeric_vector("q", q)
         if not (n := vector.size):
             raise InputError("q is empty; expected at least one variable")
@@ -531,7 +533,7 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
         M = entries = _numbers(name, value)
         M = np.atleast_2d(M) if rows is None else M
     if not np.isfinite(entries).all():
-        raise InputError(f"{name} holds NaN or inf; expected finite numbers")
+        raise InputError(f"{name} contains NaN or inf; expected finite numbers")
     if M.ndim != 2 or M.shape != (M.shape[0] if rows is None else rows, n):
         expected = f"({'rows' if rows is None else rows}, {n})"
         raise InputError(f"{name} has shape {M.shape}; expected {expected}")

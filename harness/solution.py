@@ -170,7 +170,7 @@ def checked_history(history: object) -> History:
 
 def _column(name: object, values: object) -> NDArray[Any]:
     if not isinstance(name, str) or not name.isidentifier():
-        raise ValueError(f"{name!r} names a column, expected an identifier")
+        raise ValueError(f"{name!r} is the name of a column, expected an identifier")
     column = np.asarray(values)
     if column.ndim != 1:
         raise ValueError(f"{name} has shape {column.shape}, expected one row each")

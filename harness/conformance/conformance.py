@@ -224,7 +224,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
     remark = f"a multiplier of {worst:.1e} on an absent bound"
     if not worst <= GRADIENT_ROUNDING * size:
         raise ContractError(f"{remark}; expected 0")
-    return Result(Grade.PASS, f"{remark}: rounding; 0 would be right")
+    return Result(Grade.PASS, f"{remark}: rounding; expected 0")
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:

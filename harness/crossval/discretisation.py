@@ -260,7 +260,7 @@ class _Halving:
             left = self.end - perf_counter()
             if not left > seconds * growth**TIME_EXPONENT:
                 self.late = True
-                self.why = "the next mesh would take more time than was left"
+                self.why = "the next mesh would take more than the remaining time"
                 return
             start = perf_counter()
             level = self._level(params, form, first=not sizes)

@@ -187,7 +187,7 @@ def _headline(
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
         parts.append(
-            f"{_many(counts['unresolved'], 'pair')} apart, neither answer refuted"
+            f"{_many(counts['unresolved'], 'pair')} too far apart, neither refuted"
         )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")

@@ -233,7 +233,7 @@ def _pointless(records: Sequence[Record]) -> str:
         return "its stored points are missing; expected the vectors/*.npz of the run"
     statuses = Counter(r.verdict.words for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
-    return f"no solver returned a point ({ends}); expected one that solves a case"
+    return f"no solver returned a point ({ends}); expected a solver that solves a case"
 
 
 def _built(

@@ -60,7 +60,7 @@ class DistributedDiscs(Discs):
         if split.size:
             raise ValueError(
                 f"the components {discs.index[split[0]].tolist()} of a disc are on "
-                "several ranks; expected one rank for each disc"
+                "several ranks; expected all components of a disc on one rank"
             )
         index = np.searchsorted(owned, discs.index[here])
         return cls(index, distributed(discs.radius[here], ranks))

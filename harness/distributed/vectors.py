@@ -239,7 +239,9 @@ class DistributedVector(np.ndarray):
         return self @ other
 
     def _refused(self, *args: Any, **kwargs: Any) -> Any:
-        raise TypeError("this method of a distributed vector would see its slice only")
+        raise TypeError(
+            "this method of a distributed vector would use only its local slice"
+        )
 
     argmax = argmin = argpartition = argsort = cumprod = cumsum = mean = _refused
     partition = prod = sort = std = trace = var = searchsorted = tofile = _refused

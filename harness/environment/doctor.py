@@ -156,7 +156,9 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
     blas, version = environment["cholmod"]["blas"], environment["cholmod"]["version"]
     advice = ""
     if environment["versions"]["scikit-sparse"] is None:
-        advice = "scikit-sparse is not installed, nothing is factorised: make setup"
+        advice = (
+            "scikit-sparse is missing, so matrices cannot be factorised: make setup"
+        )
     elif blas == "reference BLAS":
         link = f"libblas.so.3-{environment['machine']['architecture']}-linux-gnu"
         advice = (
@@ -180,7 +182,9 @@ def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
 def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
     for pool in threads["pools"]:
         count = pool["threads"]
-        advice = f"Several threads make times vary: {ONE_THREAD}" if count > 1 else ""
+        advice = (
+            f"Several threads cause scatter of times: {ONE_THREAD}" if count > 1 else ""
+        )
         value = f"{count} thread{'s' if count > 1 else ''}"
         yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
     variables = ", ".join(f"{k}={v}" for k, v in threads["variables"].items())

@@ -100,7 +100,7 @@ class Copies:
         copy = self._folder / name
         if not os.path.lexists(copy):
             raise self._missing(source.path, source.sha256, here)
-        check_copy(copy, source.sha256, f"put the file back at {source.path}")
+        check_copy(copy, source.sha256, f"restore the file at {source.path}")
         return copy
 
     def digest(self, path: str) -> str:
@@ -135,10 +135,10 @@ class Copies:
         sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
-            why = f"was too large to travel with the results ({_mib(size)})"
+            why = f"was too large to be copied with the results ({_mib(size)})"
         other = f" (the file changed: it has {here})" if here is not None else ""
         return InputError(
-            f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}: "
+            f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}; "
             f"put it at {path}"
         )
 
@@ -301,13 +301,13 @@ class _Writer:
     def _has_room(self, name: str, size: int) -> bool:
         if size > MAX_FILE_MIB * MIB:
             self._tell(
-                f"{name} ({_mib(size)}) is larger than {MAX_FILE_MIB} MiB, and does "
-                "not travel with the results"
+                f"{name} ({_mib(size)}) is larger than {MAX_FILE_MIB} MiB, and is "
+                "not copied to the result folder"
             )
             return False
         if self._size + size > MAX_FOLDER_MIB * MIB:
             self._tell(
-                f"{name} ({_mib(size)}) does not travel with the results: their copies "
+                f"{name} ({_mib(size)}) is not copied to the result folder: the copies "
                 f"of files would take more than {MAX_FOLDER_MIB} MiB"
             )
             return False

@@ -146,7 +146,7 @@ def _full(path: Path, code: int) -> str:
     free = shutil.disk_usage(there).free / _MIB
     return (
         f"{path} cannot be written: {os.strerror(code)} (file system {root}, "
-        f"{free:.1f} MiB free); free some space, and the same command continues"
+        f"{free:.1f} MiB free); free some space; the same command continues the run"
     )
 
 

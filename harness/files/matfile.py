@@ -34,7 +34,7 @@ from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetri
 from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
-_WRONG = "not a .mat file; expected one saved with -v7 or older"
+_WRONG = "not a .mat file; expected a file saved with -v7 or older"
 #: sizes in bytes of the header of a version 5 file, and of the tag before each element
 _HEADER, _TAG = 128, 8
 _COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: codes of data types
@@ -170,7 +170,7 @@ def _variable(element: _Element) -> tuple[str, Any]:
     if element.kind == _COMPRESSED:
         element = _decompressed(element)
     if element.kind != _MATRIX:
-        raise ValueError("an element that is not a variable")
+        raise ValueError("the file has an element that is not a variable")
     parts = _parts(element)
     flags, shape = int(next(parts)[0]), tuple(map(int, next(parts)))
     name = next(parts).tobytes().decode("latin-1")
@@ -229,7 +229,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         meta = json_object(str(text.item()))
         for name in _MATRICES:
             if not np.isfinite(matrices[name].data).all():
-                raise ValueError(f"{name} holds inf; expected finite numbers")
+                raise ValueError(f"{name} contains inf; expected finite numbers")
         for name in listed_dense(meta):
             check_dense(name, matrices[name])
             matrices[name] = matrices[name].toarray()
@@ -260,7 +260,7 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
     if array.ndim > 2:
         raise InputError(f"{name} has {array.ndim} dimensions; expected at most two")
     check_size(
-        f"{name}, {max(array.shape, default=1)} wide or high,",
+        f"{name}, {max(array.shape, default=1)} rows or columns,",
         8 * max(array.shape, default=1),
     )
     try:
@@ -270,5 +270,5 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
         raise InputError(f"{name} is not a matrix: {shortened(str(e))}") from None
     M = canonical(M)
     if np.isnan(M.data).any():
-        raise InputError(f"{name} holds NaN; expected numbers")
+        raise InputError(f"{name} contains NaN; expected numbers")
     return M

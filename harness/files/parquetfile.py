@@ -69,7 +69,7 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     for name, count in rows.items():
         if count * n > _MAX_ENTRIES:
             raise InputError(
-                f"{path}: {name} has {count} × {n} entries, and Parquet holds them "
+                f"{path}: {name} has {count} × {n} entries, and Parquet stores them "
                 f"dense, at most {_MAX_ENTRIES}; expected .npz or .mat for a QP of "
                 "this size"
             )
@@ -156,7 +156,7 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
         raise InputError(f"{path}: malformed; expected a Parquet file")
     head = json.loads(line)
     if head["rows"] != 1:
-        raise InputError(f"{path}: holds {head['rows']} problems; expected one row")
+        raise InputError(f"{path}: contains {head['rows']} problems; expected one row")
     if missing := head["missing"]:
         raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
     check_size(f"{path}: its content", head["bytes"])
@@ -176,7 +176,7 @@ def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
     if n == 0 or flat.size % n:
         raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
     if not np.isfinite(flat).all():
-        raise ValueError(f"{name} holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
     M = flat.reshape(-1, n)
     return M if dense else csc_array(M)
 

@@ -247,7 +247,7 @@ def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
     if M.ndim != 2:
         raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
     if not np.isfinite(M).all():
-        raise ValueError(f"{name} holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
     return M
 
 
@@ -292,8 +292,8 @@ def _check_foreign(
     """Check that P is not an operator, and that dense matrices are within the limit."""
     if "maker" in meta:
         raise ValueError(
-            "holds P as an operator, which is read only where the run itself wrote it; "
-            "expected P as a matrix, as export writes it"
+            "contains P as an operator, which is read only from files of the same run; "
+            "expected P as a matrix, as in files of export"
         )
     for name in dense:
         check_dense(name, matrices[name])
@@ -302,16 +302,16 @@ def _check_foreign(
 def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
     if missing := [name for name in parts if name not in arrays]:
-        raise ValueError(f"{', '.join(missing)} missing beside fixed")
+        raise ValueError(f"{', '.join(missing)} missing, but fixed is present")
     if arrays["fixed"].dtype.kind not in "iu":
-        raise ValueError("fixed must hold integers")
+        raise ValueError("fixed must contain integers")
     fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
     K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
     N = K.shape[0]
     if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
         raise ValueError("the shapes of K, B, fixed and q are inconsistent")
     if ((fixed < 0) | (fixed >= N)).any():
-        raise ValueError(f"fixed holds indices out of range; expected 0 … {N - 1}")
+        raise ValueError(f"fixed contains indices out of range; expected 0 … {N - 1}")
     return Structure(K=K, B=B, fixed=fixed)
 
 
@@ -335,10 +335,10 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     """Check the CSC parts of a stored matrix, and return the matrix."""
     data = _vector(arrays, f"{name}_data")
     if not np.isfinite(data).all():
-        raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name}_data contains NaN or inf; expected finite numbers")
     indices, indptr, shape = (arrays[f"{name}_{part}"] for part in _PARTS[1:])
     if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
-        raise ValueError(f"{name}_indices, _indptr and _shape must hold integers")
+        raise ValueError(f"{name}_indices, _indptr and _shape must contain integers")
     try:
         return compressed(data, indices, indptr, tuple(shape.tolist()))
     except (ValueError, TypeError, OverflowError) as e:

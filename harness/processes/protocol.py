@@ -118,9 +118,11 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     try:
         reply = json.loads(line)
     except ValueError:
-        raise ForeignReplyError(f"{_excerpt(line)} came, expected a reply") from None
+        raise ForeignReplyError(
+            f"{_excerpt(line)} was received, expected a reply"
+        ) from None
     if not isinstance(reply, dict) or reply.get("event") not in (expected, "fault"):
-        raise ForeignReplyError(f"{_excerpt(line)} came, expected {expected!r}")
+        raise ForeignReplyError(f"{_excerpt(line)} was received, expected {expected!r}")
     return reply
 
 

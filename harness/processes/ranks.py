@@ -107,7 +107,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
-        message = first or f"one of {ranks} ranks ended: mpiexec says {code}"
+        message = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
         # The parent quotes the last line of the output. The newline ends a possibly
         # unfinished line of a rank.
         print(f"\n{message}", file=sys.stderr)
@@ -164,7 +164,7 @@ class _RankExits:
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
         way = self._exit_description.get(
-            self._first, "killed, as was the process above it"
+            self._first, "killed together with its parent process"
         )
         return f"{one} of {self._ranks} ranks ended: {way}"
 

@@ -445,9 +445,8 @@ class WorkerProcess:
                 self._unread = rest
                 break
             if len(self._unread) > MAX_REPLY_BYTES:
-                how = (
-                    f"more than {MAX_REPLY_BYTES >> 20} MiB came without an end of line"
-                )
+                most = MAX_REPLY_BYTES >> 20
+                how = f"more than {most} MiB were received without an end of line"
                 raise ended(Verdict.FAILED, how)
             if dead and not has_more:
                 raise ended(Verdict.CRASHED, *self._death())

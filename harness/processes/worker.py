@@ -258,7 +258,7 @@ def _begin_sequence(
     if hasattr(solver, "tightening"):
         varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
         return varying
-    why = "its chain() has one tolerance for all steps; tightening() would take others"
+    why = "its chain() has one tolerance for all steps; tightening() would take several"
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 

@@ -162,8 +162,9 @@ def refuse_foreign(folder: Path) -> None:
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
-            f"{folder} holds {some(taken)} but is not a result folder (no suite.toml "
-            "with environment.json, no journal/*.jsonl); choose another --out"
+            f"{folder} contains {some(taken)} but is not a result folder (no "
+            "suite.toml with environment.json, no journal/*.jsonl); choose another "
+            "--out"
         )
 
 
@@ -355,7 +356,7 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
             raise InputError(f"{e}; restore it, or use --fresh") from None
         has_grown = old != new
         if has_grown and (difference := incompatibility(old, new)):
-            raise InputError(f"{out} holds another suite ({difference}); {REMEDY}")
+            raise InputError(f"{out} contains another suite ({difference}); {REMEDY}")
     if environment_file.exists():
         stored = _environment(environment_file)
         if stored["digest"] != environment["digest"]:
@@ -399,7 +400,7 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
     for path in (folder / "environment.json", _node_file(folder, digest)):
         if path.is_file() and (environment := _environment(path))["digest"] == digest:
             return environment
-    raise InputError(f"{folder} does not hold the environment {digest}")
+    raise InputError(f"{folder} does not contain the environment {digest}")
 
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:

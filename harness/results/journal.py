@@ -122,13 +122,13 @@ def read_journal(
                 )
                 raise InputError(
                     f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
-                    f"differs from that at {place}; expected one line per run_id; "
-                    "delete the wrong one"
+                    f"differs from the record at {place}; expected one line per "
+                    "run_id; delete the wrong line"
                 )
     if repeated:
         lines = "line repeats" if len(repeated) == 1 else "lines repeat"
         tell(
-            f"{len(repeated)} journal {lines} an earlier one word for word, and count "
+            f"{len(repeated)} journal {lines} an earlier line exactly, and count "
             f"once: {some(repeated)}"
         )
     return records

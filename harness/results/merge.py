@@ -38,7 +38,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_DUPLICATES_NOTE = "measurements are already present, and count once"
+_DUPLICATES_NOTE = "measurements are already present and are counted once"
 JOURNAL = "merged"  #: name of the only journal of a merged folder
 
 
@@ -161,7 +161,7 @@ def _refuse_nested(source: Path, out: Path) -> None:
     target, origin = out.resolve(), source.resolve()
     if target == origin:
         raise InputError(
-            f"--out {out} is one of the folders to merge; expected another one"
+            f"--out {out} is one of the folders to merge; expected a different folder"
         )
     for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
@@ -179,7 +179,7 @@ def _refuse_run(out: Path) -> None:
     others = [p.name for p in (out / "journal").glob("*.jsonl") if p != _journal(out)]
     if others:
         raise InputError(
-            f"{out} holds measurements of a run (journal/{min(others)}); expected a "
+            f"{out} contains measurements of a run (journal/{min(others)}); expected a "
             "new folder, or one that was merged before; choose another --out"
         )
 
@@ -206,7 +206,7 @@ def _copy_environments(
     for digest in dict.fromkeys(r.environment for r in records):
         environment = _environment(folders, digest)
         if environment is None:
-            tell(f"no folder holds the environment {digest}")
+            tell(f"no folder contains the environment {digest}")
             continue
         content = {k: v for k, v in environment.items() if k != "digest"}
         keep_environment(out, digest, content)

@@ -129,13 +129,13 @@ def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record
     if candidates:
         first = ", ".join(sorted(candidates)[:3])
         raise InputError(
-            f"{folder} holds {len(candidates)} measurements whose run_id begins with "
-            f"{run_id!r} ({first}); give more digits"
+            f"{folder} contains {len(candidates)} measurements whose run_id begins "
+            f"with {run_id!r} ({first}); give more digits"
         )
     near = get_close_matches(run_id, by_id, n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
     count = f"{len(by_id)} measurement{'s' * (len(by_id) != 1)}"
-    raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
+    raise InputError(f"unknown run_id {run_id!r}: {folder} contains {count}{hint}")
 
 
 def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:

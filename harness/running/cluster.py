@@ -170,16 +170,16 @@ class Nodes:
             if key.startswith(_CODE):
                 what = in_words([(key, here, there)], "here", "there")
                 raise InputError(
-                    f"{node} runs other code than this machine ({what}); install the "
-                    "same on every node"
+                    f"{node} runs different code from this machine ({what}); install "
+                    "the same code on every node"
                 )
         self._stored.add(digest)
         self.keep(digest, environment)
         if changed:
             what = in_words(changed, "here", "there")
             self.warn(
-                f"{node} measures under other conditions than this machine ({what}); "
-                f"its times are marked as those of environment {digest}"
+                f"{node} measures under different conditions from this machine "
+                f"({what}); its times are marked as those of environment {digest}"
             )
 
 
@@ -317,7 +317,9 @@ class _Cluster:
                 self._queue.append(active)
             else:
                 case = active.block.turns[0][0].case
-                reason = f"{case} was given up: all Dask workers that took it were lost"
+                reason = (
+                    f"{case} was given up: all Dask workers that executed it were lost"
+                )
                 yield BuildFailure(block=active.block, reason=reason)
 
 

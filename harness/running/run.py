@@ -269,7 +269,7 @@ def _check_same(
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} holds {record.case}, which is no longer in the suite; cases "
+                f"{out} contains {record.case}, which is no longer in the suite; cases "
                 f"may be added, and --case narrows a run; {REMEDY}"
             )
         today = configured.get(record.solver, record.options)
@@ -277,14 +277,14 @@ def _check_same(
             old, new = record.options.get(key), today.get(key)
             if old != new:
                 raise InputError(
-                    f"{out} holds {record.solver} with {key} = {shown(old)}, now "
-                    f"{shown(new)}; give other options another label"
+                    f"{out} contains {record.solver} with {key} = {shown(old)}, now "
+                    f"{shown(new)}; use a different label for other options"
                 )
         params = now.get(record.case, record.params)
         for key in params.keys() & record.params.keys():
             if record.params[key] != params[key]:
                 raise InputError(
-                    f"{out} holds {record.case} with {key} = {record.params[key]}, "
+                    f"{out} contains {record.case} with {key} = {record.params[key]}, "
                     f"now {params[key]}; {REMEDY}"
                 )
 
@@ -311,6 +311,6 @@ def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
             common = [case for case in cases if case in steps]
             if common != steps[: len(common)]:
                 raise InputError(
-                    f"{out} holds a sequence that reached {common[-1]} by other steps; "
-                    f"steps may be added at its end; {REMEDY}"
+                    f"{out} contains a sequence that reached {common[-1]} by "
+                    f"different steps; steps may be added at its end; {REMEDY}"
                 )

@@ -42,7 +42,7 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
     for one in sets:
         if not isinstance(one, KINDS):
             raise InputError(
-                f"sets of the kind {type(one).__name__} cannot be stored in files; "
+                f"sets of the class {type(one).__name__} cannot be stored in files; "
                 "expected bounds, Discs and Cones"
             )
         counts[type(one)] += 1
@@ -97,7 +97,7 @@ def _parts(
     if not here:
         return {}
     if absent := both.keys() - here:
-        raise InputError(f"{absent.pop()} is missing beside {here.pop()}")
+        raise InputError(f"{absent.pop()} is missing, but {here.pop()} is present")
     names -= here
     index, sizes = (np.asarray(arrays[name]) for name in both)
     sizes = sizes.ravel() if sizes.ndim == 2 and 1 in sizes.shape else sizes

@@ -53,7 +53,7 @@ class Blocks(ABC):
         with np.errstate(invalid="ignore"):  # NaN, or out of the range of int64
             whole = index.astype(np.int64)
         if not np.array_equal(whole, index):
-            raise InputError(f"{kind}: index holds a number that is not an integer")
+            raise InputError(f"{kind}: index contains a number that is not an integer")
         bad = np.flatnonzero(~(np.isfinite(sizes) & (sizes >= 0)))
         if bad.size:
             raise InputError(

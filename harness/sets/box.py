@@ -50,7 +50,7 @@ class Box:
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
         if not (self.lower < np.inf).all() or not (self.upper > -np.inf).all():
-            raise ValueError("QP bounds hold NaN, lb = +inf or ub = -inf")
+            raise ValueError("QP bounds contain NaN, lb = +inf or ub = -inf")
         if (self.lower > self.upper).any():
             raise ValueError("QP bounds cross: lb > ub in some component")
 

@@ -40,7 +40,7 @@ def _settings(old: Table, new: Table) -> Iterator[str]:
     for key in GROWING_KEYS:
         if new[key] < old[key]:
             yield f"{_change(key, old[key], new[key])}; it may only grow"
-    finer = "it may only become finer"
+    finer = "it may only be reduced"
     # None counts as the loosest precision, 1
     if old["precision"] is not None and (new["precision"] or 1) > old["precision"]:
         yield f"{_change('precision', old['precision'], new['precision'])}; {finer}"

@@ -404,10 +404,10 @@ class Balance(NamedTuple):
             if (balanced := self._solved(multipliers, shares)) is not None:
                 return balanced
         raise UncertifiableError(
-            "contact would have to pull to balance the load, which moves some body "
+            "only tensile contact forces could balance the load, which moves some body "
             "away from its contacts, and no support holds the body"
             if self.forces.contact.all()
-            else "contact would have to pull, or friction to exceed its bound, to "
+            else "only tensile contact forces or friction above its bound could "
             "balance the load, which moves some body away from its contacts or along "
             "them, and no support holds the body"
         )

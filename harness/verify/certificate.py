@@ -238,7 +238,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
 
     """
     if not np.isfinite(s.x).all():
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     if qp.b.size + qp.h.size:
         raise UncertifiableError("the QP has rows; expected bounds, discs and cones")
     L = largest_eigenvalue(qp)
@@ -285,7 +285,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     if mechanics.certify_by_subdomains is not None:
         certificate: Certificate = mechanics.certify_by_subdomains(
             s.x, mechanics.multipliers(s)
@@ -474,8 +474,8 @@ def proven(
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
-            "the answer is too far off: along such large rigid motions, the rounding "
-            "of the stiffness outweighs the contact forces"
+            "the error of the answer is too large: along its rigid motions, the "
+            "rounding of the stiffness outweighs the contact forces"
         )
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2

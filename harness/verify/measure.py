@@ -164,7 +164,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
         )
     for one in qp.sets:
         if not isinstance(one, accepted):
-            return f"does not accept sets of the kind {type(one).__name__}"
+            return f"does not accept sets of the class {type(one).__name__}"
     reason: object = solver.declines(qp)
     if reason is None or isinstance(reason, str):
         return reason
@@ -366,7 +366,9 @@ def _numbers(name: str, values: object) -> Vector:
 def _count(name: str, value: Any) -> int:
     count = int(value)
     if not 0 <= count <= MAX_COUNT:
-        got = count if abs(count) < 10 * MAX_COUNT else "a number far out of range"
+        got = (
+            count if abs(count) < 10 * MAX_COUNT else "a number far outside this range"
+        )
         raise ValueError(f"{name} = {got}, expected 0 to 2**53")
     return count
 

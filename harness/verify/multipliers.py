@@ -217,7 +217,7 @@ def _fitted(
         if (n + k) * (k + m) > MAX_ENTRIES:
             raise InputError(
                 f"multipliers of {k} nearly active rows and bounds and {m} equality "
-                "rows are too many to compute; expected y, z and z_box beside x"
+                "rows are too many to compute; expected y, z and z_box in addition to x"
             )
         columns = np.zeros((n, k))
         columns[:, : rows.size] = _dense(qp.G[rows].T)

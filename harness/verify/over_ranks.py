@@ -239,7 +239,7 @@ def certify_over_ranks(
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     u = claimed.astype(Real)
     u[local.fixed] = 0
     split = _OnRanks(local)

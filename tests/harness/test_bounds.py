@@ -136,7 +136,7 @@ def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
 
     assert [r.run_id for r in read_journal(folder, told.append)] == ["a", "b"]
     [line] = told
-    assert line.startswith("2 journal lines repeat an earlier one word for word, ")
+    assert line.startswith("2 journal lines repeat an earlier line exactly, ")
     assert "here.jsonl, line 3" in line
 
 
@@ -145,7 +145,9 @@ def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(jou
 
     with pytest.raises(InputError) as e:
         read_journal(folder)
-    assert "line 3: the record of run_id 'a' differs from that at " in str(e.value)
+    assert "line 3: the record of run_id 'a' differs from the record at " in str(
+        e.value
+    )
     assert "here.jsonl, line 2; expected one line per run_id" in str(e.value)
 
 
@@ -154,12 +156,12 @@ def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
 ):
     folder = journal(record("a"), record("a"))
     assert main(Registries(), ["report", str(folder), "--format", "csv"]) == 0
-    assert "1 journal line repeats an earlier one" in capsys.readouterr().err
+    assert "1 journal line repeats an earlier line" in capsys.readouterr().err
 
     folder = journal(record("a"), record("a", tol=1e-3))
     for command in ("report", "validate"):
-        assert "differs from that at" in refused(command, folder)
-    assert "differs from that at" in refused("replay", folder, "a")
+        assert "differs from the record at" in refused(command, folder)
+    assert "differs from the record at" in refused("replay", folder, "a")
 
 
 def test_equal_tables_of_a_journal_are_one_in_memory_but_1_is_not_true(journal):

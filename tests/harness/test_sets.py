@@ -204,11 +204,11 @@ def test_blocks_are_substituted_with_their_variables():
         ),
         (
             lambda: Discs([[0.5, 1]], [1]),
-            "Discs: index holds a number that is not an in",
+            "Discs: index contains a number that is not an in",
         ),
         (
             lambda: Discs([[np.nan, 1]], [1]),
-            "Discs: index holds a number that is not an",
+            "Discs: index contains a number that is not an",
         ),
         (
             lambda: Discs([[0, 1], [2]], [1, 1]),
@@ -225,7 +225,7 @@ def test_blocks_are_substituted_with_their_variables():
         ),
         (
             lambda: Discs([[1e300, 1]], [1]),
-            "Discs: index holds a number that is not an",
+            "Discs: index contains a number that is not an",
         ),
     ],
 )
@@ -310,7 +310,9 @@ def test_sets_that_do_not_fit_are_refused(sets, message):
 
 def test_a_box_beside_bounds_is_refused():
     arrays = dict(P=np.eye(N), q=np.ones(N))
-    with pytest.raises(InputError, match="expected a tuple of convex sets, beside lb"):
+    with pytest.raises(
+        InputError, match="expected a tuple of convex sets in addition to"
+    ):
         QP.from_arrays(**arrays, sets=(BOX,))
     assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
 
@@ -459,7 +461,9 @@ class Conic(Careless):
 
 def test_a_solver_that_declares_nothing_accepts_bounds_alone():
     qp = qp_with(FREE, BALLS)
-    assert reason_to_decline(Careless(), qp) == "does not accept sets of the kind Balls"
+    assert (
+        reason_to_decline(Careless(), qp) == "does not accept sets of the class Balls"
+    )
     assert reason_to_decline(Careless(), qp_with(BOX)) is None
     assert reason_to_decline(Conic(), qp) is None
 

@@ -119,4 +119,4 @@ def test_a_solver_of_bounds_declines_all_checks_over_sets():
     for check in OVER_SETS:
         result = run_check(check, SOLVERS["osqp"])
         assert result.grade is Grade.DECLINE
-        assert "does not accept sets of the kind" in result.message
+        assert "does not accept sets of the class" in result.message

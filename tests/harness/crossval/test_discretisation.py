@@ -302,7 +302,7 @@ def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
     )  # fmt: skip
 
     assert found.kind == "unknown"
-    assert "more time than was left" in found.note
+    assert "more than the remaining time" in found.note
     assert len(found.levels) <= 1
 
 

@@ -208,7 +208,7 @@ def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
 
 
 def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
-    said = "free some space, and the same command continues"
+    said = "free some space; the same command continues the run"
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         with pytest.raises(InputError) as e, report_full_disk(tmp_path / "none"):
             raise OSError(code, os.strerror(code))

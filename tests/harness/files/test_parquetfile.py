@@ -116,7 +116,7 @@ def columns(**changes):
     [
         ({"P": [1.0, 2.0], "q": [1.0, 1.0]}, r"QP.P has shape \(1, 2\), expected \(2,"),
         ({"P": [1.0] * 3, "q": [1.0, 1.0]}, "P has 3 entries; expected rows of 2"),
-        ({"P": [np.nan]}, "P holds NaN or inf"),
+        ({"P": [np.nan]}, "P contains NaN or inf"),
         ({"P": ["one"]}, "P is not a list of numbers"),
         ({"q": None}, "P or q is null"),
         ({"b": [3.0]}, r"QP.A has shape \(0, 1\), expected \(1, 1\)"),
@@ -137,7 +137,7 @@ def test_what_is_no_problem_is_refused_in_one_line(path, changes, message):
 def test_a_set_of_several_problems_is_no_problem(path, rows):
     one = pa.table(columns())
     pq.write_table(pa.concat_tables([one] * rows) if rows else one.slice(0, 0), path)
-    with pytest.raises(InputError, match=f"holds {rows} problems; expected one row"):
+    with pytest.raises(InputError, match=f"contains {rows} problems; expected one row"):
         load_parquet(path)
 
 

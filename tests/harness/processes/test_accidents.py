@@ -50,13 +50,13 @@ ACCIDENTS = load_plugin(PLUGIN)
 TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
-FOREIGN = "came, expected 'timed'"
+FOREIGN = "was received, expected 'timed'"
 SUSPECT = "results are cached between measurements"
 PARENTS_TIME = "the parent's time is recorded"
 #: expected verdict and pattern of the message, by solver
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
-    "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
+    "writesendlessly": (Verdict.FAILED, "4 MiB were received without an end of line"),
     "daemon": (Verdict.VERIFIED, "^$"),
     "executeddaemon": (Verdict.VERIFIED, "^$"),
     "forkbomb": (Verdict.VERIFIED, "^$"),

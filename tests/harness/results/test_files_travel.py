@@ -191,7 +191,7 @@ def test_a_file_that_is_nowhere_is_named_with_its_digest(here, copy, cli):
         assert code == 2
         assert (
             f"qp.npz (sha256 {right}) is not available and has no copy in "
-            "run/files: put it at qps/qp.npz"
+            "run/files; put it at qps/qp.npz"
         ) in last
 
 
@@ -229,13 +229,14 @@ def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch
 
     assert [p.name for p in (tmp_path / "run" / "files").iterdir()] == ["copies.json"]
     assert said == [
-        "large.npz (70 MiB) is larger than 64 MiB, and does not travel with the results"
+        "large.npz (70 MiB) is larger than 64 MiB, "
+        "and is not copied to the result folder"
     ]
     with pytest.raises(InputError) as refused:
         Copies(tmp_path / "run").locate(source)
     assert str(refused.value) == (
         f"large.npz (sha256 {source.sha256}) is not available and was too large to "
-        "travel with the results (70 MiB): put it at large.npz"
+        "be copied with the results (70 MiB); put it at large.npz"
     )
 
 
@@ -255,7 +256,7 @@ def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
     kept = {p.name for p in (tmp_path / "run" / "files").glob("*.mat")}
     assert kept == {f"{s.sha256}.mat" for s in sources[:2]}
     assert len(said) == 2
-    assert said[0].startswith("2.mat (1 MiB) does not travel with the results")
+    assert said[0].startswith("2.mat (1 MiB) is not copied to the result folder")
 
 
 def test_merged_folders_have_one_copy_of_a_file_at_two_paths(

@@ -502,7 +502,7 @@ def test_another_environment_is_stored_and_warned_of_once(meet):
     assert len(said) == 1
     cpu = capture()["machine"]["cpu"]
     assert said[0].startswith(
-        "node07 measures under other conditions than this machine "
+        "node07 measures under different conditions from this machine "
         f"(processor: {cpu} here, Another there); "
     )
 
@@ -521,5 +521,5 @@ def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
     ],
 )
 def test_a_node_with_other_code_is_refused(meet, change):
-    with pytest.raises(InputError, match="node07 runs other code"):
+    with pytest.raises(InputError, match="node07 runs different code"):
         meet(change)

@@ -141,7 +141,7 @@ def assert_told(run):
     code, said = end_of(run)
     assert code in (0, 2), (code, said)
     if code == 2:
-        assert said.endswith("free some space, and the same command continues")
+        assert said.endswith("free some space; the same command continues the run")
 
 
 def disturb(suite, out, events, rng, longest):

@@ -158,7 +158,7 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: solvers that exhaust the time limit and are tested by default
+#: solvers that exhaust the time limit; only the slow test includes them
 WAITED_FOR = {"printsendlessly"}
 
 
@@ -502,7 +502,7 @@ def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
     [
         ("build", "ZeroDivisionError: no stiffness"),
         ("input", "tiny: fault=input is out of range"),
-        ("memory", "it needs more memory than there is"),
+        ("memory", "it needs more memory than is available"),
         ("exit", "SystemExit: 3"),
     ],
 )
@@ -555,7 +555,7 @@ def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path)
     (tmp_path / "references").mkdir()
 
     other = suite("zero", text='name = "other"\n')
-    with pytest.raises(InputError, match=r"holds another suite .* --fresh"):
+    with pytest.raises(InputError, match=r"contains another suite .* --fresh"):
         measure(other)
     with pytest.raises(InputError, match=r"another environment \(here, now there\)"):
         measure(suite("honest"), digest="there")
@@ -752,7 +752,7 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
             said.add(str(e).partition("; ")[2])
         assert not [*tmp_path.rglob("*.tmp")]
 
-    assert said == {"free some space, and the same command continues"}
+    assert said == {"free some space; the same command continues the run"}
     records = once_each(tmp_path, 2)
     assert {r.verdict for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
     assert writes > 6  # suite and environment need four writes

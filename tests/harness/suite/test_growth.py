@@ -50,7 +50,7 @@ def test_a_stopping_rule_may_become_stricter_and_not_laxer():
     ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
 
     assert incompatibility(ruled, ruled | {"precision": 0.05}) == ""
-    said = "precision was 0.1, now 0.2; it may only become finer"
+    said = "precision was 0.1, now 0.2; it may only be reduced"
     assert incompatibility(ruled, ruled | {"precision": 0.2}) == said
     assert incompatibility(ruled, SUITE).startswith("precision was 0.1, now not set")
     assert (

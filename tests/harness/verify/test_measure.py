@@ -383,8 +383,8 @@ def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
     [
         (-1, "-1"),
         (2**53 + 1, "9007199254740993"),
-        (10**300, "a number far out of range"),
-        (-(10**300), "a number far out of range"),
+        (10**300, "a number far outside this range"),
+        (-(10**300), "a number far outside this range"),
     ],
 )
 def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, shown):
