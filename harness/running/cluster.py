@@ -185,7 +185,7 @@ class Nodes:
 
 @dataclass(eq=False, kw_only=True)
 class _ActiveBlock:
-    """Block in progress; at any time, one of its turns is a Dask task."""
+    """Block in progress; at any time, exactly one of its turns is a Dask task."""
 
     block: WorkUnit
     turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet

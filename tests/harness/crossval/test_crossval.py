@@ -680,7 +680,7 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
 
 
 def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path):
-    """With u″ = 2 on a length of 1, ‖u − u_h‖² = h²/3, apart from the norm of û."""
+    """For u″ = 2 on a length of 1, ‖u − u_h‖² = h²/3; errors are relative to ‖û‖."""
     text = "obstacle/dim=1/n=12/primal"
     case = built(text)
     folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])

@@ -331,7 +331,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
 
 
 def test_work_of_friction_has_its_own_part():
-    """The missing work of a zero force on a slipping row is part of the bound."""
+    """A zero force on a slipping row has missing work, which the bound includes."""
     problem = known("beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7")
     mechanics, s = problem.mechanics, problem.solution()
     slip = mechanics.friction.T @ s.x - mechanics.friction.start
