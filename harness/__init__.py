@@ -1,7 +1,7 @@
 """Interfaces between problems, solvers and reports; measurement and verification.
 
-Each exported name is imported at its first access, so that commands that only list
-cases and solvers do not load NumPy and SciPy. `__init__.pyi` lists the exported names.
+Each exported name is imported at its first access. Commands that only list cases and
+solvers therefore do not load NumPy and SciPy. `__init__.pyi` lists the exported names.
 """
 
 from lazy_loader import attach_stub

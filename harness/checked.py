@@ -1,7 +1,7 @@
 """Checks of plain data from users: entries of files, and arguments of functions.
 
-A check that fails raises `InputError`. In all functions, `where` is the name of the
-value in the message, such as the key of a file.
+A failed check raises `InputError`. In all functions, `where` is the name of the value
+in the error message, such as a key of a file.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
-    """Check that `value` is an int (no float or bool) from 1 to `most`; return it."""
+    """Check that `value` is an int from 1 to `most`, and not a bool; return it."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
     if value > most:
@@ -53,7 +53,7 @@ def positive(where: str, value: Any) -> float:
 
 
 def is_number(value: object) -> bool:
-    """Return True if `value` is an int or a float; a bool does not count."""
+    """Return True if `value` is an int or a float, but not a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -113,7 +113,8 @@ def path(where: str, value: object) -> Path:
         os.stat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError) as e:  # ValueError for NUL and lone surrogates
+    # a ValueError is caused by NUL or lone surrogates
+    except (OSError, ValueError) as e:
         why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
     return Path(text)

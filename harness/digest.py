@@ -35,6 +35,6 @@ def running_digest(parts: Iterable[bytes]) -> Digest:
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:
-    """Yield the unread rest of an open file in pieces of at most 1 MiB."""
+    """Yield the unread content of an open file in pieces of at most 1 MiB."""
     while piece := file.read(_PIECE_BYTES):
         yield piece

@@ -10,7 +10,7 @@ from contextlib import suppress
 from difflib import get_close_matches
 
 MAX_SHOWN = 200  #: number of characters of the user's input that a message repeats
-_MAX_MESSAGE = 600  #: largest number of characters of a message, not counting paths
+_MAX_MESSAGE = 600  #: largest number of characters of a message, excluding paths
 #: A quotation or a word. Possessive quantifiers avoid backtracking, whose time could
 #: grow without bound for malicious input.
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
@@ -19,8 +19,9 @@ _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 class InputError(Exception):
     """Error for invalid input.
 
-    The message is one line: the place of the error, the value, and what is expected.
-    The command line prints this line without a traceback and exits with code 2.
+    The message is one line that states the place of the error, the value, and the
+    expected value. The command line prints this line without a traceback and exits with
+    code 2.
     """
 
     def __str__(self) -> str:
@@ -30,20 +31,20 @@ class InputError(Exception):
 class PastEndError(InputError):
     """Error for a step after the end of a sequence, e.g. after convergence.
 
-    If a suite asks for more steps than exist, its sequence ends at the last step.
+    If a suite requests more steps than exist, its sequence ends at the last step.
     """
 
 
 class FaultError(Exception):
     """Error of the harness or the machine, such as a full disk, but not of a solver.
 
-    The message is one line. A fault yields no verdict: the measurement is repeated
-    once, and counts as not measured if the repetition fails as well.
+    The message is one line. A fault yields no verdict. The measurement is repeated
+    once, and it counts as not measured if the repetition also fails.
     """
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for a message, with the middle of a long one cut."""
+    """Return the repr of a value for a message, without the middle of a long repr."""
     try:
         return shortened(repr(value))
     except (
@@ -54,7 +55,7 @@ def shown(value: object) -> str:
 
 
 def shortened(text: str, most: int = MAX_SHOWN) -> str:
-    """Replace the middle of a long text by …, since names tend to differ at the ends.
+    """Replace the middle of a long text by …; names usually differ at their ends.
 
     >>> from mortarbench.harness.errors import shortened
     >>> shortened("beam-ring/Nr=30/Nh=15/dual", 16)
@@ -67,8 +68,8 @@ def shortened(text: str, most: int = MAX_SHOWN) -> str:
 def one_line(message: str) -> str:
     """Return a message as a single line of limited length.
 
-    First, long words and quotations are shortened, then the whole line if it is still
-    too long. Paths that exist are not shortened, since users copy them.
+    Long words and quotations are shortened first. If the line is still too long, the
+    whole line is shortened. Existing paths are not shortened, since users copy them.
     """
     line = " ".join(message.splitlines())
     if len(line) <= MAX_SHOWN:
@@ -95,9 +96,9 @@ def unknown(
 ) -> InputError:
     """Return the error for an unknown name; the message lists the known names.
 
-    A similar known name is suggested, if there is one.
+    The message suggests the most similar known name, if any name is similar.
 
-    what : kind of the name, such as "solver"
+    what : type of the named object, such as "solver"
     more : text appended to the list of known names
 
     >>> from mortarbench.harness.errors import unknown
@@ -106,7 +107,8 @@ def unknown(
     """
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
-    got = shortened(got)  # the search below takes O(length²)
+    # the time of the search for similar names is quadratic in the length
+    got = shortened(got)
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
@@ -115,7 +117,7 @@ def unknown(
 
 
 def some(names: Iterable[str], most: int = 3) -> str:
-    """Return the first `most` names as text, followed by the number of the others.
+    """Return the first `most` names as text, followed by the number of further names.
 
     >>> from mortarbench.harness.errors import some
     >>> some(["a", "b", "c", "d", "e"])
@@ -126,6 +128,6 @@ def some(names: Iterable[str], most: int = 3) -> str:
 
 
 def say(text: str) -> None:
-    """Print a remark on stderr, so that stdout carries results only."""
+    """Print a remark on stderr, since stdout is reserved for results."""
     with suppress(BrokenPipeError):  # a closed stderr must not end the program
         print(f"mortarbench: {text}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""Limits on threads, and on memory for solvers and for building cases."""
+"""Limits on the threads and the memory of solvers, and on the memory for cases."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def memory_limit_mib() -> float:
 
 
 def case_limit_mib() -> float:
-    """Return the memory limit for building a case in MiB; default: physical memory.
+    """Return the memory limit for building a case, in MiB.
 
     Raises
     ------
     InputError
-        If the environment variable is set, but is not a positive number.
+        If the environment variable is set to a value that is not a positive number.
 
     """
     text = os.environ.get(CASE_VARIABLE)

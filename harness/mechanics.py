@@ -1,7 +1,7 @@
-"""The elastic contact problem from which a QP is derived, for error certificates.
+"""Elastic contact problems from which QPs are derived, for error certificates.
 
 If a family attaches its `Mechanics` to a case (`harness.plugin.Case`), the error of
-every answer is bounded in the energy norm, whichever form the QP has; see
+every answer is bounded in the energy norm, for every form of the QP; see
 `harness.verify.certificate`.
 """
 
@@ -35,18 +35,18 @@ from mortarbench.harness.solution import Solution
 #: as small as the rounding errors of double precision still has correct digits.
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
-#: Largest change of the gaps by a rigid motion, and largest work of the loads on it,
-#: that count as rounding (of coordinates, normals and tractions). Both are relative to
-#: the sum of the absolute values of their terms.
+#: Largest change of the gaps by a rigid motion, and largest work of the loads along a
+#: rigid motion, that count as rounding (of coordinates, normals and tractions). Each
+#: value is relative to the sum of the absolute values of its terms.
 MOTION_ROUNDING = 1e-10
 
 
 class Inverse(Protocol):
     """A symmetric generalised inverse K⁺ of the stiffness K (n, n).
 
-    K⁺ is zero on prescribed components, and the inverse of K on the others. If the
-    supports allow rigid motions, which form the columns of R, then K K⁺ b = b for all b
-    with Rᵀb = 0.
+    K⁺ is zero on prescribed components, and the inverse of K on all other components.
+    If the supports allow rigid motions, which form the columns of R, then K K⁺ b = b
+    for all b with Rᵀb = 0.
     """
 
     @property
@@ -105,18 +105,18 @@ class Friction:
         energy of friction:  Σ gᵢ‖Tᵢu − sᵢ‖,   multipliers:  ‖λᵢ‖ ≤ gᵢ
 
     T u is the tangential displacement of the slave side relative to the master side.
-    The slip is measured from s: s = 0 for a single static load, and T u of the previous
-    load step for slip increments. A contact row i with friction has d consecutive rows
-    Tᵢ of equal bound, one for each tangential direction: d = 1 in the plane, d = 2 in
-    space. A problem without friction has zero rows.
+    The slip is measured from s. For a single static load, s = 0; for slip increments, s
+    is T u of the previous load step. A contact row i with friction has d consecutive
+    rows Tᵢ of equal bound, one for each tangential direction, where d = 1 in the plane
+    and d = 2 in space. A problem without friction has zero rows.
 
     The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
-    the contact row. mu = 0 for Tresca's law, and cohesion = 0 for Coulomb's law.
+    the contact row. Tresca's law has mu = 0, and Coulomb's law has cohesion = 0.
     """
 
-    T: csr_array  #: (k, n) tangential rows, d consecutive ones per contact row
+    T: csr_array  #: (k, n) tangential rows, d consecutive rows per contact row
     bound: Vector  #: (k,) g ≥ 0, a force
-    start: Vector  #: (k,) s, the T u from which slip is measured, a length
+    start: Vector  #: (k,) s, the value of T u from which slip is measured, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
     mu: Vector  #: (k,) coefficient of friction
@@ -154,9 +154,9 @@ class Friction:
         return np.asarray(self.cohesion + self.mu * np.maximum(normal[self.row], 0.0))
 
     def residual(self, normal: Vector) -> float:
-        """Return the relative distance of the bound g from the one the law requires.
+        """Return the relative distance of the bound g from the required bound.
 
-        The distance is ‖g − demanded‖₂/‖g‖₂, or the numerator alone if g = 0.
+        The distance is ‖g − demanded‖₂/‖g‖₂, or ‖demanded‖₂ if g = 0.
 
         normal : (m,) multipliers λ_n of the contact rows
         """
@@ -224,8 +224,9 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
 
-    The unknown is (u, t) or (u, t, w). If no row has g > 0, `primal` itself is
-    returned. `friction_multipliers` returns the multipliers of the friction rows.
+    The unknown is (u, t) in the plane and (u, t, w) in space. If no row has g > 0,
+    `primal` is returned unchanged. `friction_multipliers` returns the multipliers of
+    the friction rows.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
@@ -271,8 +272,8 @@ def friction_multipliers(
     s : solution of the QP returned by `with_friction`
 
     The multipliers λ_t (k,) of friction rows are zero where g = 0. In the plane, the
-    other entries are differences of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s; in
-    space, they are the multipliers of Tu − w = s.
+    nonzero entries are differences of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s.
+    In space, they are the multipliers of Tu − w = s.
     """
     e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
     tangential = np.zeros(acts.size)
@@ -298,7 +299,7 @@ class AdmissibleForces:
 
     @property
     def sets(self) -> tuple[ConvexSet, ...]:
-        """The set Λ as a box and discs, the form in which a QP takes it."""
+        """The set Λ as a box and discs, as in the attribute `sets` of a QP."""
         upper = np.full(self.rows, np.inf)
         return Box(np.where(self.contact, 0.0, -upper), upper), self.discs
 
@@ -311,8 +312,8 @@ class AdmissibleForces:
         """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
         The norm of a projected multiplier equals g only up to rounding in extended
-        precision, about 1e-19. Counted as work, this error would dominate certificates,
-        which contain its square root.
+        precision, about 1e-19. If this error counted as work, it would dominate
+        certificates, which contain its square root.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -329,7 +330,7 @@ class AdmissibleForces:
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return lower and upper bounds (m,) of each λᵢ, with all others held fixed."""
+        """Return lower and upper bounds (m,) of each λᵢ for fixed other multipliers."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -340,12 +341,12 @@ class AdmissibleForces:
 
 
 class Exact(NamedTuple):
-    """The data of the contact problem except K, in extended precision.
+    """Data of the contact problem except K, in extended precision.
 
     Contact rows precede friction rows. Λ is the set of admissible multipliers. At a
-    solution, v = Bu − c is normal to Λ at λ: λ ∈ Λ and λᵀv = σ(v). Here, σ is the
-    support function of Λ: σ(v) is Σ gᵢ‖vᵢ‖, summed over friction vectors, if v ≤ 0 on
-    all contact rows, and infinite otherwise.
+    solution, v = Bu − c is normal to Λ at λ, that is, λ ∈ Λ and λᵀv = σ(v), where σ is
+    the support function of Λ. If v ≤ 0 on all contact rows, σ(v) is the sum Σ gᵢ‖vᵢ‖
+    over friction vectors; otherwise, σ(v) is infinite.
     """
 
     f: Extended  #: (n,) load
@@ -374,8 +375,9 @@ class Exact(NamedTuple):
     ) -> tuple[Extended, Extended]:
         """Return the nonnegative terms of σ(v) − λᵀv, which vanishes at a solution.
 
-        The first array contains the terms of contact rows, −λᵢvᵢ, the second those of
-        friction vectors. The latter, g‖v‖ − λᵀv, are evaluated without cancellation as
+        The first array contains the terms −λᵢvᵢ of contact rows. The second array
+        contains the terms g‖v‖ − λᵀv of friction vectors, which are evaluated without
+        cancellation as
 
             (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
         """
@@ -392,19 +394,19 @@ class Exact(NamedTuple):
 
 
 class RigidMotions(NamedTuple):
-    """Rigid motions that the supports allow, split into constrained and free ones.
+    """Rigid motions that the supports allow, split into constrained and free motions.
 
-    Constrained motions change contact gaps or slip; free ones do not. Columns are
+    Constrained motions change contact gaps or slip; free motions do not. Columns are
     orthonormal in extended precision. K·constrained is zero except for rounding errors,
-    which matter if bodies move far; see `harness.verify.certificate`.
+    which are relevant if bodies move far; see `harness.verify.certificate`.
     """
 
     constrained: Any  #: (n, p) sparse; motions that change gaps or slip
-    free: Any  #: (n, q) sparse; motions that change gaps and slip by rounding only
+    free: Any  #: (n, q) sparse; motions that change gaps and slip only by rounding
     G: Extended  #: (m, p)  B·constrained
-    largest: (
-        Any  #: (n, p) `constrained`; each nonzero becomes the largest of its column
-    )
+    #: (n, p) `constrained` with each nonzero replaced by the largest absolute value of
+    #: its column
+    largest: Any
     KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
 
 
@@ -420,7 +422,7 @@ KINDS = {
 }
 
 
-#: Corners of each facet, for each kind of cell. In the plane, the cell is on the left
+#: Corners of each facet, for each type of cell. In the plane, the cell is on the left
 #: of the edge. In space, the corners are in anticlockwise order when seen from outside,
 #: and a triangle repeats its last corner.
 FACETS = {
@@ -437,15 +439,15 @@ FACETS = {
 
 
 class CellBlock(NamedTuple):
-    """The cells of one kind in a table of cells."""
+    """The cells of one type in a table of cells."""
 
-    kind: str  #: name of the kind in meshio
+    kind: str  #: name of the cell type in meshio
     nodes: NDArray[np.int64]  #: (k, corners) node numbers
     cells: NDArray[np.int64]  #: (k,) rows of these cells in the table
 
 
 def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
-    """Split a table of cells (E, c) by kind; kinds with few corners come first.
+    """Split a table of cells (E, c) by type; types with few corners come first.
 
     In a mixed table, a cell with fewer than c corners repeats some of its corners: a
     triangle among quadrilaterals is (a, b, c, c), a wedge among hexahedra is (a, b, c,
@@ -476,8 +478,8 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
     """Return the node numbers (k, m) of the facets that belong to a single cell.
 
-    Facets are oriented as in `FACETS`. In the plane, they are edges, sorted by the
-    lower, then by the higher node number.
+    Facets are oriented as in `FACETS`. In the plane, facets are edges, which are sorted
+    by the lower, then by the higher node number.
     """
     facets, names, _ = cell_facets(cells, dim)
     key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
@@ -492,13 +494,14 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
 
     The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
     cells have the same key for their common facet. Degenerate facets between repeated
-    corners are left out. In space, a triangle repeats its last corner.
+    corners are omitted. In space, a triangle repeats its last corner.
     """
     facet = np.array(FACETS[KINDS[dim, cells.shape[1]]])
     facets = cells[:, facet].reshape(-1, facet.shape[1])
     cell = np.repeat(np.arange(len(cells)), len(facet))
     names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # placed last by the sort below
+    # the next sort places these numbers last
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last
     names = np.sort(names, axis=1)[:, :dim]
     is_facet = names[:, -1] < last
     facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
@@ -529,7 +532,7 @@ class Mechanics:
 
         min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
 
-    With `friction`, its energy is added to the objective.
+    With `friction`, the energy of friction is added to the objective.
     """
 
     #: P = K, q = −f, G = B, h = c, b = 0; each row of A has a single entry 1, at a
@@ -544,9 +547,8 @@ class Mechanics:
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
     #: equilibrium
     rigid: NDArray[np.float64]
-    names: tuple[
-        str, ...
-    ] = ()  #: names of the bodies, in the order of the columns of `rigid`
+    #: names of the bodies, in the order of the columns of `rigid`
+    names: tuple[str, ...] = ()
     scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
     #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`
@@ -558,12 +560,12 @@ class Mechanics:
 
     @cached_property
     def rows(self) -> csr_array:
-        """Rows B (m, n) of contact, followed by those of friction with g > 0."""
+        """Rows B (m, n) of contact, followed by rows of friction with g > 0."""
         return contact_rows(self.primal, self._active_friction)[0]
 
     @cached_property
     def program(self) -> QP:
-        """The problem as a QP, see `with_friction`; `primal` if it is frictionless."""
+        """The problem as a QP, see `with_friction`; `primal` if frictionless."""
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:
@@ -607,7 +609,7 @@ class Mechanics:
 
     @cached_property
     def whole(self) -> Mechanics:
-        """The same problem, certified with the assembled K instead of by subdomains."""
+        """The same problem, with certificates from the assembled K."""
         return (
             self
             if self.certify_by_subdomains is None
@@ -659,7 +661,7 @@ class Mechanics:
         return self.without_rigid_motion(u.astype(Real))
 
     def norm(self, v: Extended) -> float:
-        """Return the energy norm ‖v‖_K, a seminorm if bodies can move rigidly.
+        """Return the energy norm ‖v‖_K, which is a seminorm if bodies can move rigidly.
 
         The rigid part of v is subtracted first. KR = 0 holds only up to rounding
         errors, which would dominate if the rigid part is much larger than the
@@ -672,7 +674,8 @@ class Mechanics:
 def _orthonormal(R: NDArray[np.float64]) -> Any:
     """Orthonormalise the columns of R (n, r) in extended precision, as a sparse matrix.
 
-    R is orthonormal to double precision; the step R + R(I − RᵀR)/2 squares this error.
+    On entry, R is orthonormal to double precision. The step R + R(I − RᵀR)/2 squares
+    the error of RᵀR = I.
     """
     Q = csr_array(R.astype(Real))
     return csr_array(Q + Q @ (0.5 * (eye_array(R.shape[1]) - Q.T @ Q)))
@@ -691,9 +694,9 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
     """Return KR (n, r) with about twice the digits of doubles, despite cancellation.
 
     K and R are split into leading parts and remainders. The leading part of K has 26
-    bits relative to the largest entry of the row; that of R has 24 bits relative to the
-    largest entry of R. In extended precision (64 bits), products of leading parts are
-    exact, and so is the sum of these products over a row of K.
+    bits relative to the largest entry of the row, and the leading part of R has 24 bits
+    relative to the largest entry of R. In extended precision (64 bits), products of
+    leading parts and the sum of these products over a row of K are exact.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))
@@ -705,7 +708,7 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
 
 
 def _leading(v: Any, size: Any, bits: int) -> Any:
-    """Round v to multiples of 2^−bits·`size`, with size rounded up to a power of 2."""
+    """Round v to multiples of 2^−bits·s; s is `size`, rounded up to a power of 2."""
     unit = np.exp2(np.ceil(np.log2(np.where(size > 0, size, 1))) - bits)
     return np.round(v / unit) * unit
 

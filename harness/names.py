@@ -1,11 +1,12 @@
 """Case names ``FAMILY/key=value/…/FORM``: strict parsing, and canonical names.
 
-The family's method ``complete`` adds missing keys. The default of a key may depend on
-other keys: a default number of layers may depend on the number of cells.
+The method ``complete`` of a family adds missing keys. The default of a key may depend
+on other keys; for instance, a default number of layers may depend on the number of
+cells.
 
 A family that reads problems from files has the key ``path``, and its attribute
-``path_suffix`` is the suffix of these files. A case is named
-``FAMILY:PATH/key=value/…/FORM``. Since PATH may contain slashes, it ends at the first
+``path_suffix`` is the suffix of these files. The name of such a case is
+``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes; it ends at the first
 component with the suffix. If ``path_suffix`` is empty, PATH is the rest of the name,
 ``FAMILY:PATH``, and the family has a single form.
 """
@@ -28,7 +29,7 @@ from mortarbench.harness.plugin import Case, Family, Reference, Value
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _FILE = re.compile(r"[^=:]*\.[A-Za-z]\w*(/|$)")  #: a path that ends in a suffix
-_INTEGER_LIMIT = 2**63  #: least integer that exceeds 64 bits
+_INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bits
 _TYPE_NAMES = {
     int: "an integer, such as 4",
     float: "a finite number, such as 0.5",
@@ -49,7 +50,7 @@ class CaseId:
         return self.name
 
     def build(self, reference: Reference) -> Case:
-        """Build the case, with anything that the family prints redirected to stderr.
+        """Build the case; output that the family prints is redirected to stderr.
 
         Exceptions of the family are not caught.
 
@@ -143,7 +144,7 @@ def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
 def assemble(
     family: Family, given: Mapping[str, object], form: str, *, texts: bool = False
 ) -> CaseId:
-    """Return the case of a family with the keys `given` and a form, after checks.
+    """Check the keys `given` and the form, and return the case of a family.
 
     texts : True to convert the text of a value to a number if the default of its key
         is a number
@@ -195,7 +196,7 @@ def unbuilt(name: object, e: BaseException) -> str:
         case InputError():
             why = str(e)
         case MemoryError():
-            why = "it needs more memory than there is"
+            why = "it needs more memory than is available"
         case _:
             why = f"{type(e).__name__}: {e}"
     return " ".join(f"{name} could not be built: {why}".split())
@@ -214,7 +215,7 @@ def is_shared(name: CaseId) -> bool:
 
 
 def match(pattern: str, names: Iterable[str]) -> list[str]:
-    """Return those of the canonical `names` that match a shell glob.
+    """Return the canonical `names` that match a shell glob.
 
     >>> from mortarbench.harness.names import match
     >>> match("*/dual", ["beam-ring/dual", "beam-ring/primal"])
@@ -237,7 +238,7 @@ def _path_key(family: Family) -> str:
 def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]:
     """Split the text after ``FAMILY:`` into the path and the other components.
 
-    The form may be missing if the family has a single form; it is then added.
+    If the family has a single form and the form is missing, the form is added.
     """
     head = family.name
     path = text[len(head) + 1 :]
@@ -260,7 +261,7 @@ def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]
 def _number(text: str, kind: type) -> object:
     """Convert a text to a finite number; return any other text unchanged."""
     if not (_INTEGER if kind is int else _REAL).fullmatch(text):
-        return text  # int and float would accept 1_0 and digits of other scripts
+        return text  # int and float would also accept 1_0 and digits of other scripts
     try:
         number = kind(text)
         return number if math.isfinite(number) else text
@@ -272,7 +273,7 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
     """Check the type of a value, and return it; an integer may become a float.
 
     kind : type of the default of the key
-    free : True to allow the characters / and =, which separate components of a name
+    free : True to allow the characters / and =, which are separators in a name
     """
     match value:
         case str() if kind is str and value and (free or not set("/=") & set(value)):

@@ -2,10 +2,10 @@
 
 P is the matrix of a QP. A matrix-free P cannot be written to a file, but the arrays
 from which it is built can. Workers receive these arrays and build the operator while
-the clock runs: work before the first product, such as a factorisation, counts as
-preparation of the solver.
+the clock runs. Work before the first product, such as a factorisation, therefore counts
+as preparation of the solver.
 
-The function that builds P, its *maker*, is looked up by name in a table: the
+The function that builds P, called its *maker*, is looked up by name in a table, the
 ``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
 and therefore cannot cause the import of a module.
 """
@@ -59,8 +59,8 @@ class Preconditioned(Protocol):
 class WithDiagonal(Protocol):
     """A product x ↦ Px with a method that returns the diagonal of P.
 
-    A maker may return such a product. Pᵢᵢ scales the residual of component i; without
-    the diagonal, the scale is smaller, and the verdict stricter than for a matrix
+    A maker may return such a product. Pᵢᵢ scales the residual of component i. Without
+    the diagonal, the scale is smaller, and the verdict is stricter than for a matrix
     (`harness.verify.kkt`).
     """
 
@@ -85,8 +85,8 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
     maker : name of the function in `makers` that builds the map x ↦ Px
     arrays : plain arrays by name, the argument of the maker
-    makers : functions by name; a worker loads the same plug-ins, and so has the same
-        table
+    makers : functions by name; workers have the same table, since they load the same
+        plug-ins
 
     Raises
     ------
@@ -122,19 +122,19 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         self._product: Product | None = None
 
     def build(self) -> Product:
-        """Return the product x ↦ Px, which the first call builds."""
+        """Return the product x ↦ Px; the first call builds it."""
         if self._product is None:
             self._product = self._make(self.arrays)
         return self._product
 
     def diagonal(self) -> NDArray[np.float64] | None:
-        """Return the diagonal of P (n,), or None if x ↦ Px has no such method."""
+        """Return the diagonal of P (n,), or None if x ↦ Px does not provide it."""
         product = self.build()
         return product.diagonal() if hasattr(product, "diagonal") else None
 
     @property
     def least_eigenvalue(self) -> float | None:
-        """Proven lower bound on the eigenvalues of P, or None if the product has none.
+        """Proven lower bound on the eigenvalues of P, or None if it is unavailable.
 
         A positive bound yields an error bound for any answer over convex sets
         (`harness.verify.certificate.certify_by_eigenvalue`).
@@ -142,7 +142,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return getattr(self.build(), "least_eigenvalue", None)
 
     def forget(self) -> None:
-        """Discard the product: the next solver builds it again while the clock runs."""
+        """Discard the product: the next solver builds it while the clock runs."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -155,8 +155,8 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return self
 
 
-# The next functions test for an attribute, since `isinstance` with a protocol takes
-# longer than several products with a small operator.
+# The following functions test for an attribute, since `isinstance` with a protocol
+# takes longer than several products with a small operator.
 
 
 def preconditioned(P: Any) -> Preconditioned | None:
@@ -177,6 +177,6 @@ def assembled(P: LinearOperator) -> NDArray[np.float64]:
     The symmetric part of the product is returned.
     """
     M = np.asarray(P @ np.eye(P.shape[0]))
-    M += M.T.copy()  # rounding errors of products make P·I slightly asymmetric
+    M += M.T.copy()  # products have rounding errors, so P·I may be slightly asymmetric
     M /= 2
     return M

@@ -39,8 +39,8 @@ class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options.
 
     The class attribute ``accepts``, a tuple of classes of `harness.sets`, declares the
-    convex sets that the solver supports. A solver without this attribute accepts bounds
-    only, as with ``(Box,)``. QPs with other sets are declined without a call of
+    convex sets that the solver supports. A solver without this attribute accepts only
+    bounds, as with ``(Box,)``. QPs with other sets are declined without a call of
     `declines`.
 
     Examples
@@ -76,7 +76,7 @@ class Solver(Protocol):
     """
 
     def declines(self, qp: QP) -> str | None:
-        """Return the reason why this solver does not accept `qp`; None if it does."""
+        """Return the reason to decline `qp`, or None if the solver accepts `qp`."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Convert and factorise the data of `qp`, and return a function that solves it.
@@ -98,7 +98,7 @@ class Chained(Solver, Protocol):
         The returned function is called for each QP in the order of the sequence. A call
         may reuse results of earlier calls (points, multipliers, factors, norms). The
         solver must check that these results still apply, since the QPs of a sequence
-        may differ in every coefficient. Nothing may be shared between two sequences.
+        may differ in every coefficient. Two sequences must not share any data.
         """
 
 
@@ -117,19 +117,19 @@ class Tightening(Chained, Protocol):
 class About:
     """Description of a solver, for lists and reports.
 
-    A solver may have an `About` as its attribute ``about``. Each text is Markdown, of
-    one or two sentences. The docstring of the solver's class, rather than this
-    description, explains how the tolerance is translated.
+    A solver may have an `About` as its attribute ``about``. Each text is Markdown and
+    has one or two sentences. The docstring of the solver's class, rather than this
+    description, explains the translation of the tolerance.
     """
 
     title: str
     method: str  #: class of methods, e.g. "interior point"
     licence: str
     linear_solver: str  #: solver used for its linear systems
-    phases: str  #: which work is timed as preparation, and which as solution
-    package: str = (
-        ""  #: package to install; its module has the same name unless `module` is set
-    )
+    #: work that is timed as preparation, and work that is timed as solution
+    phases: str
+    #: package to install; its module has the same name unless `module` is set
+    package: str = ""
     module: str = ""  #: name of the module, if it differs from that of the package
     sequence: str = ""  #: work reused from one QP to the next; empty if none is reused
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
@@ -143,8 +143,8 @@ class About:
         return f"not installed: {module} (pip install {self.package})"
 
 
-#: State of a node that has no contact pressure, but whose shear has reached the bound
-#: of Tresca's law, which does not depend on the pressure.
+#: State of a node without contact pressure whose shear has reached the bound of
+#: Tresca's law. This bound does not depend on the pressure.
 SLIDING = "sliding without contact"
 
 
@@ -174,12 +174,12 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Return the mask (s,) of the nodes in contact.
 
-        With friction, a node is in contact if it sticks or slips; a force is not a
+        With friction, a node is in contact if it sticks or slips. A force is not a
         sufficient criterion, since under Tresca's law forces also act without contact.
         Without friction, a node is in contact if its `push`, or the norm of its force
-        if `push` is None, exceeds `least` (N/m). The norm of the force is the worse
-        criterion: on a curved side, a mortar row also causes tangential forces at nodes
-        adjacent to its own.
+        if `push` is None, exceeds `least` (N/m). The norm of the force is a less
+        accurate criterion, because on a curved side a mortar row also causes tangential
+        forces at adjacent nodes.
         """
         mask: NDArray[Any]
         if self.friction is not None:
@@ -204,7 +204,8 @@ class Fields:
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     #: (c, dim) force on each slave node: N/m in the plane, N in space
     contact_forces: NDArray[Any] | None = None
-    contacts: tuple[ContactSide, ...] = ()  #: one for each pair of bodies
+    #: contact sides, one for each pair of bodies
+    contacts: tuple[ContactSide, ...] = ()
     #: (E,) subdomain of each cell, from 0; None for undivided bodies
     subdomains: NDArray[Any] | None = None
 
@@ -215,7 +216,7 @@ class Fields:
 
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
-        """Cells grouped by kind, under the names that meshio uses."""
+        """Cells grouped by type, with the type names of meshio."""
         from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
 
         return cell_blocks(self.cells, self.dim)
@@ -226,16 +227,14 @@ class Case:
     """A QP, and the maps from its solution to physical results.
 
     The potential energy of the physical problem is scale·objective + constant, where
-    `objective` is that of the QP.
+    `objective` is the objective of the QP.
     """
 
     qp: QP
-    recover: Callable[
-        [Solution], Vector
-    ]  #: maps a solution of the QP to the physical unknown u, SI
-    quantities: Callable[
-        [Solution], Mapping[str, Any]
-    ]  #: maps a solution of the QP to physical results, SI
+    #: maps a solution of the QP to the physical unknown u, SI
+    recover: Callable[[Solution], Vector]
+    #: maps a solution of the QP to physical results, SI
+    quantities: Callable[[Solution], Mapping[str, Any]]
     #: maps a solution of the QP to the deformed state, for plots
     fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0
@@ -246,8 +245,8 @@ class Case:
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
     remarks: tuple[str, ...] = ()  #: warnings about the input, one line each
     #: relative residual of the fixed-point iteration to which the QP belongs, such as
-    #: that of Coulomb's law. An accurate solution of this QP does not reduce it. 0 if
-    #: there is no iteration
+    #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
+    #: the residual. 0 if there is no iteration
     unsettled: float = 0.0
 
 
@@ -257,7 +256,7 @@ class SourceFile:
 
     path: str  #: path as given in the name of the case
     sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
-    #: suffix for the name of a copy, which depends on the file format, not on `path`
+    #: suffix for the name of a copy; it depends on the file format, not on `path`
     suffix: str
 
 
@@ -321,7 +320,7 @@ class Family(ABC):
         return ""
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the params for half the cell size, or None if there is no such mesh.
+        """Return the params for half the cell size, or None if unavailable.
 
         Estimates of the discretisation error need these params, and `Mechanics.grid` of
         both cases; see `harness.crossval.discretisation`.
@@ -329,7 +328,7 @@ class Family(ABC):
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the geometry that `refined` leaves unrefined; "" if there is none.
+        """Describe the geometry that `refined` does not refine; "" if all is refined.
 
         The text is appended to an estimate of the discretisation error, for instance
         "of the bodies as they are meshed".
@@ -337,7 +336,7 @@ class Family(ABC):
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file from which a case is read, or None if it is not from a file.
+        """Return the file from which a case is read, or None for other cases.
 
         The file is copied to the result folder.
         """
@@ -359,9 +358,9 @@ class Family(ABC):
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
         """Return a function that assembles the QP of `build` on MPI ranks, or None.
 
-        All ranks must call the returned function, which takes a reference solve for
-        distributed QPs. None means that a single process builds the QP. The method
-        itself builds nothing and does not need MPI.
+        All ranks must call the returned function, whose second argument is a reference
+        solver for distributed QPs. None means that a single process builds the QP. This
+        method does not build the QP and does not need MPI.
 
         params : values of all keys
         """
@@ -369,7 +368,7 @@ class Family(ABC):
 
 
 def as_family(offered: Any) -> Family:
-    """Return an object as a `Family`; wrap it unless its class inherits from `Family`.
+    """Return an object as a `Family`; wrap an object of any other class.
 
     offered : object with `name`, `defaults`, `forms` and `build`; the other members of
         `Family` are optional

@@ -1,4 +1,4 @@
-"""The convex quadratic program, which is the input of all solvers."""
+"""Convex quadratic programs, the input of all solvers."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from mortarbench.harness.sets.discs import Discs
 
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
-#: Largest absolute entry of P − Pᵀ that counts as rounding, relative to that of P.
+#: Largest absolute entry of P − Pᵀ that counts as rounding, relative to the largest
+#: absolute entry of P.
 SYMMETRY_TOLERANCE = 1e-12
 #: Largest number of rows of P for which convexity is checked by a Cholesky
 #: factorisation. The factorisation of a P of this size takes 0.25 s.
 _MAX_FACTORED_ROWS = 2000
-#: Least permitted eigenvalue of the scaled P. It is negative, since entries rounded to
-#: six digits, as in some text formats, may perturb zero eigenvalues.
+#: Smallest permitted eigenvalue of the scaled P. The limit is negative, since entries
+#: rounded to six digits, as in some text formats, may perturb zero eigenvalues.
 _MIN_CURVATURE = -1e-6
-#: Least diagonal entry used for scaling, relative to the largest entry of P. Smaller
+#: Smallest diagonal entry used for scaling, relative to the largest entry of P. Smaller
 #: entries may consist mostly of rounding errors.
 _MIN_DIAGONAL = 1e-4
 _STRIP_ROWS = 256  #: rows of P that are compared with Pᵀ at a time, to save memory
@@ -36,7 +37,7 @@ _STRIP_ROWS = 256  #: rows of P that are compared with Pᵀ at a time, to save m
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """The matrices K and B in P = B K⁺ Bᵀ, the matrix of a dual QP, in its units."""
+    """The matrices K and B in the matrix P = B K⁺ Bᵀ of a dual QP, in its units."""
 
     K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
     B: Matrix  #: (n, N) sparse constraint rows
@@ -60,7 +61,7 @@ class QP:
 
     Absent constraints have zero rows, and absent bounds are ±inf, never None. All
     arrays become read-only, so that an exception occurs if a solver scales its input in
-    place. `from_arrays` accepts more kinds of input, and copies the arrays.
+    place. `from_arrays` accepts more types of input and copies the arrays.
 
     Parameters
     ----------
@@ -129,7 +130,9 @@ class QP:
                 raise ValueError(f"QP.{name} has shape {array.shape}, expected {shape}")
         for name in ("q", "b", "h"):
             if not np.isfinite(arrays[name]).all():
-                raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
+                raise ValueError(
+                    f"QP.{name} contains NaN or inf, expected finite numbers"
+                )
         every = _without_intervals((box, *further[has_box:]), n)
         values = {**arrays, "sets": every, "structure": structure}
         for name, value in values.items():
@@ -170,10 +173,10 @@ class QP:
     ) -> QP:
         """Create a QP from copies of arrays, after checking them.
 
-        Matrices may be dense or sparse; sparse ones are stored by columns. A vector may
-        be given as a matrix with one row or column, a single row of G or A as a vector
-        with a scalar right-hand side, and equal bounds as a scalar. Absent constraints
-        and bounds are None.
+        Matrices may be dense or sparse; sparse matrices are stored by columns. A vector
+        may also be a matrix with one row or column. A single row of G or A may be a
+        vector, with a scalar right-hand side. Equal bounds may be a scalar. Absent
+        constraints and bounds are None.
 
         Parameters
         ----------
@@ -207,13 +210,13 @@ class QP:
             isinstance(one, ConvexSet) and not isinstance(one, Box) for one in sets
         ):
             raise InputError(
-                f"sets = {shown(sets)}; expected a tuple of convex sets, beside lb and "
-                "ub for bounds"
+                f"sets = {shown(sets)}; expected a tuple of convex sets in addition "
+                "to lb and ub for bounds"
             )
         for M, rhs, name, side in ((G, h, "G", "h"), (A, b, "A", "b")):
             if (M is None) != (rhs is None):
                 here, absent = (name, side) if rhs is None else (side, name)
-                raise InputError(f"{absent} is missing beside {here}")
+                raise InputError(f"{absent} is missing, but {here} is present")
         vector = numeric_vector("q", q)
         if not (n := vector.size):
             raise InputError("q is empty; expected at least one variable")
@@ -243,7 +246,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return the diagonal of P (n,), or None if P is an operator without one."""
+        """Return the diagonal of P (n,), or None if P is an operator without it."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -255,7 +258,7 @@ class QP:
     def sizes(self) -> dict[str, int]:
         """Numbers of variables, equality rows, inequality rows and finite bounds.
 
-        If the QP has discs or cones, their numbers follow.
+        If the QP has discs or cones, the result also contains their numbers.
         """
         bounds = np.isfinite(self.lb).sum() + np.isfinite(self.ub).sum()
         sizes = {
@@ -290,9 +293,9 @@ class QP:
 
 
 def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
-    """Check the sets, and return them with discs of one variable turned into bounds.
+    """Check the sets, and convert discs of one variable to bounds.
 
-    Empty sets are left out.
+    Empty sets are omitted.
 
     Raises
     ------
@@ -336,7 +339,7 @@ def needs_matrices(qp: QP) -> str | None:
 
     A solver that reads entries of P should call this function in `declines`. If a
     solver declines for this reason and P is small, the matrix is assembled while the
-    clock runs, and `declines` is called again.
+    clock runs. Then `declines` is called again.
 
     Examples
     --------
@@ -359,8 +362,8 @@ def check_symmetric(P: Matrix) -> None:
     Raises
     ------
     ValueError
-        If P is not symmetric. The message names the two entries that differ most, with
-        a hint if P is triangular.
+        If P is not symmetric. The message states the two entries with the largest
+        difference, and a hint if P is triangular.
 
     """
     where, worst = _asymmetry(P)
@@ -377,10 +380,10 @@ def check_convex(P: Matrix) -> None:
     """Check that P is positive semidefinite up to rounding.
 
     If P had a direction of negative curvature, a KKT point could be a saddle point or a
-    maximum. Let D be the diagonal matrix of dᵢ = max(Pᵢᵢ, 1e-4 max|P|). The eigenvalues
-    of D⁻½PD⁻½ must exceed −1e-6, i.e. D⁻½PD⁻½ + 1e-6·I must have a Cholesky factor.
-    Eigenvalues between −1e-6 and 0 may be due to rounding. If P has more than 2000
-    rows, only its diagonal is checked.
+    maximum. Let D be the diagonal matrix with entries dᵢ = max(Pᵢᵢ, 1e-4 max|P|). The
+    eigenvalues of D⁻½PD⁻½ must exceed −1e-6, that is, D⁻½PD⁻½ + 1e-6·I must have a
+    Cholesky factor. Eigenvalues between −1e-6 and 0 may be due to rounding. If P has
+    more than 2000 rows, only its diagonal is checked.
 
     Raises
     ------
@@ -473,12 +476,12 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
     if array.dtype.kind not in "biuf":
         kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
         raise InputError(f"{name} is of type {kind}; {expected}")
-    with np.errstate(over="ignore"):  # overflow yields inf, for which callers check
+    with np.errstate(over="ignore"):  # overflow yields inf, which callers reject
         return np.array(array, dtype=float)
 
 
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
-    """Return a copy of a vector, which may be given as a matrix with one row or column.
+    """Return a copy of a vector, which may also be a matrix with one row or column.
 
     name : name of the vector in messages
     n : expected number of entries; None for any number
@@ -530,7 +533,7 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
         M = entries = _numbers(name, value)
         M = np.atleast_2d(M) if rows is None else M
     if not np.isfinite(entries).all():
-        raise InputError(f"{name} holds NaN or inf; expected finite numbers")
+        raise InputError(f"{name} contains NaN or inf; expected finite numbers")
     if M.ndim != 2 or M.shape != (M.shape[0] if rows is None else rows, n):
         expected = f"({'rows' if rows is None else rows}, {n})"
         raise InputError(f"{name} has shape {M.shape}; expected {expected}")
@@ -542,7 +545,7 @@ def _rows(
 ) -> dict[str, Matrix]:
     """Return the matrix and the right-hand side of constraints as keyword arguments.
 
-    name, side : their names, such as "G" and "h"
+    name, side : names of the matrix and the right-hand side, such as "G" and "h"
     M : matrix with n columns; None for zero rows
     """
     if M is None:

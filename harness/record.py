@@ -1,4 +1,4 @@
-"""The record of a measurement, which is stored as a line of the journal."""
+"""Records of measurements, which are stored as lines of the journal."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ if TYPE_CHECKING:
     from msgspec import Struct
     from msgspec.json import Decoder
 
-#: Version of a journal line, increased whenever a field changes its meaning.
-#: In version 2, the four residuals are scaled differently (docs/verdicts.md).
+#: Version of a journal line, which increases whenever the meaning of a field changes.
+#: Version 2 changed the scales of the four residuals (docs/verdicts.md).
 SCHEMA = 2
 #: Largest residual of a verified answer, relative to the tolerance.
 VERIFIED_FACTOR = 10.0
 READABLE = (1, 2)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
-SECONDS = (1e-12, 1e10)  #: least and largest measured time in s, except 0
+SECONDS = (1e-12, 1e10)  #: smallest and largest valid measured time in s, except 0
 MAX_LEVELS = 20  #: largest depth of nested lists and tables in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
-#: fields whose values are equal in many lines; equal values are stored once
+#: fields whose values are equal in many lines; equal values are stored only once in
+#: memory
 _TEXTS = (
     "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
     "session",
@@ -43,9 +44,9 @@ class Verdict(StrEnum):
     """Verdict on a measurement: the claim of the solver, and whether it is true."""
 
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
-    #: claimed infeasible and proven, see `harness.verify.infeasibility`
+    #: claimed infeasible, and proven infeasible; see `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    #: claimed solved; not verified, but at least half of the requested digits are right
+    #: claimed solved; not verified, but with at least half of the requested digits
     INACCURATE = "inaccurate"
     WRONG = "wrong"  #: claimed solved, but refuted
     INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, but not proven
@@ -76,9 +77,9 @@ class Verdict(StrEnum):
 class Measurement:
     """Time and memory needed to prepare and to solve; None if not measured.
 
-    Every field is also a field of the journal, with a value of at least 0. A field
-    added here needs no further code: `harness.verify.measure` sets it in the worker,
-    from which all fields are transferred to the record.
+    Every field is also a field of the journal, with a value of at least 0.
+    `harness.verify.measure` sets the fields in the worker, and all fields are
+    transferred to the record.
     """
 
     prepare_seconds: float | None = None
@@ -87,7 +88,8 @@ class Measurement:
     peak_mib: float | None = None  #: peak resident memory of the worker
     prepare_peak_mib: float | None = None
     solve_peak_mib: float | None = None
-    #: number of solves timed together, if one is too short; seconds are their means
+    #: number of solves timed together, if a single solve is too short; times are means
+    #: over these solves
     inner_loops: int = 1
 
 
@@ -99,8 +101,8 @@ class Record(Measurement):
     """A single run of one solver on one case at one tolerance; one JSON line.
 
     A record contains the task, the measured costs, the claim of the solver and the
-    verdict. Values that were not, or cannot be, measured are None, since JSON has no
-    NaN.
+    verdict. Values that were not measured, or cannot be measured, are None, since JSON
+    has no NaN.
     """
 
     schema: int = SCHEMA
@@ -116,17 +118,16 @@ class Record(Measurement):
     repeat: int  #: number of the repeat, from 0
     block: int  #: number of the work unit, whose measurements ran consecutively
     verdict: Verdict
-    claimed: str | None = None  #: status claimed by the solver; None if it has none
-    #: message of the solver, reason to decline, or the way in which the worker ended
+    #: status claimed by the solver; None if the solver made no claim
+    claimed: str | None = None
+    #: message of the solver, reason to decline, or description of the end of the worker
     message: str = ""
     iterations: int | None = None
     counts: Mapping[str, Any] = field(default_factory=dict)
-    reported: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: other data from the solver, such as its own times in seconds
-    build_seconds: float | None = (
-        None  #: time to build the case, in the process that built it
-    )
+    #: other data from the solver, such as its own times in seconds
+    reported: Mapping[str, Any] = field(default_factory=dict)
+    #: time to build the case, in the process that built it
+    build_seconds: float | None = None
     #: part of `build_seconds` spent on the factorisation and the dual; dual forms only
     dualise_seconds: float | None = None
     #: peak resident memory of the new process that built the case; measured only in
@@ -134,9 +135,8 @@ class Record(Measurement):
     build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
-    canary_seconds: float | None = (
-        None  #: time of a fixed computation before the measurement, to reveal drift
-    )
+    #: time of a fixed computation before the measurement, to reveal drift
+    canary_seconds: float | None = None
     threads: int | None = None  #: largest thread count of any library in the worker
     cpu: int | None = None  #: number of the CPU to which the worker was bound
     ranks: int = 1  #: number of MPI processes of the solve
@@ -148,31 +148,34 @@ class Record(Measurement):
     #: [mean, largest] over ranks of reduction_seconds, message_seconds and
     #: seconds_per_byte; see `harness.distributed.network`
     rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: "cold"; "sequence": results of earlier steps may be reused; "sequence,
-    #: tighten=θ": a sequence with tightening tolerances, see `Record.tighten`
+    #: "cold" for a single case; "sequence" if results of earlier steps may be reused;
+    #: "sequence, tighten=θ" for a sequence with tightening tolerances, see
+    #: `Record.tighten`
     mode: str = "cold"
-    #: tolerance of an early step of a tightening sequence; None if it is `tol`
+    #: tolerance of an early step of a tightening sequence; None if the tolerance is
+    #: `tol`
     step_tol: float | None = None
-    #: tolerance of the verdict if it differs from `tol`, as in accuracy sweeps
+    #: tolerance of the verdict if it differs from `tol`, as in accuracy sweeps; else
+    #: None
     accuracy: float | None = None
-    #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
-    #: which measures the noise; "copies": `ranks` independent solves at the same time
+    #: "" for an ordinary solver; "null" for the second copy of a solver in an A/A
+    #: comparison, which measures the noise; "copies" for `ranks` independent
+    #: simultaneous solves
     role: str = ""
-    primal: float | None = (
-        None  #: this and the next three are the residuals of `harness.verify.kkt`
-    )
+    #: primal residual; `primal`, `dual`, `complementarity` and `gap` are defined in
+    #: `harness.verify.kkt`
+    primal: float | None = None
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: basis of the verdict: "residuals"; "reference" for `optimum_error`; "certificate"
-    #: for a proof of infeasibility
+    #: basis of the verdict: "residuals", "reference" for `optimum_error`, or
+    #: "certificate" for a proof of infeasibility
     decided_by: str = "residuals"
     #: error relative to a proven optimum, see `harness.verify.optimum`
     optimum_error: float | None = None
-    energy_bound: float | None = (
-        None  #: certified bound on the relative error in the energy norm
-    )
-    #: terms of `energy_bound`, relative; see `harness.verify.verdicts.certified`
+    #: certified bound on the relative error in the energy norm
+    energy_bound: float | None = None
+    #: relative components of `energy_bound`; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     #: physical results by name, in SI units
@@ -189,8 +192,9 @@ class Record(Measurement):
     def tighten(self) -> float:
         """Factor θ of a tightening sequence; 0 for other modes.
 
-        Each step of a tightening sequence is solved to the tolerance
-        max(tol, θ·`unsettled`), see `harness.plugin.Case`.
+        Each step of a tightening sequence is solved to the tolerance max(tol,
+        min(θ·`unsettled`, 1e-2)), where `unsettled` is an attribute of
+        `harness.plugin.Case`.
         """
         _, _, number = self.mode.partition(TIGHTENING)
         return float(number or 0)
@@ -207,7 +211,7 @@ class Record(Measurement):
 
     @property
     def claims_answer(self) -> bool:
-        """True if a solution is claimed, or a claim of infeasibility is proven."""
+        """True if a solution is claimed, or if a claim of infeasibility is proven."""
         return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
     def replace(self, **changes: Any) -> Self:
@@ -222,8 +226,8 @@ class Record(Measurement):
         """Return one line of strict JSON.
 
         NaN, inf and integers beyond 64 bits become null. Fields that do not occur in
-        old journals are omitted if they have their defaults, so that an old line is
-        written unchanged.
+        old journals are omitted if they have their default values, so that the line of
+        an old record does not change.
         """
         row = finite(self.to_dict())
         if not self.session:
@@ -246,8 +250,8 @@ class Record(Measurement):
         Lone surrogates are escaped, since they cannot be encoded in UTF-8. If a key
         occurs several times, its last value counts.
 
-        shared : texts and tables of earlier lines, to which those of this line are
-            added; equal ones are stored once
+        shared : texts and tables of earlier lines, to which the texts and tables of
+            this line are added, so that equal objects are stored only once
 
         Raises
         ------
@@ -276,12 +280,12 @@ class Record(Measurement):
             raise ValueError(f"nested deeper than {MAX_LEVELS} levels") from None
 
 
-#: journal names of those attributes whose names differ from them
+#: journal names of attributes whose journal name differs from the attribute name
 _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 
 
 def in_space(quantities: Mapping[str, Any]) -> bool:
-    """Return True if quantities are those of three-dimensional bodies.
+    """Return True if the quantities belong to three-dimensional bodies.
 
     Forces are then in N and energies in J, instead of N/m and J/m in the plane.
     """
@@ -329,7 +333,7 @@ _seconds = attrgetter(*_SECONDS)
 
 
 def _parsed(line: str | bytes) -> Any:
-    """Parse strict JSON, without NaN and Infinity, which Python accepts."""
+    """Parse strict JSON; refuse NaN and Infinity, which Python accepts."""
 
     def refuse(text: str) -> NoReturn:
         raise ValueError(f"{text} is not a number in JSON; expected null or a number")
@@ -361,7 +365,7 @@ def _line() -> type[Struct]:
 
 
 def _explained(e: Exception, row: object) -> str:
-    """Return the error message for a journal line with a missing or mistyped field.
+    """Return the message for a journal line with a missing field or a wrong type.
 
     e : error of msgspec, which contains the path of the field
     """
@@ -440,7 +444,7 @@ def _share(record: Record, shared: dict[Any, Any]) -> Record:
     for name, text in zip(_TEXTS, _texts(record), strict=True):
         object.__setattr__(record, name, shared.setdefault(text, text))
     for name, table in zip(_TABLES, _tables(record), strict=True):
-        key = (repr(table),)  # a tuple, so that no text equals the key of a table
+        key = (repr(table),)  # a tuple, which differs from the keys of all texts
         if key not in shared:
             _check_nested(name, table, MAX_LEVELS)
             if name == "params":
@@ -451,7 +455,7 @@ def _share(record: Record, shared: dict[Any, Any]) -> Record:
 
 
 def _check_values(params: Mapping[str, Any]) -> None:
-    """Raise ValueError if a value is a list or a table, which no case name contains."""
+    """Raise ValueError for a list or a table, which a case name cannot contain."""
     for key, value in params.items():
         if isinstance(value, dict | list):
             raise ValueError(

@@ -1,17 +1,17 @@
 """Registries of solvers and families, and plug-ins from files and packages.
 
 A registry maps names to solvers or families. In a registry of solvers, the entry
-``"PREFIX:*"`` stands for all backends of a generic adapter. In the name
+``"PREFIX:*"`` represents all backends of a generic adapter. In the name
 ``PREFIX:BACKEND``, the text after the last colon is the value of the adapter's field
 ``backend``. A method ``backends()`` of the adapter, if it exists, returns the installed
 backends.
 
-A plug-in file is loaded as a Python package of its own, whose path is the folder of the
+A plug-in file is loaded as a separate Python package, whose path is the folder of the
 file. The plug-in can import the modules and packages in this folder, which are called
-its neighbours. Two plug-ins may have different neighbours of the same name: when the
-code of a plug-in is compiled, ``import helper`` is replaced by an import of the
-submodule ``helper`` of its package. Similarly, ``from harness import QP`` is replaced
-by an import from `mortarbench.harness`.
+its neighbours. Two plug-ins may have different neighbours with the same name. When the
+code of a plug-in is compiled, ``import helper`` is therefore replaced by an import of
+the submodule ``helper`` of its package. Similarly, ``from harness import QP`` is
+replaced by an import from `mortarbench.harness`.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
 #: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
-#: Prefix of the folder in the ``__path__`` of a plug-in's package, by which a hook in
-#: `sys.path_hooks` recognises the entry.
+#: Prefix of the folder in the ``__path__`` of a plug-in's package. A hook in
+#: `sys.path_hooks` recognises entries by this prefix.
 _BESIDE = "beside a plug-in: "
 
 
@@ -78,12 +78,11 @@ class SolverSpec:
 
     name: str  #: name in the registry, "NAME" or "PREFIX:BACKEND"
     label: str  #: label in records and reports
-    options: Mapping[str, Any] = field(
-        default_factory=dict
-    )  #: options that the suite sets, by name
-    #: "": an ordinary solver; "null": the second copy of a solver in an A/A comparison,
-    #: which measures the noise; "copies": `ranks` independent solves at the same time,
-    #: which bound the speed-up of a solve on that number of ranks
+    #: options that the suite sets, by name
+    options: Mapping[str, Any] = field(default_factory=dict)
+    #: "" for an ordinary solver; "null" for the second copy of a solver in an A/A
+    #: comparison, which measures the noise; "copies" for `ranks` independent
+    #: simultaneous solves, which bound the speed-up of a solve on this number of ranks
     role: str = ""
     ranks: int = 1  #: number of MPI processes
 
@@ -116,7 +115,7 @@ class PluginFile:
 
     @classmethod
     def of(cls, text: str | Path | PluginFile) -> PluginFile:
-        """Parse ``[LABEL=]FILE.py``; a path with ``=`` must have a ``/`` before it."""
+        """Parse ``[LABEL=]FILE.py``; in a path, a ``/`` must precede any ``=``."""
         if isinstance(text, PluginFile):
             return text
         if isinstance(text, str) and (match := _LABELLED.fullmatch(text)):
@@ -136,10 +135,10 @@ class PluginFile:
         return replace(self, path=self.path.resolve())
 
     def content(self) -> Iterator[bytes]:
-        """Yield the bytes of the file, then those of its neighbours, sorted by path.
+        """Yield the bytes of the file, then of its neighbours, sorted by path.
 
         Neighbours are the modules in the same folder that the file imports, directly or
-        through other neighbours. Import statements inside functions count.
+        through other neighbours. Import statements inside functions are included.
 
         Raises
         ------
@@ -163,9 +162,8 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    operators: Mapping[str, Maker] = field(
-        default_factory=dict
-    )  #: functions that build operators, see `harness.operators`
+    #: functions that build operators, see `harness.operators`
+    operators: Mapping[str, Maker] = field(default_factory=dict)
     origin: str = ""  #: path of the plug-in file, or "entry points"
 
 
@@ -220,7 +218,7 @@ class Registry(Mapping[str, T]):
 
 
 def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
-    """Return the solver that `spec` names, with the backend and options of `spec`.
+    """Return the solver that `spec` names, with its backend and its options.
 
     Raises
     ------
@@ -263,8 +261,7 @@ def option_types(solver: Solver) -> dict[str, Any]:
     """Return the annotated types of a solver's options by name.
 
     Options annotated as Any or object are omitted. If Python cannot evaluate the
-    annotations, all options are omitted. The type of an omitted option is that of its
-    default.
+    annotations, all options are omitted. An omitted option has the type of its default.
     """
     try:
         hints = get_type_hints(type(solver))
@@ -287,7 +284,7 @@ def load_plugin(file: str | Path | PluginFile) -> Plugin:
     ------
     InputError
         If the file is missing, fails to import, defines neither ``SOLVERS`` nor
-        ``PROBLEMS``, or if an object in these has the wrong type.
+        ``PROBLEMS``, or contains an object of the wrong type.
 
     """
     plugin_file = PluginFile.of(file)
@@ -325,7 +322,7 @@ def entry_point_plugins() -> Plugin:
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
     if not _some_package_offers():
         return Plugin(origin="entry points")
-    from importlib.metadata import entry_points  # slow to load, and seldom needed
+    from importlib.metadata import entry_points  # loads slowly and is seldom needed
 
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
@@ -341,8 +338,8 @@ def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
     The function reads the folders of `sys.path`, which is faster than importing
-    importlib.metadata. It does not open archives: if one is on the path, the result is
-    True.
+    importlib.metadata. It does not open archives; if an archive is on the path, the
+    result is True.
     """
     for place in sys.path:
         if os.path.isfile(place):
@@ -359,12 +356,12 @@ def _some_package_offers() -> bool:
 def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[str, T]:
     """Return the union of two registries.
 
-    what : kind of their objects, for the message
+    what : type of the objects, for the message
 
     Raises
     ------
     InputError
-        If both contain the same name: results under this name would be ambiguous.
+        If both registries contain the same name, which would make results ambiguous.
 
     """
     if both := sorted(known.keys() & new.keys()):
@@ -403,7 +400,8 @@ def _with_options(
         where, kind = f"{spec.name}: {name}", annotated.get(name)
         changes[name] = _option(where, value, known[name], kind)
     if not changes:
-        return solver  # type: ignore[no-any-return]  # without options, it need not be a dataclass
+        # type: ignore[no-any-return]  # without options, it need not be a dataclass
+        return solver
     try:
         configured: Solver = replace(solver, **changes)
     except (TypeError, ValueError) as e:  # raised by the solver's check of its options
@@ -414,7 +412,7 @@ def _with_options(
 def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
     """Check the type of an option, and return its value; an int may become a float.
 
-    current : default of the option, whose type counts if there is no annotation
+    current : default of the option, whose type is required if there is no annotation
     """
     kinds = _classes(annotation)
     if kinds is None:
@@ -462,7 +460,7 @@ def _no_file(plugin_file: PluginFile) -> InputError:
 
 
 def _imported(path: Path) -> ModuleType:
-    """Import a plug-in file as a package of its own; see the module docstring."""
+    """Import a plug-in file as a separate package; see the module docstring."""
     whole = path.resolve()
     stem = re.sub(r"\W", "_", whole.stem)
     name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"
@@ -487,7 +485,7 @@ def _imported(path: Path) -> ModuleType:
 
 
 def _forget(package: str) -> None:
-    """Remove a package and its submodules from `sys.modules`, to import them again."""
+    """Remove a package and its submodules from `sys.modules`, for a new import."""
     for name in [n for n in sys.modules if f"{n}.".startswith(f"{package}.")]:
         del sys.modules[name]
     importlib.invalidate_caches()
@@ -497,7 +495,8 @@ class _PluginLoader(SourceFileLoader):
     """Loader of the modules of a plug-in; redirects their imports to neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
-        # bypass __pycache__, since rewritten imports depend on the files in the folder
+        # bypass __pycache__, since the rewritten imports depend on the files in the
+        # folder
         package = fullname.partition(".")[0]
         (entry,) = sys.modules[package].__path__
         imports = _Imports(package, entry.removeprefix(_BESIDE))
@@ -574,8 +573,8 @@ sys.path_hooks.append(_neighbour_finder)
 def stand_for_harness() -> None:
     """Install a module `harness` with the exported names, for plug-ins that import it.
 
-    Only worker processes call this function. In the process of a user, a module of this
-    name may belong to the user, see `_standing_for_harness`.
+    Only worker processes call this function directly. In the process of a user, a
+    module of this name may belong to the user; see `_standing_for_harness`.
     """
     exports = ModuleType("harness")  # without a path: it has no submodules
     exports.__dict__["__getattr__"] = partial(getattr, import_module(__package__))
@@ -597,7 +596,7 @@ def _standing_for_harness() -> Iterator[None]:
 
 
 def _neighbour(name: str, folder: str) -> ModuleSpec | None:
-    """Return the spec of a module or package in a folder, or None if there is none.
+    """Return the spec of a module or package in a folder, or None if it is missing.
 
     Packages without ``__init__`` are not found.
     """
@@ -631,8 +630,8 @@ def _imported_names(file: Path) -> set[str]:
     """Return the top-level names in the import statements of a file.
 
     The names in relative imports are included, since ``from .helper import f`` imports
-    a neighbour of the plug-in. If the file has a syntax error, the result is empty; the
-    import of the file will report the error.
+    a neighbour of the plug-in. If the file has a syntax error, the result is empty, and
+    the import of the file reports the error.
     """
     names: set[str] = set()
     try:
@@ -649,7 +648,7 @@ def _imported_names(file: Path) -> set[str]:
 
 
 def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
-    """Check the types and names of a plug-in's objects, and return a `Plugin`.
+    """Check the types and names of the objects of a plug-in; return a `Plugin`.
 
     where : file or "entry points", for messages
     """

@@ -1,22 +1,22 @@
 """The result of a solver: a claim, a primal-dual point, and a history of iterations.
 
-A history consists of columns of equal length, which may have any names. Reports use the
+A history consists of columns of equal length with arbitrary names. Reports use the
 following columns:
 
-* ``step``: kind of the step, one letter: c CG, e expansion, f fallback,
-  p proportioning, n Newton
+* ``step``: type of the step as one letter: c for CG, e for expansion, f for fallback, p
+  for proportioning, n for Newton
 * ``outer``: number of the outer iteration
 * ``products``: number of products with P so far
 * ``free_gradient``, ``chopped_gradient``: norms ‖φ‖ and ‖β‖ of the free and the chopped
   gradient; the norm of the projected gradient is √(‖φ‖² + ‖β‖²)
 * ``infeasibility``: relative norm of Ax − b
 * ``active``: number of active bounds
-* ``two_sided``: number of components at one of two finite bounds; in a dual with
-  friction, these are the rows that slip
+* ``two_sided``: number of components at a bound that have two finite bounds; in a dual
+  QP with friction, these components are the rows that slip
 * ``cost``: value of the objective or the Lagrangian
 * ``seconds``: time since the start of `prepare`
 
-The solver reports these values; no verdict depends on them.
+The solver reports these values. Verdicts do not depend on them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class Status(StrEnum):
     SOLVED = "solved"  #: the solver claims that the point meets its tolerance
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
-    INFEASIBLE = "infeasible"  #: claimed: no feasible point, or objective unbounded
+    #: the solver claims that the feasible set is empty or the objective is unbounded
+    INFEASIBLE = "infeasible"
     FAILED = "failed"  #: the solver stopped without a solution, or raised an exception
     DECLINED = "declined"  #: the solver was not started; `message` states the reason
 
@@ -83,12 +84,10 @@ class Solution:
     iterations: int | None = None  #: None if the solver does not report the number
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record
-    reported: Mapping[str, float | str] = field(
-        default_factory=dict
-    )  #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
-    history: History = field(
-        default_factory=dict
-    )  #: columns of equal length, a row per iteration; see `harness.solution`
+    #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
+    reported: Mapping[str, float | str] = field(default_factory=dict)
+    #: columns of equal length, a row per iteration; see `harness.solution`
+    history: History = field(default_factory=dict)
 
     @classmethod
     def without_point(
@@ -126,7 +125,7 @@ class Solution:
         )
 
     def mismatch(self, qp: QP) -> str | None:
-        """Return a message if a vector does not have the shape required by `qp`."""
+        """Return a message if a vector does not have the shape that `qp` requires."""
         expected = {"x": qp.q, "y": qp.b, "z": qp.h, "z_box": qp.q}
         for name, like in expected.items():
             got = np.shape(getattr(self, name))
@@ -136,14 +135,14 @@ class Solution:
 
 
 def usable_history(history: object) -> tuple[History, str]:
-    """Return the history as plain arrays and "", or {} and a description of its defect.
+    """Return the history as plain arrays and "", or {} and a description of a defect.
 
-    The function does not raise, so that a malformed history does not invalidate the
-    answer that comes with it.
+    The function does not raise exceptions, so that a malformed history does not
+    invalidate the answer.
     """
     try:
         return checked_history(history), ""
-    except Exception as e:  # reading a solver's own object may raise anything
+    except Exception as e:  # reading an object of a solver may raise any exception
         return {}, f"history dropped: {e}"
 
 
@@ -171,7 +170,7 @@ def checked_history(history: object) -> History:
 
 def _column(name: object, values: object) -> NDArray[Any]:
     if not isinstance(name, str) or not name.isidentifier():
-        raise ValueError(f"{name!r} names a column, expected an identifier")
+        raise ValueError(f"{name!r} is the name of a column, expected an identifier")
     column = np.asarray(values)
     if column.ndim != 1:
         raise ValueError(f"{name} has shape {column.shape}, expected one row each")

@@ -1,1 +1,1 @@
-"""Checks that a solver conforms to its contract, and the manufactured QPs they use."""
+"""Checks that a solver conforms to its contract, and manufactured QPs for them."""

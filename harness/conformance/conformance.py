@@ -2,9 +2,9 @@
 
 The name of each check is a statement about the solver. A check passes, or it fails with
 a description of the violation. If the solver declines the QP, the check counts as
-declined, for the reason that the solver states. If the answer changes under an
-equivalent formulation of the QP, the check reports a weakness, since many otherwise
-correct solvers would fail.
+declined, and the result contains the reason that the solver states. If the answer
+changes under an equivalent formulation of the QP, the check reports a weakness. Such a
+change is not a failure, since many otherwise correct solvers would fail.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-#: Size of a gradient, relative to its largest term, that counts as rounding, as in dual
-#: residuals.
+#: Largest gradient that counts as rounding, relative to its largest term. Dual
+#: residuals use the same value.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
@@ -90,7 +90,8 @@ class Result(NamedTuple):
 
     grade: Grade
     message: str = ""
-    #: number of iterations relative to that of the unchanged formulation, if compared
+    #: ratio of the numbers of iterations for the changed and the unchanged formulation;
+    #: None for other checks
     work: float | None = None
 
 
@@ -98,8 +99,9 @@ class ContractError(Exception):
     """Violation of the contract by a solver."""
 
 
-#: Function that checks a solver. If it passes, it returns a result, or None if there is
-#: no remark; otherwise it raises ContractError, DeclinedError or WeaknessError.
+#: Function that checks a solver. If the check passes, the function returns a result, or
+#: None if there is no remark. Otherwise, the function raises ContractError,
+#: DeclinedError or WeaknessError.
 Check = Callable[[Solver], Result | None]
 
 
@@ -116,7 +118,7 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve as in a measurement, and require a point unless the solver declines."""
+    """Solve as in a measurement; require a point, unless the solver declines the QP."""
     s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
@@ -124,7 +126,7 @@ def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
 
 
 def _end(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve as in a measurement, in which an exception of the solver becomes a status.
+    """Solve as in a measurement, which converts an exception of the solver to a status.
 
     Raises
     ------
@@ -170,7 +172,7 @@ def _solves_over_sets(shape: str, solver: Solver) -> Result:
 
     The eigenvalues of P exceed 0.1, so that an error δ in x increases the objective f
     by at least 0.05 δ². The permitted error in f therefore permits an error in x of up
-    to √(20·1e-8·|f|), which interior-point methods may attain.
+    to √(20·1e-8·|f|). Errors of this size occur with interior-point methods.
     """
     qp, expected = manufactured_over_sets(shape)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
@@ -222,7 +224,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
     remark = f"a multiplier of {worst:.1e} on an absent bound"
     if not worst <= GRADIENT_ROUNDING * size:
         raise ContractError(f"{remark}; expected 0")
-    return Result(Grade.PASS, f"{remark}: rounding; 0 would be right")
+    return Result(Grade.PASS, f"{remark}: rounding; expected 0")
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
@@ -240,7 +242,7 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
-    # compare values as well, since a solver can make read-only arrays writable
+    # also compare values, since a solver can make read-only arrays writable
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
             raise ContractError("modified the QP")
@@ -277,7 +279,7 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Require a correct solution of a QP with bounds only.
+    """Require a correct solution of a QP without rows, which has only bounds.
 
     Some solvers claim that their first iterate is optimal if a QP has no rows.
     """
@@ -288,8 +290,8 @@ def _runs_in_one_thread(solver: Solver) -> None:
     """Require that a solve uses one thread: CPU time must not exceed wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
-    # permit all CPUs: on a single CPU, the CPU time of two threads would not exceed the
-    # wall time
+    # permit all CPUs, because on a single CPU the CPU time of two threads would not
+    # exceed the wall time
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()
@@ -306,7 +308,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Require correct solutions of a sequence of QPs, given by `_sequence`."""
+    """Require correct solutions of the QPs of `_sequence`, solved as a sequence."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
@@ -330,7 +332,8 @@ def _a_sequence_is_solved(solver: Solver) -> None:
 
 def _sequence() -> list[QP]:
     qp, point = manufactured("everything")
-    # a translation of the solution and all constraints does not change the active set
+    # a translation of the solution and of all constraints does not change the active
+    # set
     shift = 0.1 * np.cos(np.arange(qp.q.size))
     moved = shift_unknowns(qp, -shift).qp
     softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))

@@ -1,10 +1,12 @@
 """Invariance of a solver's answer under equivalent formulations of a contact problem.
 
 The problem of two strings in contact (`harness.conformance.manufactured.strings`) is
-solved in each form, unchanged and after each of the `CHANGES`, which yield equivalent
-QPs. Verdict and answer must be equal. Answers are compared as points x and x₀ of the
-unchanged QP: if both are verified, their residuals bound the difference of their
-objectives, and the energy ½‖x − x₀‖²_P of their difference, relative to their energies.
+solved in each form. The QP is solved unchanged and after each of the `CHANGES`, which
+yield equivalent QPs. The verdicts and the answers must be equal. The answer x to a
+changed QP is mapped to the unchanged QP and compared with its answer x₀. If both
+answers are verified, their residuals bound two quantities relative to the energies of
+the answers: the difference of the objectives, and the energy ½‖x − x₀‖²_P of the
+difference.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ TOL = 1e-8  #: tolerance of all solves of the strings
 #: the sum of residuals over rows.
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
-#: Load (10⁸ N/m) and length (2 m) of beam-ring in each system of units, rounded to
-#: powers of two. Forces are per unit thickness, so that the stiffness is in Pa, MPa or
-#: GPa.
+#: Load (10⁸ N/m) and length (2 m) of beam-ring, expressed in each system of units and
+#: rounded to powers of two. Forces are per unit thickness, so that the unit of
+#: stiffness is Pa, MPa or GPa.
 UNITS: Mapping[str, tuple[float, float]] = {
     "N, m": (2.0**27, 2.0**1),
     "N, mm": (2.0**17, 2.0**11),
@@ -49,11 +51,11 @@ UNITS: Mapping[str, tuple[float, float]] = {
 
 
 class WeaknessError(Exception):
-    """Error if an equivalent formulation changes the verdict or the answer."""
+    """Error for a verdict or answer that changes under an equivalent formulation."""
 
 
 class DeclinedError(Exception):
-    """Error if a solver declines a QP; the message is its reason."""
+    """Error for a QP that a solver declines; the message is the solver's reason."""
 
 
 def same_answer(
@@ -66,7 +68,7 @@ def same_answer(
 
     Returns
     -------
-    numbers of iterations of both solves; None if the solver does not report them
+    numbers of iterations of both solves, each None if the solver does not report it
 
     Raises
     ------
@@ -144,7 +146,7 @@ def _rows_scaled(qp: QP, form: str) -> Equivalent:
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: Shift of the unknowns in each form: about half the largest deflection or force.
+#: Shift of the unknowns in each form, about half of the largest deflection or force.
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
 #: Function that maps the QP of the strings and its form to an equivalent QP.
@@ -169,7 +171,7 @@ CHANGES: Mapping[str, Change] = {
     "unknowns shifted": lambda qp, form: shift_unknowns(
         qp, np.full(qp.q.size, _SHIFTS[form])
     ),
-    # reverse all signs: the load acts upwards, and λ ≥ 0 becomes λ ≤ 0
+    # reverse the signs of all unknowns: the load acts upwards, and λ ≥ 0 becomes λ ≤ 0
     "mirrored": lambda qp, _: mirror(qp, np.arange(qp.q.size)),
 }
 

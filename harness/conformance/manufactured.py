@@ -1,4 +1,4 @@
-"""Manufactured QPs to test solvers; most have solutions known by construction."""
+"""Manufactured QPs for tests of solvers; most solutions are known by construction."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
 
-#: Arguments of each shape. m, p: numbers of equality and inequality rows; lower, upper:
-#: False without such bounds; some: bounds on half of the variables; redundant: linearly
-#: dependent equality rows; fixed: equal bounds on some variables; rank: rank of P.
+#: Arguments of each shape. "m" and "p" are the numbers of equality and inequality rows.
+#: "lower" and "upper" are False if there are no lower or upper bounds. "some" means
+#: bounds on half of the variables only, "redundant" means linearly dependent equality
+#: rows, and "fixed" means equal bounds on some variables. "rank" is the rank of P.
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
@@ -67,10 +68,10 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
-    # multipliers of active rows are at least 0.5, so that complementarity is strict
+    # multipliers of active rows are at least 0.5: complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # one of four variables is at its lower bound, one is at its upper bound, and two
-    # are between their bounds
+    # of each four variables, one is at its lower bound, one is at its upper bound, and
+    # two are between their bounds
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
     bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
@@ -91,7 +92,7 @@ def _plant(
     return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
-#: Numbers of discs, of cones, and of rows of each kind, by shape.
+#: Numbers of discs, of cones, and of rows of each type (A and G), by shape.
 SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
     "discs": (6, 0, 0),
     "discs and rows": (6, 0, 2),
@@ -104,12 +105,12 @@ SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
 def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solution]:
     """Return a random QP over discs and cones, with its solution.
 
-    A block has two tangential components, and a cone also a normal one. Radii and
-    normal components are between 0.1 and 10. Two of three successive discs are
-    active. For three successive cones, the point is on the boundary of one (slip), at
-    the apex of one (open), and in the interior of one (stick). Multipliers of active
-    blocks are at least 0.5 from the boundary of the normal cone, so that
-    complementarity is strict. The eigenvalues of P are above 0.1. Two further variables
+    Each block has two tangential components; a cone also has a normal component. Radii
+    and normal components are between 0.1 and 10. Two of three successive discs are
+    active. Of three successive cones, one has the point on its boundary (slip), one at
+    its apex (open), and one in its interior (stick). Multipliers of active blocks have
+    a distance of at least 0.5 from the boundary of the normal cone, so that
+    complementarity is strict. The eigenvalues of P exceed 0.1. Two further variables
     have lower bounds, one of which is active.
 
     shape : a key of `SET_SHAPES`
@@ -183,7 +184,7 @@ def degenerate_cone() -> tuple[QP, Vector]:
 
 
 def one_of_each() -> tuple[QP, dict[str, Vector]]:
-    """Return a QP with an active constraint of each kind, and its solution by name.
+    """Return a QP with an active constraint of each type, and its solution by name.
 
     The QP separates into four problems min ½x² + qx with the constraints x₀ ≤ 1 and
     x₁ ≥ −1 (bounds), 2x₂ ≤ 2 (inequality row) and 2x₃ = 2 (equality row). The
@@ -237,13 +238,14 @@ def strings(form: str) -> QP:
     The upper string has 24 cells, the lower one 16. The unknown is the deflection u at
     their 25 + 17 nodes; K is the stiffness and f the load. The primal problem is
     min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends. Each row of
-    G u ≤ h keeps an inner node of the upper string above the lower string: its entries
-    are −1 at this node, and interpolation weights at two nodes of the lower string.
+    G u ≤ h keeps an inner node of the upper string above the lower string. The entries
+    of the row are −1 at this node and interpolation weights at two nodes of the lower
+    string.
 
-    form : "primal" is the above QP. "dual", with B = [A; G], c = [0; h] and an
-        orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to
-        RᵀBᵀλ = Rᵀf,  λ_I ≥ 0,  where λ_I are the multipliers of G. "dual-bounds" is the
-        dual after elimination of the fixed ends, with λ ≥ 0 as its only constraint
+    form : "primal" is the primal problem. "dual", with B = [A; G], c = [0; h] and an
+        orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to RᵀBᵀλ
+        = Rᵀf,  λ_I ≥ 0,  where λ_I are the multipliers of G. "dual-bounds" is the dual
+        after elimination of the fixed ends; its only constraint is λ ≥ 0
     """
     K, f, R = _two_strings()
     upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)

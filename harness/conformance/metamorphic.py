@@ -1,9 +1,9 @@
 """Equivalent formulations of a QP, and maps of their solutions to the original QP.
 
-Equivalent problems must have equal answers. The changes are: different units, another
-order of unknowns or rows, another origin or sign of unknowns, and scaled or duplicated
-rows. Such relations are called metamorphic (T. Y. Chen et al., ACM Computing Surveys 51
-(2018) 4). Each change is one of two substitutions:
+Equivalent problems must have equal answers. A change may concern the units, the order
+of unknowns or rows, the origin or the sign of unknowns, or the scaling or duplication
+of rows. Such relations are called metamorphic (T. Y. Chen et al., ACM Computing Surveys
+51 (2018) 4). Each change is a substitution of one of two types:
 
 * of unknowns,  x = T x' + a,  where T has one nonzero in each row and column; the
   objective is multiplied by t:
@@ -17,9 +17,9 @@ rows. Such relations are called metamorphic (T. Y. Chen et al., ACM Computing Su
       y = Mᵀy',  z = Nᵀz'
 
 If all factors are powers of two, every change except a shift is exact in floating-point
-arithmetic. The structure of the QP is also transformed: P = BK⁺Bᵀ becomes P' =
-B'K'⁺B'ᵀ with B' = TᵀB and K' = K/t. Substitutions of unknowns require P as a matrix;
-they raise ValueError if P is an operator.
+arithmetic. The structure of the QP is also transformed: P = BK⁺Bᵀ becomes P' = B'K'⁺B'ᵀ
+with B' = TᵀB and K' = K/t. Substitutions of unknowns require P as a matrix and raise
+ValueError if P is an operator.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def change_units(qp: QP, *, unknown: float, objective: float) -> Equivalent:
     Since the entries of contact rows are dimensionless, A and G do not change, and
     right-hand sides have the unit of x. If x is a displacement, multipliers are forces.
 
-    unknown : s, the new unit of x, in multiples of the old one
-    objective : t, the old unit of the objective, in multiples of the new one
+    unknown : s, the new unit of x in multiples of the old unit
+    objective : t, the old unit of the objective in multiples of the new unit
     """
     s = unknown
     T = diags_array(np.full(qp.q.size, s))
@@ -99,8 +99,8 @@ def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
 def duplicate_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
     """Append copies of the selected rows.
 
-    The multiplier of an original row is the sum of the multipliers of its copies, which
-    are not unique.
+    The multiplier of an original row is the sum of the multipliers of its copies. The
+    multipliers of the copies are not unique.
     """
     every = [np.arange(v.size) for v in (qp.b, qp.h)]
     twice = [
@@ -147,7 +147,8 @@ def _unknowns(
     if not qp.is_explicit:
         raise ValueError(f"QP.P is a {type(qp.P).__name__}, expected a matrix")
     T, t = csr_array(T), objective
-    U = T.copy()  # T⁻ᵀ has the pattern of T, with one nonzero in each row and column
+    # T⁻ᵀ has the sparsity pattern of T, since T has one nonzero in each row and column
+    U = T.copy()
     U.data = 1 / T.data
     a = np.zeros(qp.q.size) if origin is None else origin
     Pa = qp.P @ a

@@ -1,4 +1,4 @@
-"""Page docs/weaknesses.md: effects of equivalent formulations on each solver."""
+"""Generation of docs/weaknesses.md, on effects of equivalent formulations."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ even if the answer is verified.
 
 
 def weaknesses_page(results: Mapping[str, Results]) -> str:
-    """Return the Markdown page on the results of the checks of equivalence.
+    """Return a Markdown page on the results of the checks of equivalent formulations.
 
     results : results of all checks by solver
     """
@@ -97,7 +97,7 @@ def line_of(name: str, form: str, change: str) -> str:
 
 
 def _degenerate(results: Mapping[str, Results]) -> Iterator[str]:
-    """Yield the lines of the section on the degenerate cone, for solvers with cones."""
+    """Yield the lines of the section on the degenerate cone."""
     yield from DEGENERATE_HEAD.splitlines()
     for name, checks in results.items():
         result = checks.get(DEGENERATE)

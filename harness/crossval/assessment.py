@@ -1,20 +1,22 @@
 """Errors of one answer against the reference solution.
 
-Let u and λ be the displacement and the multipliers of the answer, u* and λ* those of
-the solution, ‖·‖ the energy norm, and u_λ the equilibrium of the bodies under the load
-and the contact forces −Bᵀλ. An answer is verified at tolerance t if its KKT residuals
-are at most 10t. The residual of the duality gap g is g/‖u*‖². By the identity of Prager
-and Synge (`harness.verify.certificate`, (2)),
+Let u and λ be the displacement and the multipliers of the answer, and u* and λ* the
+displacement and the multipliers of the solution. Let ‖·‖ be the energy norm, and u_λ
+the displacement in equilibrium with the load and the contact forces −Bᵀλ. An answer is
+verified at tolerance t if its KKT residuals are at most 10t. The residual of the
+duality gap g is g/‖u*‖². By the identity of Prager and Synge
+(`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
 so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at most √(20t)‖u*‖. The
-latter equals the error of the contact forces in the dual norm, ‖Bᵀ(λ − λ*)‖. The
-multipliers themselves need not be unique.
+error ‖u_λ − u*‖ equals the error ‖Bᵀ(λ − λ*)‖ of the contact forces in the dual norm.
+The multipliers need not be unique.
 
 A contact row i with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors within this
-bound change λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. Reference and answer therefore
-contradict each other on a row only if max(λᵢDᵢ, gapᵢ) > sᵢ for both.
+bound change λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. A reference and an answer with
+different states of row i therefore contradict each other only if max(λᵢDᵢ, gapᵢ) > sᵢ
+for the reference and for the answer.
 """
 
 from __future__ import annotations
@@ -40,18 +42,20 @@ from mortarbench.harness.verify.references import ReferencePoint
 class Assessment:
     """Errors of one answer, in the notation of the docstring of this module.
 
-    Energies are relative to ½‖u*‖², energy norms to ‖u*‖. If a problem has no mechanics
-    (it is a QP only), fields that are defined by the mechanics are None.
+    Energies are relative to ½‖u*‖², and energy norms are relative to ‖u*‖. For a QP
+    without mechanics, fields that require the mechanics are None.
     """
 
     error: float  #: ‖u − u*‖
     equilibrium_error: float | None  #: ‖u_λ − u*‖
     energy: float  #: J(u) − J(u*), where J is the potential energy
-    penetration: float | None  #: max (Bu − c)₊ over contact rows, over the mesh size
+    #: max (Bu − c)₊ of all contact rows, divided by the mesh size
+    penetration: float | None
     #: largest resultant force or moment on a body, relative to the forces on the body
     balance: float | None
     active: int | None  #: number of closed contact rows
-    rows: tuple[int, ...] = ()  #: rows whose state contradicts that of the reference
+    #: rows whose state contradicts the state in the reference
+    rows: tuple[int, ...] = ()
     #: contact rows in tension, λᵢDᵢ < −sᵢ, and friction rows that exceed the friction
     #: bound by more than sᵢ/Dᵢ
     pulls: tuple[int, ...] = ()
@@ -117,8 +121,9 @@ def assess(
 def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Deviation]:
     """Compute the errors of a finite point of a QP without mechanics.
 
-    Errors are measured in the seminorm ‖·‖_P, relative to `point_norm`. They do not
-    depend on the choice of the reference solution, since Px is equal for all solutions.
+    Errors are measured in the seminorm ‖·‖_P, relative to `point_norm`. The errors do
+    not depend on the choice of the reference solution, since Px is equal for all
+    solutions.
     """
     norm = point_norm(qp, truth)
     off = s.x - truth.x
@@ -136,7 +141,7 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
 
 
 def point_norm(qp: QP, s: Solution) -> float:
-    """Return √max(xᵀPx, |qᵀx|), to which errors in the seminorm ‖·‖_P are relative."""
+    """Return √max(xᵀPx, |qᵀx|), the scale of errors in the seminorm ‖·‖_P."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
 
 
@@ -148,9 +153,9 @@ def distances(
 
     A distance is inf if one of its points is not finite.
 
-    The distances are computed from the Gram matrix, in which cancellation hides those
-    below 1e-8 of the norm of the longer vector. The points must therefore be deviations
-    from a common reference.
+    The distances are computed from the Gram matrix. Because of cancellation, distances
+    below 1e-8 of the norm of the longer vector are inaccurate. The points must
+    therefore be deviations from a common reference.
 
     P : (n, n) stiffness, or matrix of a QP
     kernel : (n, r) orthonormal rigid motions, which are projected out
@@ -179,10 +184,11 @@ def _closed(
 
 
 def _balance(mechanics: Mechanics, s: Solution) -> float | None:
-    """Return the largest resultant force or moment on a body, relative to its forces.
+    """Return the largest relative resultant force or moment on a body, or None.
 
-    Resultants are Rᵀ(f − B_Eᵀy − Bᵀλ), where R are the rigid motions of the bodies, B_E
-    the rows of the supports and B those of contact and friction. The value is None if
+    Resultants are Rᵀ(f − B_Eᵀy − Bᵀλ), where R contains the rigid motions of the
+    bodies, B_E the rows of the supports, and B the rows of contact and friction. They
+    are relative to the sum of the absolute forces on the body. The value is None if
     there are no rigid motions.
     """
     R, primal = mechanics.rigid, mechanics.primal

@@ -2,10 +2,11 @@
 
 The reference is a point with a proven error bound (`harness.verify.references`), which
 is computed independently of the solvers under test. An answer is refuted if a residual
-is too large, or if its distance to the reference, minus the error bound of the
-reference, exceeds the error that its claim permits (`harness.crossval.assessment`).
-Majorities of answers play no role. If two answers differ by more than the sum of the
-permitted errors, and neither answer is refuted, the disagreement is unresolved.
+is too large. It is also refuted if its distance to the reference, minus the error bound
+of the reference, exceeds the error that the claim of the answer permits
+(`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
+If two answers differ by more than the sum of the permitted errors, and neither answer
+is refuted, the disagreement is unresolved.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ from mortarbench.harness.verify.kkt import allowed, verdict
 from mortarbench.harness.verify.optimum import Proves, decided, proves
 from mortarbench.harness.verify.verdicts import note_of
 
-#: Least error of an outlier, relative to the median error of the other solvers.
+#: Smallest error of an outlier, relative to the median error of the other solvers.
 OUTLIER_RATIO = 100
-MIN_PEERS = 3  #: least number of answers of other solvers from which a median is taken
+#: smallest number of answers of other solvers for which a median is computed
+MIN_PEERS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +60,8 @@ class Answer:
     stored: Verdict  #: verdict that the run stored
     verdict: Verdict  #: verdict on the stored point, evaluated again
     residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
-    optimum_error: (
-        float | None
-    )  #: error relative to a proven optimum, which decides instead of the residuals
+    #: error relative to a proven optimum, which decides instead of the residuals
+    optimum_error: float | None
     allowed: float  #: largest residual of a verified answer
     energy_allowed: float  #: largest permitted relative error in the energy norm
     energy_bound: float | None  #: certified error bound that the run stored
@@ -68,7 +69,7 @@ class Answer:
     assessment: Assessment | None
     refuted: tuple[str, ...] = ()  #: reasons why the claim is false
     #: description of a contradiction between the certified bound of the run and the
-    #: reference, which indicates a defect of mortarbench; empty if there is none
+    #: reference, which indicates a defect of mortarbench; empty without contradiction
     contradiction: str = ""
     remarks: tuple[str, ...] = ()
 
@@ -87,7 +88,8 @@ class Pair(NamedTuple):
     a: int  #: index of the first answer
     b: int  #: index of the second answer
     distance: float  #: ‖u − u'‖ in the energy norm
-    #: ‖Bᵀ(λ − λ')‖, distance of the contact forces, dual norm; None without mechanics
+    #: ‖Bᵀ(λ − λ')‖, distance of the contact forces in the dual norm; None without
+    #: mechanics
     equilibrium: float | None
     energy: float  #: |J(u) − J(u')|, difference of potential energies
     allowed: float  #: sum of the errors that the two claims permit
@@ -121,7 +123,7 @@ def compare_answers(
     answers : answers to cases with equal ``mechanics.program``, or to a single QP
         without mechanics
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None for no cache
+    references : folder in which reference points are cached; None to disable the cache
     """
     prove = proves(solve)
     truth = ground_truth_of(answers, solve, references)
@@ -207,8 +209,8 @@ def _answer(
 def _contradiction(a: Answer) -> str:
     """Describe an error that exceeds the bound certified in the run, or return "".
 
-    The result is "" for a point with remarks, and for a point whose verdict differs
-    from that of the run, since such a point may differ from the certified one.
+    The result is "" for a point with remarks, and for a point whose new verdict differs
+    from the stored one. In both cases, the point may differ from the certified point.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
@@ -249,7 +251,7 @@ def _refutations(a: Answer) -> Iterable[str]:
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Add a remark to valid answers that are far less accurate than the others."""
+    """Add a remark to valid answers that are far less accurate than other answers."""
     groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
     for a in answers:
         if not a.refuted and a.error is not None:

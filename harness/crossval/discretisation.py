@@ -1,9 +1,10 @@
 """Estimate of the discretisation error, which bounds the useful accuracy of a solver.
 
 Let u be the exact solution, û the reference solution on the mesh of the case, and u_h,
-u_{h/2}, u_{h/4} solutions on meshes with successively halved cell size h, where each is
-interpolated on the next mesh. Their distances in the energy norm ‖·‖ determine the rate
-of convergence and the remaining error (Richardson extrapolation of squared errors):
+u_{h/2}, u_{h/4} solutions on meshes with successively halved cell size h. Each solution
+is interpolated on the next mesh. The distances of successive solutions in the energy
+norm ‖·‖ determine the rate of convergence and the remaining error (Richardson
+extrapolation of squared errors):
 
     2^q = ‖u_h − u_{h/2}‖² / ‖u_{h/2} − u_{h/4}‖²
     ‖u_h − u‖² = ‖u_h − u_{h/2}‖² / (1 − 2^−q)                                       (1)
@@ -14,14 +15,14 @@ pressure on the differences of the gaps, which is of higher order if few nodes c
 state. Estimates are relative to ‖û‖, like the bounds of `harness.verify.certificate`.
 
 An estimate by differences of potential energies, ‖u_h − u‖² ≤ 2(J_h − J), would be
-simpler. But these differences contain terms of the same order in h that are not errors
-of u: each mesh approximates a curved side by a different polygon, and its boundary
-values differ. Such an estimate is 1.5 times the true error on the membrane, and an
-eighth of it on a cylinder with four cells per contact half-width. A load step is
-linearised at the previous solution on the same mesh, and the effect of this
-linearisation counts as part of the error. Under a point load, the energy decreases
-without limit, like log h; in this case, only the distance to the solution on the next
-mesh is reported.
+simpler. However, these differences contain terms of the same order in h that are not
+errors of u, because each mesh approximates a curved side by a different polygon with
+different boundary values. The energy estimate is 1.5 times the true error on the
+membrane, and an eighth of the true error on a cylinder with four cells per contact
+half-width. A load step is linearised at the previous solution on the same mesh, and the
+effect of this linearisation counts as part of the error. Under a point load, the energy
+decreases without limit, like log h. In this case, only the distance to the solution on
+the next mesh is reported.
 """
 
 from __future__ import annotations
@@ -55,10 +56,12 @@ MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 GROWTH = 4.0
 #: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: number of meshes; a rate can be determined from no fewer
-MIN_RATE = 0.5  #: least q for extrapolation: below it, 1/(1 − 2^−q) exceeds 3.4
-#: Least assumed relative error of u_h, even if its certificate proves a smaller one,
-#: since coefficients of slender bodies are subject to rounding in double precision.
+MAX_LEVELS = 3  #: number of meshes, the smallest from which a rate can be determined
+#: smallest q for extrapolation; for a smaller q, 1/(1 − 2^−q) exceeds 3.4
+MIN_RATE = 0.5
+#: Smallest assumed relative error of u_h, even if its certificate proves a smaller
+#: error, since coefficients of slender bodies are subject to rounding in double
+#: precision.
 ROUNDING = 1e-8
 
 
@@ -80,9 +83,10 @@ class Level:
 class Discretisation:
     """Discretisation error of one physical case.
 
-    kind : meaning of `error`. "limit": extrapolated distance to the limit of fine
-        meshes; "change": distance to the solution on the next mesh; "rounding": upper
-        bound, at the level of rounding errors; "unknown": no estimate, see `note`
+    kind : meaning of `error`. For "limit", it is the extrapolated distance to the limit
+        of fine meshes; for "change", the distance to the solution on the next mesh; for
+        "rounding", an upper bound at the level of rounding errors. For "unknown", there
+        is no estimate, and `note` states the reason
     """
 
     case: str  #: canonical name without the form
@@ -90,10 +94,11 @@ class Discretisation:
     error: float | None = None  #: relative to ‖û‖, in the energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
     rate: float | None = None  #: observed rate q of the squared error
-    #: for the kind "limit", geometry to which the meshes converge; for other kinds,
-    #: reason why there is no limit
+    #: for the kind "limit", the geometry to which the meshes converge; for other kinds,
+    #: the reason why there is no limit
     note: str = ""
-    levels: tuple[Level, ...] = ()  #: coarsest mesh first, which is that of the case
+    #: levels; the first is the coarsest mesh, which is the mesh of the case
+    levels: tuple[Level, ...] = ()
     params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
 
     def __str__(self) -> str:
@@ -152,10 +157,10 @@ def discretisation_errors(
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
-    If there is not enough time for all meshes of a case, an earlier estimate from more
+    If the time does not suffice for all meshes of a case, an earlier estimate from more
     meshes is kept.
 
-    cases : cases; those that differ only in form are estimated once
+    cases : cases; the error of cases that differ only in form is estimated once
     folder : result folder, with the cache of reference points in ``references``
     budget : time for all cases, s; a mesh is skipped if its expected time exceeds the
         remaining time
@@ -208,7 +213,7 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
 
 
 def _continues(old: Discretisation, new: Discretisation) -> bool:
-    """Return True if `old` contains all meshes of `new`, and finer ones."""
+    """Return True if `old` contains all meshes of `new` and finer meshes."""
     common = [
         (a.case, a.unknowns) == (b.case, b.unknowns)
         for a, b in zip(old.levels, new.levels, strict=False)
@@ -235,7 +240,7 @@ class _Halving:
     references: Path
     end: float  #: deadline, in seconds of `perf_counter`
     why: str = ""  #: reason why there is no finer mesh
-    late: bool = False  #: True if that reason is the deadline
+    late: bool = False  #: True if the reason is the deadline
     _coarse: tuple[Grid, Extended] | None = None
 
     def levels(self, case: CaseId) -> Iterator[Level]:
@@ -258,15 +263,13 @@ class _Halving:
             left = self.end - perf_counter()
             if not left > seconds * growth**TIME_EXPONENT:
                 self.late = True
-                self.why = "the next mesh would take more time than was left"
+                self.why = "the next mesh would take more than the remaining time"
                 return
             start = perf_counter()
             level = self._level(params, form, first=not sizes)
             if level is None and not sizes and form != case.form:
-                form, self.why = (
-                    case.form,
-                    "",
-                )  # cases on subdomains have only a dual form
+                # cases on subdomains have only a dual form
+                form, self.why = (case.form, "")
                 level = self._level(params, form, first=True)
             if level is None:
                 return
@@ -288,7 +291,7 @@ class _Halving:
     def _level(
         self, params: Mapping[str, object], form: str, *, first: bool
     ) -> Level | None:
-        """Solve on one mesh; if this is impossible, set `why` and return None."""
+        """Solve on one mesh; on failure, set `why` and return None."""
         text = self.family.name
         try:
             case = assemble(self.family, params, form)
@@ -302,7 +305,7 @@ class _Halving:
                 return None
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):
-                return None  # the solve would be useless without a second mesh
+                return None  # without a second mesh, the solve is not needed
             point = reference_point(mechanics, self.reference, self.references)
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
@@ -327,9 +330,9 @@ class _Halving:
         )
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
-        """Return the energy norm of u − u_{2h}, or None on the first mesh.
+        """Return the energy norm of u − u_{2h}, or None on the first mesh; store u.
 
-        u is stored for the comparison with the next mesh.
+        The stored u is compared with the solution on the next mesh.
         """
         whole = u + grid.lift
         before, self._coarse = self._coarse, (grid, whole)

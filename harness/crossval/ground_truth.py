@@ -1,8 +1,8 @@
 """Reference point with which the answers to one problem are compared.
 
 The reference point is computed by the reference solve. If this solve fails, the answer
-with the smallest certified error takes its place, and the report states this.
-Majorities of answers play no role.
+with the smallest certified error replaces the reference point, and the report states
+this. Agreement of several answers is not used as evidence.
 """
 
 from __future__ import annotations
@@ -71,11 +71,12 @@ class GroundTruth(NamedTuple):
 def ground_truth_of(
     answers: Sequence[StoredAnswer], solve: Reference, references: Path | None
 ) -> GroundTruth | str:
-    """Return the reference point, or the reason why there is none.
+    """Return the reference point, or the reason why it is missing.
 
-    answers : all answers to the problem; the best may replace a missing reference
+    answers : all answers to the problem; the best answer may replace a missing
+        reference
     solve : function that solves a QP accurately
-    references : folder in which reference points are cached; None for no cache
+    references : folder in which reference points are cached; None to disable the cache
     """
     mechanics = answers[0].case.mechanics
     if mechanics is None:
@@ -108,9 +109,9 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return the reference point, its origin, and the reason if it is an answer.
+    """Return the reference point, its origin, and a note if it is an answer.
 
-    If there is no reference point, a message with the reason is returned instead.
+    Without a reference point, return a message with the reason instead.
     """
     try:
         return reference_point(mechanics, solve, references), "reference", ""
@@ -154,10 +155,10 @@ def _best_certified(
 def _plain_truth(
     answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
-    """Return the reference point of a QP without mechanics, or why there is none.
+    """Return the reference point of a QP without mechanics, or the reason why not.
 
-    Its error is bounded by √(2r), where r is its largest KKT residual, like the
-    errors of verified answers.
+    The error of the point is bounded by √(2r), where r is its largest KKT residual. The
+    errors of verified answers have the same bound.
     """
     qp, why = answers[0].case.qp, ""
     try:

@@ -1,9 +1,9 @@
 """Interpolation from a mesh to its refinement with half the cell size.
 
-A node of the coarse mesh is found in the refined mesh by its position. Positions cannot
-be used for new nodes: on a curved side, a new node does not lie on the chord, and its
-distance from the chord may exceed the size of a thin cell. Instead, a new node is found
-as the only node that is connected by an edge to two given nodes.
+A node of the coarse mesh is located in the refined mesh by its position. Positions
+cannot be used for new nodes: on a curved side, a new node does not lie on the chord,
+and its distance from the chord may exceed the size of a thin cell. Instead, a new node
+is identified as the only node that is connected by edges to two given nodes.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
 
 
 def _edges(corners: list[Nodes]) -> list[tuple[Nodes, Nodes]]:
-    """Return the two end nodes of the edges of all cells, for each edge of a cell."""
+    """Return, for each edge of a cell, its two end nodes in all cells."""
     if len(corners) == 8:
         return [(corners[a], corners[b]) for a, b in EDGES]
     return list(zip(corners, [*corners[1:], corners[0]], strict=True))

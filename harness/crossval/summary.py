@@ -1,4 +1,4 @@
-"""Summary of a cross-validation: counts, one row per solver, lists of disagreements.
+"""Summary of a cross-validation: counts, rows per solver, lists of disagreements.
 
 The summary is plain data, for the report, the terminal and ``--json``.
 """
@@ -21,7 +21,7 @@ SCHEMA = 1  #: version of the format of the summary
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Summary of one solver at one tolerance; a value is None if no answer has it."""
+    """Summary of one solver at one tolerance; None for values that no answer has."""
 
     solver: str
     tol: float
@@ -42,7 +42,7 @@ def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
     """Return the summary of a cross-validation, followed by all answers and pairs.
 
     folder : name of the result folder
-    ours : label of the solver with which all others are compared
+    ours : label of the solver with which all other solvers are compared
     """
     answers = [a for p in validation.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]
@@ -160,7 +160,7 @@ def _between_forms(
 def _between(
     problems: Sequence[Problem], solver: str, other: str, tol: float
 ) -> Iterable[float]:
-    """Yield the distances between answers of two solvers, whatever their forms."""
+    """Yield the distances between answers of two solvers in any forms."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
@@ -187,7 +187,7 @@ def _headline(
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
         parts.append(
-            f"{_many(counts['unresolved'], 'pair')} apart, neither answer refuted"
+            f"{_many(counts['unresolved'], 'pair')} too far apart, neither refuted"
         )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")

@@ -1,6 +1,6 @@
 """Cross-validation of a result folder, case by case.
 
-Nothing that the run computed from the answers is reused: cases are rebuilt, and
+No quantity that the run computed from the answers is reused. Cases are rebuilt, and
 residuals, errors and distances are computed from the stored points. Answers that cannot
 be assessed are listed with the reason.
 """
@@ -64,7 +64,7 @@ class Validation:
 
     problems: tuple[Problem, ...]
     solvers: tuple[str, ...]  #: labels of all solvers with a record
-    #: false claims without a point, which `problems` cannot contain
+    #: false claims without a point, which are not in `problems`
     false_claims: tuple[Listed, ...]
     #: measurements that ended without a claim of success, such as crashes and limits
     unanswered: tuple[Listed, ...]
@@ -122,8 +122,8 @@ def validate_folder(
     Raises
     ------
     InputError
-        If the folder or its journal is missing, or if it contains neither a stored
-        point nor a proven claim of infeasibility.
+        If the folder or its journal is missing, or if the folder contains neither a
+        stored point nor a proven claim of infeasibility.
 
     """
     records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
@@ -182,7 +182,8 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     lost += damaged
     claims = [r for r in records if _is_proven(r) and r.case in cases]
     contradictory = set()
-    for r in claims:  # the certificate of the solver was not stored: find a new one
+    # the run did not store the certificate of the solver: search for a new one
+    for r in claims:
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status.INFEASIBLE)
         if infeasibility_margin(qp, claim) is not None:
@@ -193,7 +194,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         if r.run_id not in contradictory
     ]
     # forms with equal mechanics belong to one problem; without mechanics, each form is
-    # a problem of its own
+    # a separate problem
     by_numbers: dict[str, list[StoredAnswer]] = {}
     for g in answers:
         of = g.case.mechanics
@@ -232,13 +233,13 @@ def _pointless(records: Sequence[Record]) -> str:
         return "its stored points are missing; expected the vectors/*.npz of the run"
     statuses = Counter(r.verdict.words for r in records)
     ends = ", ".join(f"{n} {status}" for status, n in statuses.items())
-    return f"no solver returned a point ({ends}); expected one that solves a case"
+    return f"no solver returned a point ({ends}); expected a solver that solves a case"
 
 
 def _built(
     folder: _Folder, records: Sequence[Record]
 ) -> tuple[dict[str, Case], list[Listed]]:
-    """Rebuild the cases with answers; list answers whose case cannot be rebuilt."""
+    """Rebuild the cases of answers; list the answers whose case cannot be rebuilt."""
     cases: dict[str, Case] = {}
     lost: list[Listed] = []
     answered = [r for r in records if r.vectors or _is_proven(r)]
@@ -255,9 +256,9 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims of success; equal points of a solver only once.
+    """Read the stored points of claims of success; read equal points of a solver once.
 
-    Points that cannot be read are returned as a list with the reasons.
+    The second result lists the points that cannot be read, with the reasons.
     """
     answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
     lost: list[Listed] = []
@@ -315,7 +316,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _apart(r: Record) -> Record:
-    """Return the record; if it is part of a sequence, the label includes the mode."""
+    """Return the record; for a step of a sequence, the label includes the mode."""
     return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
 
 
@@ -329,7 +330,7 @@ def _true_forces(
     solve: Reference,
     references: Path,
 ) -> Vector | None:
-    """Return the multipliers (m,) of the reference point, or None if there is none."""
+    """Return the multipliers (m,) of the reference point, or None if it is missing."""
     mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
@@ -380,8 +381,9 @@ def _with_mix_ups(
 def _nearest_problem(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
     """Return the name of the problem whose contact forces are nearest to z.
 
-    Returns "" if none of them equals z up to MAX_FORCE_DIFFERENCE, or if those of the
-    problem `own` do: in the latter case, the answer is wrong for another reason.
+    Returns "" if no contact forces equal z up to MAX_FORCE_DIFFERENCE. Also returns ""
+    if the contact forces of the problem `own` equal z: in this case, the answer is
+    wrong for another reason.
     """
     differences = {
         name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))

@@ -16,11 +16,11 @@ from mortarbench.harness.sets.discs import Discs
 
 
 class DistributedDiscs(Discs):
-    """The discs whose components are on this rank, with radii as a distributed vector.
+    """Discs whose components are on this rank, with radii as a distributed vector.
 
     All components of a disc are on the same rank, so that only sums over discs need
-    communication. Every rank has such a set, even if it is empty, since all ranks must
-    take part in the sums.
+    communication. Every rank has an object of this class, even without discs, since all
+    ranks must take part in the sums.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class DistributedDiscs(Discs):
         Raises
         ------
         ValueError
-            If some components of a disc are on this rank, but not all.
+            If this rank has some, but not all, of the components of a disc.
 
         """
         is_owned = np.isin(discs.index, owned)
@@ -60,7 +60,7 @@ class DistributedDiscs(Discs):
         if split.size:
             raise ValueError(
                 f"the components {discs.index[split[0]].tolist()} of a disc are on "
-                "several ranks; expected one rank for each disc"
+                "several ranks; expected all components of a disc on one rank"
             )
         index = np.searchsorted(owned, discs.index[here])
         return cls(index, distributed(discs.radius[here], ranks))

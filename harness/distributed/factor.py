@@ -4,20 +4,20 @@ Rank p stores a symmetric, positive semidefinite A_p on a set of rows, which the
 said to *touch*. A row that only one rank touches is an *inner* row of this rank. Rows
 that several ranks touch are *shared*. No entry couples inner rows of different ranks,
 so each rank eliminates its inner rows independently. The Schur complements on the
-shared rows are summed over the ranks, and every rank factorises the sum (this is
-substructuring; Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A
-solve needs one reduction of shared rows; all other work is local.
+shared rows are summed over the ranks, and every rank factorises the sum. This method is
+known as substructuring (Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter
+4). A solve needs one reduction of shared rows; all other work is local.
 
-A vector with an entry for each row of A has one of three representations, each of them
-a `DistributedVector`:
+A vector with an entry for each row of A is stored as a `DistributedVector` in one of
+three representations:
 
 * additive: the vector is the sum of the contributions of all ranks
 * consistent: each rank stores the entries of the rows that it touches
-* orthonormal: in the order of L; each rank stores the entries of its inner rows, and
+* orthonormal: in the row order of L, each rank stores the entries of its inner rows and
   all shared entries divided by √P, where P is the number of ranks
 
-The inner product of two vectors is the sum over ranks of local products if one vector
-is additive and the other consistent, or if both are orthonormal.
+The inner product of two vectors is the sum over ranks of local inner products if one
+vector is additive and the other is consistent, or if both vectors are orthonormal.
 """
 
 from __future__ import annotations
@@ -41,14 +41,15 @@ from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
-#: Largest pivot that counts as zero, if rows are scaled to length one.
+#: Largest pivot that counts as zero; rows are scaled to length one.
 DEPENDENCE_TOLERANCE = 1e-13
-#: Shift of a unit diagonal, without which a zero pivot would end the factorisation.
+#: Number added to a unit diagonal, since the factorisation would fail at a zero pivot.
 PIVOT_SHIFT = 1e-15
 #: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
-#: Largest number of rows of a matrix that is factorised as an array by compiled code.
-#: For 500 rows, this takes longer than the overhead of calling a sparse library.
+#: Largest number of rows of a matrix that compiled code factorises as a dense array.
+#: For 500 rows, this already takes longer than the overhead of calling a sparse
+#: library.
 MAX_ARRAY_ROWS = 256
 
 
@@ -73,7 +74,7 @@ class Touched:
 
     @property
     def few_shared(self) -> bool:
-        """True if the dense factor of the shared rows is small, see `MAX_FILL`."""
+        """True if the dense factor of the shared rows is small (`MAX_FILL`)."""
         inner = self.ranks.total(np.array([float(np.count_nonzero(~self.is_shared))]))
         s = self.shared.size
         return s**2 <= MAX_FILL * (s + float(inner[0]))
@@ -84,7 +85,7 @@ class Touched:
 
 
 def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
-    """Gather the rows that all ranks touch, and determine the shared ones.
+    """Gather the numbers of the rows that the ranks touch, and find the shared rows.
 
     rows : (k,) rows that this rank touches, ascending
     """
@@ -101,16 +102,18 @@ class DependentRowsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class LocalFactor:
-    """A_p after elimination of those inner rows that do not change.
+    """The matrix A_p after elimination of the inner rows that do not change.
 
-    The other rows, i.e. the inner rows that may change and the shared rows, form the
-    *border*. In formulas, a denotes the eliminated rows and b the border.
+    The remaining rows form the *border*. They are the inner rows that may change,
+    followed by the shared rows. In formulas, a denotes the eliminated rows and b the
+    border.
     """
 
     at: Touched
-    changing: int  #: number of inner rows that may change; the border begins with them
-    #: factor of A_p, with 1 added to the diagonal of shared rows; rows are ordered as
-    #: unchanging, changing and shared rows
+    #: number of inner rows that may change, which are the first rows of the border
+    changing: int
+    #: factor of A_p with 1 added to the diagonal of shared rows. Unchanging rows are
+    #: first, then changing rows, then shared rows
     factor: BorderedFactor
 
     @property
@@ -151,7 +154,7 @@ class LocalFactor:
             L_cc = _cholesky(L_cc)
         except np.linalg.LinAlgError:
             fails = 1.0
-        if ranks.extreme(fails, np.max):  # raise on all ranks if one failed
+        if ranks.extreme(fails, np.max):  # raise on all ranks if any rank failed
             raise DependentRowsError("the rows are linearly dependent")
         L_sc, S = self._onto_shared(self.complement, L_cc)
         try:
@@ -160,13 +163,13 @@ class LocalFactor:
             raise DependentRowsError("the rows are linearly dependent") from None
 
     def _onto_shared(self, T: Dense, L_cc: Dense) -> tuple[Dense, Dense]:
-        """Eliminate the changing rows of T (b, b), and sum over ranks.
+        """Eliminate the changing rows of T (b, b), and sum the results over ranks.
 
         Returns the block L_sc of this rank, and the sum S (s, s) of Schur complements
         on the shared rows.
 
         T : Schur complement on the border of this rank
-        L_cc : (c, c) factor of its block of changing rows
+        L_cc : (c, c) factor of the block of changing rows of T
         """
         c, s, place = self.changing, self.at.shared.size, self.at.place
         L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
@@ -177,7 +180,7 @@ class LocalFactor:
 
 @dataclass(frozen=True, eq=False)
 class SummedFactor:
-    """Factor L of A, or of the matrix of `shifted`, distributed over ranks."""
+    """Factor L of A, or of the matrix in `shifted`, distributed over ranks."""
 
     local: LocalFactor
     root: float  #: √(1 + shift), by which L_aa is multiplied
@@ -196,9 +199,9 @@ class SummedFactor:
         """Factorise (1 + shift)A − Σ_p `less`_p, where L is the factor of A.
 
         less : (b, b) matrix of this rank on its border, such that Σ_p `less`_p ≤ A. The
-            result is then at least shift·A. Since Schur complements are monotone, those
-            of the result are at least `shift` times those of A, whose factors are L_cc
-            and L_ss.
+            factorised matrix is then at least shift·A. Since Schur complements are
+            monotone, its Schur complements are at least `shift` times the Schur
+            complements of A, whose factors are L_cc and L_ss.
         """
         local, c, scale = self.local, self.local.changing, 1 + shift
         T = scale * local.complement - less
@@ -255,7 +258,7 @@ class SummedFactor:
         return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense) -> Dense:
-        """Add the entries (s_p,) in shared rows of all ranks; return the sum (s,)."""
+        """Sum the entries (s_p,) in shared rows over all ranks; return the sum (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared) if shared.size else shared
@@ -294,7 +297,7 @@ def local_factor(
 def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
     """Factorise a symmetric, positive definite A (n, n), with the border last.
 
-    The other rows are ordered such that the factor has few nonzeros.
+    The rows before the border are ordered such that the factor has few nonzeros.
 
     border : (b,) rows whose diagonal block may change later
 
@@ -332,8 +335,8 @@ def independent_rows(gram: Matrix) -> Rows:
 
     The pivot of a row is the square of its distance from the span of the previous rows.
     A row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times its squared
-    length. Pivots that follow a dependent row consist of rounding errors. Therefore,
-    only the first dependent row is dropped before the pivots are computed again.
+    length. The pivots after a dependent row consist of rounding errors. Therefore, only
+    the first dependent row is removed before the pivots are computed again.
 
     gram : (r, r) matrix GGᵀ
 
@@ -358,7 +361,7 @@ def independent_rows(gram: Matrix) -> Rows:
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return L with LLᵀ = M, of which only the lower triangle is meaningful."""
+    """Return L with LLᵀ = M; the upper triangle of the result is not meaningful."""
     if not len(M):
         return np.zeros((0, 0), order="F")
     L, failed = lapack.dpotrf(M, lower=1, clean=0)
@@ -375,7 +378,7 @@ def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
 
 
 def with_int32(M: Matrix) -> csc_matrix:
-    """Return a sparse matrix with the 32-bit indices that CHOLMOD needs here."""
+    """Return a copy of a sparse matrix with 32-bit indices, as CHOLMOD requires."""
     M = csc_matrix(M)
     M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
     return M

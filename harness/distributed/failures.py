@@ -1,11 +1,11 @@
 """Collective handling of failures: all ranks raise, or all processes end.
 
 If a single rank raised an exception, the other ranks would wait for its messages for
-ever. Work that may fail is therefore called by `run_collectively`, which then exchanges
-the outcomes of all ranks, on a communicator that is used only for this purpose. A rank
-whose work failed waits in this exchange for the others. If they do not arrive in time,
-they must be waiting for messages of the failed rank, which then ends all processes
-(`abort`).
+ever. Work that may fail is therefore called by `run_collectively`. This function then
+exchanges the outcomes of all ranks on a communicator that is used only for this
+purpose. A rank whose work failed waits in this exchange for the other ranks. If another
+rank does not arrive in time, it must be waiting for a message of the failed rank. In
+this case, the failed rank ends all processes (`abort`).
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from mortarbench.harness.distributed.vectors import Ranks
 
 T = TypeVar("T")
 
-PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the others, s
-#: Environment variable with the number of a file descriptor. `harness.processes.ranks`
-#: reads failures of ranks from it, separately from the output of solvers.
+PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other ranks, s
+#: Environment variable with the number of a file descriptor. Through this descriptor,
+#: ranks report failures to `harness.processes.ranks`, separately from the output of
+#: solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
 _POLL_SECONDS = 1e-3  #: interval at which a failed rank tests for the other ranks, s
 _MESSAGE_BYTES = 500  #: length to which descriptions of failures are truncated
@@ -38,17 +39,18 @@ class RankFailedError(Exception):
 
 
 def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
-    """Call `work` on all ranks, and raise on all ranks if it fails on any of them.
+    """Call `work` on all ranks; raise on all ranks if `work` fails on any rank.
 
-    If all ranks raise exceptions with equal messages, these are raised unchanged.
+    If all ranks raise exceptions with equal messages, each rank re-raises its
+    exception.
 
     Raises
     ------
     RankFailedError
-        If `work` failed on some ranks only, or with different messages.
+        If `work` failed only on some ranks, or with different messages.
 
     """
-    # The first access is collective, and must be at a place that all ranks reach.
+    # The first access is collective, so all ranks must reach this line.
     comm = ranks.private_comm
     failure: Exception | None = None
     try:

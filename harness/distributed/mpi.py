@@ -17,7 +17,7 @@ MISSING = (
 
 
 def mpiexec() -> str | None:
-    """Return the path of mpiexec, or None if it or mpi4py is not installed.
+    """Return the path of mpiexec, or None if mpiexec or mpi4py is not installed.
 
     An mpiexec in the folder of the Python interpreter is preferred to one on PATH.
     """

@@ -12,16 +12,16 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE_BYTES = 2**20  #: size of a message whose time depends on the bandwidth only
+LARGE_BYTES = 2**20  #: size of a message whose time depends only on the bandwidth
 _BATCHES = 5  #: number of batches of timed calls; the first is discarded as warm-up
 
 
 def network(comm: Comm) -> dict[str, float]:
     """Measure the times of reductions and messages; called by all ranks.
 
-    The ranks form a ring, and all of them send to the next rank at the same time, since
-    all ranks also send at the same time in a matrix-vector product. Times are medians
-    over batches. The measurement takes a few milliseconds.
+    The ranks form a ring, and all ranks send to the next rank simultaneously, as in a
+    matrix-vector product. Times are medians over batches. The measurement takes a few
+    milliseconds.
 
     Returns
     -------

@@ -3,10 +3,10 @@
 
 A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, or a composition
 of other maps. Operators of decomposed bodies, and the rows of their coarse problem, are
-implemented as such maps: for short vectors, a product takes less time than the overhead
-of library calls, or than another pass over the vectors for a linear combination. The
-module is compiled when the package is installed. `sparse.pyi` declares its types for
-Python, `sparse.pxd` for compiled callers.
+implemented as linear maps. For short vectors, a product takes less time than the
+overhead of a library call, and less than another pass over the vectors for a linear
+combination. The module is compiled when the package is installed. `sparse.pyi` declares
+its types for Python, `sparse.pxd` for compiled callers.
 """
 
 from libc.math cimport sqrt
@@ -200,7 +200,9 @@ cdef class CompressedRows(LinearMap):
         cdef const int *indptr = self.indptr
         j = indptr[0]
         for i in range(self.n):
-            y_i = z_i = 0  # two sums, since an addition waits for the previous one
+            # two partial sums, since each addition to the same sum waits for the
+            # previous addition
+            y_i = z_i = 0
             last = indptr[i + 1]
             while j + 1 < last:
                 y_i += data[j] * x[indices[j]]
@@ -321,7 +323,7 @@ cdef void add_outer_products(
 
 
 cdef class Composition(LinearMap):
-    """The composition x ↦ A₁A₂…Aᵣx of maps, of which the last is applied first."""
+    """The composition x ↦ A₁A₂…Aᵣx of maps; Aᵣ is applied first."""
 
     cdef tuple maps
     cdef double *between[2]
@@ -436,19 +438,19 @@ cdef double PIVOT_TOLERANCE = 1e-3
 def factor_above(M, double share, L_0):
     """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
 
-    M is a difference of matrices of the size of L₀L₀ᵀ. If `share` is smaller than their
-    relative rounding errors, the computed M may have negative eigenvalues. In exact
-    arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ. If a computed pivot
-    is smaller, the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed
-    instead. Eigenvalues below `share` are set to `share`, and L follows from
+    M is a difference of matrices of similar norm as L₀L₀ᵀ. If `share` is smaller than
+    the relative rounding errors of these matrices, the computed M may have negative
+    eigenvalues. In exact arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ.
+    If a computed pivot is smaller, the Cholesky factor is discarded, and the
+    eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed. Eigenvalues
+    below `share` are set to `share`, and L follows from
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
 
-    which involves no subtraction and so preserves the lower bound.
+    which contains no subtraction and therefore preserves the lower bound.
 
     M : (k, k) symmetric
-    share : factor of the lower bound, which is small and positive
-    L_0 : (k, k) lower triangular L₀
+    share : small positive factor of the lower bound L_0 : (k, k) lower triangular L₀
     """
     cdef Py_ssize_t k = len(M)
     L = np.array(M, dtype=np.float64, order="F")
@@ -490,8 +492,8 @@ cdef class BorderedFactor(LinearMap):
         A = LLᵀ,   L = ⎡L_aa     ⎤     with the rows of A in the order `order`.
                        ⎣L_ba  L_bb⎦
 
-    If A changes on the border only, it suffices to factorise the new Schur complement
-    L_bbL_bbᵀ. As a linear map, the object is x ↦ A⁻¹x.
+    If A changes only on the border, it suffices to factorise the new Schur complement
+    L_bbL_bbᵀ. As a linear map, an object of this class is x ↦ A⁻¹x.
 
     order : (n,) permutation of the rows, with the border last
     columns : first n − b columns of L (n, n − b) in CSC format, each with its diagonal

@@ -1,4 +1,4 @@
-"""Vectors distributed over the processes of one solve, the *ranks* of MPI.
+"""Vectors distributed over the MPI processes of one solve, called *ranks*.
 
 Every rank runs the same code, and stores a slice of each vector. Elementwise operations
 need no communication. Reductions to a number are collective and return the same number
@@ -43,9 +43,10 @@ T = TypeVar("T")
 #: every rank obtains the same rounding errors. Longer arrays are summed by Allreduce.
 MAX_ORDERED_SUM = 64
 
-#: Categories of the time of a solve. products: products with local operators; exchange:
-#: packing and unpacking of exchanged values; coarse: solves of the coarse problem and
-#: other work that every rank repeats; waiting: waiting in MPI for other ranks.
+#: Categories of the time of a solve. "products" are products with local operators.
+#: "exchange" is packing and unpacking of exchanged values. "coarse" comprises solves of
+#: the coarse problem and other work that every rank repeats. "waiting" is waiting for
+#: other ranks in MPI.
 PARTS = ("products", "exchange", "coarse", "waiting")
 
 
@@ -54,7 +55,7 @@ class Ranks:
     """The MPI processes of one solve, with timers and counters of this process."""
 
     comm: Comm
-    #: time that this process spent in each of the `PARTS`, without overlap, s
+    #: time in s that this process spent in each of the `PARTS`, which do not overlap
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
     #: numbers of reductions, of messages to single ranks, and of bytes in the messages
     counts: dict[str, int] = field(
@@ -110,7 +111,7 @@ class Ranks:
         sizes: NDArray[np.int64],
         coming: NDArray[np.int64],
     ) -> Callable[[], NDArray[np.float64]]:
-        """Start to send consecutive parts of an array to other ranks.
+        """Start sending consecutive parts of an array to other ranks.
 
         out : entries to be sent, in the order of the ranks
         sizes, coming : (size,) numbers of entries sent to and received from each rank
@@ -144,9 +145,9 @@ class Ranks:
         return arrived
 
     def clocked(self, part: str) -> _Clock:
-        """Return a context manager that adds the time of its block to a category.
+        """Return a context manager that adds the run time of its block to a category.
 
-        The time of a nested block is added to the category of the nested block only.
+        The time of a nested block is added only to the category of the nested block.
 
         part : one of the `PARTS`
         """
@@ -164,7 +165,7 @@ def single_process() -> Ranks:
 
 
 class _SingleProcess:
-    """Replacement of an MPI communicator for a single process."""
+    """Substitute for an MPI communicator in a single process."""
 
     size = 1
     rank = 0
@@ -193,8 +194,7 @@ class _SingleProcess:
 class _Clock:
     """Timer that adds the time of a block, without nested blocks, to a category.
 
-    This is a class, since a context manager based on a generator is several times
-    slower.
+    A context manager based on a generator would be several times slower.
     """
 
     __slots__ = ("before", "part", "seconds", "start")
@@ -203,7 +203,8 @@ class _Clock:
         self.seconds, self.part = seconds, part
 
     def __enter__(self) -> None:
-        # nested blocks add to the same table; their time is subtracted at the end
+        # nested blocks add their times to the same table; __exit__ subtracts these
+        # times
         self.before = sum(self.seconds.values())
         self.start = perf_counter()
 
@@ -216,8 +217,8 @@ class _Clock:
 class DistributedVector(np.ndarray):
     """The local slice (n_rank,) of a vector, with reductions over all ranks.
 
-    A slice may also be a matrix (k, d) whose rows are blocks of components. Since every
-    block is on a single rank, sums and norms along axis 1 need no communication.
+    The slice may also be a matrix (k, d) whose rows are blocks of components. Since
+    each block is on a single rank, sums and norms along axis 1 need no communication.
 
     Raises
     ------
@@ -238,7 +239,9 @@ class DistributedVector(np.ndarray):
         return self @ other
 
     def _refused(self, *args: Any, **kwargs: Any) -> Any:
-        raise TypeError("this method of a distributed vector would see its slice only")
+        raise TypeError(
+            "this method of a distributed vector would use only its local slice"
+        )
 
     argmax = argmin = argpartition = argsort = cumprod = cumsum = mean = _refused
     partition = prod = sort = std = trace = var = searchsorted = tofile = _refused
@@ -275,7 +278,7 @@ class DistributedVector(np.ndarray):
 
 
 def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
-    """Return an array (n_rank,) as the local slice of a distributed vector."""
+    """Wrap an array (n_rank,) as the local slice of a distributed vector."""
     vector = np.ascontiguousarray(part).view(DistributedVector)
     vector.ranks = ranks
     return vector
@@ -355,7 +358,7 @@ class _DistributedRows:
 
 
 class Share(NamedTuple):
-    """The part of a distributed QP that is stored on one rank."""
+    """Part of a distributed QP that is stored on one rank."""
 
     qp: QP  #: vectors and the columns of A are distributed; b is equal on all ranks
     #: gathers a solution on rank 0; returns None on other ranks
@@ -423,7 +426,7 @@ class Distributable(Protocol):
 
     @property
     def parts(self) -> int:
-        """Number of parts of the operator, and so the largest number of ranks."""
+        """Number of parts of the operator, which limits the number of ranks."""
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Return the part of a `qp` with this P on this rank; called by all ranks.

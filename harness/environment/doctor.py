@@ -1,4 +1,4 @@
-"""Checks whether a machine is fit for measuring times, with advice on changes."""
+"""Checks of the fitness of a machine for measuring times, with advice on changes."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def load_advice(load: float) -> str:
 
 
 def _check(section: str, name: str, value: object, advice: str = "") -> Check:
-    """Return a check with the level that follows from the value and the advice.
+    """Return a check, whose level follows from the value and the advice.
 
     The level is WARN if there is advice, UNKNOWN if the value is None, otherwise OK.
     """
@@ -156,7 +156,9 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
     blas, version = environment["cholmod"]["blas"], environment["cholmod"]["version"]
     advice = ""
     if environment["versions"]["scikit-sparse"] is None:
-        advice = "scikit-sparse is not installed, nothing is factorised: make setup"
+        advice = (
+            "scikit-sparse is missing, so matrices cannot be factorised: make setup"
+        )
     elif blas == "reference BLAS":
         link = f"libblas.so.3-{environment['machine']['architecture']}-linux-gnu"
         advice = (
@@ -169,7 +171,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the BLAS in a package's wheel, else the BLAS of the system, or None."""
+    """Return the BLAS in a package's wheel, else the system's BLAS, else None."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":
@@ -180,7 +182,9 @@ def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
 def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
     for pool in threads["pools"]:
         count = pool["threads"]
-        advice = f"Several threads make times vary: {ONE_THREAD}" if count > 1 else ""
+        advice = (
+            f"Several threads cause scatter of times: {ONE_THREAD}" if count > 1 else ""
+        )
         value = f"{count} thread{'s' if count > 1 else ''}"
         yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
     variables = ", ".join(f"{k}={v}" for k, v in threads["variables"].items())

@@ -46,10 +46,8 @@ BLAS_LIBRARIES = (
 #: owners of libraries whose thread pools the code of mortarbench may use: the operating
 #: system, or the wheel of a package
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
-CHOLMOD_OWNERS = (
-    "system",
-    "scikit_sparse",
-)  #: owners of libraries that CHOLMOD may use
+#: owners of libraries that CHOLMOD may use
+CHOLMOD_OWNERS = ("system", "scikit_sparse")
 
 VOLATILE = ("now",)  #: keys of an environment that its digest excludes
 
@@ -65,12 +63,12 @@ def capture(
     """Describe the environment of this process as nested plain data.
 
     Values that cannot be read are None. The entries on threads describe the calling
-    process; `capture_in` returns those of a worker.
+    process; `capture_in` describes the threads of a worker.
 
     plugins : plug-in files; digests of their code are included
     packages : packages of solvers whose versions are included
     """
-    # import these, since threadpoolctl finds only libraries that are loaded
+    # import these modules, since threadpoolctl finds only loaded libraries
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
@@ -211,10 +209,11 @@ def system_blas(
 ) -> str | None:
     """Return the BLAS that CHOLMOD uses, such as "OpenBLAS 0.3.21 (pthreads)".
 
-    Since CHOLMOD does not call a BLAS in the wheel of another package, libraries in
-    site-packages are ignored, except those of scikit-sparse. A system library libblas
-    is the reference BLAS only if no optimised BLAS is loaded: in the alternatives
-    system of Debian, libblas.so.3 may be a wrapper of OpenBLAS or MKL.
+    CHOLMOD does not call a BLAS in the wheel of another package. Libraries in
+    site-packages are therefore ignored, except the libraries of scikit-sparse. A system
+    library libblas is the reference BLAS only if no optimised BLAS is loaded, because
+    in the alternatives system of Debian libblas.so.3 may be a wrapper of OpenBLAS or
+    MKL.
 
     mapped : absolute paths of loaded libraries, see `mapped_libraries`
     pools : entries ``threads.pools`` of `capture`
@@ -249,7 +248,7 @@ def _in_foreign_wheel(path: str) -> bool:
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an entry of threadpoolctl; the owner of the library replaces its path."""
+    """Return an entry of threadpoolctl with the library's owner instead of its path."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],
@@ -271,7 +270,7 @@ def _version(package: str) -> str | None:
 def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
     """Return digests of the code of plug-ins by name.
 
-    If several files have the same name, the result contains a digest of all of them.
+    If several files have the same name, the result contains one digest of these files.
     """
     contents: dict[str, list[bytes]] = defaultdict(list)
     for file in files:

@@ -1,4 +1,4 @@
-"""Readable names for entries of an environment, and texts on their differences."""
+"""Readable names of entries of an environment, and descriptions of differences."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def named(key: str) -> str:
 
 
 def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
-    """Describe the first few differences in words, and count the others.
+    """Describe the first few differences in words, and count the remaining ones.
 
     changes : differences between two environments
     one, other : words for the two environments, such as "then" and "now"

@@ -1,8 +1,8 @@
 """Noise floor of a machine, determined by an A/A comparison.
 
-The two times of a pair are measured with the same kernel in immediate succession, just
-as solvers are compared within blocks. A difference between two solvers is not
-significant if it is smaller than the differences within such pairs.
+The two times of a pair are measured with the same kernel in immediate succession, like
+the times of solvers within a block. A difference between two solvers is not significant
+if it is smaller than the differences within such pairs.
 """
 
 from __future__ import annotations

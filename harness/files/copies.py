@@ -1,10 +1,10 @@
-"""Copies of the files that cases are read from: ``FOLDER/files/DIGEST.SUFFIX``.
+"""Copies of the input files of cases: ``FOLDER/files/DIGEST.SUFFIX``.
 
 To make a result folder self-contained, each file that defines a QP is copied into it,
-unless the file is too large; files with equal content share one copy. The list
-``files/copies.json`` holds the paths that occur in the names of cases, including those
-of files that were too large to copy. These paths are compared with the names of cases
-and never opened.
+unless the file is too large. Files with equal content share one copy. The list
+``files/copies.json`` contains the paths that occur in the names of cases, including the
+paths of files that were too large to copy. Readers compare these paths with the names
+of cases and never open them.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from mortarbench.harness.plugin import SourceFile
 
 FOLDER = "files"
 LIST = "copies.json"
-MAX_FILE_MIB = (
-    64  #: size of the largest file that is copied; results must be small enough to send
-)
+#: size of the largest file that is copied, so that results remain small enough to send
+MAX_FILE_MIB = 64
 MAX_FOLDER_MIB = 256  #: largest total size of the copies in a result folder
 
-_DIGITS = 12  #: hex digits of the SHA-256 that identify a file, as in case parameters
+#: number of hex digits of the SHA-256 that identify a file, as in case parameters
+_DIGITS = 12
 _COPY = re.compile(rf"([0-9a-f]{{{_DIGITS}}})((?:\.[a-z0-9]{{1,8}}){{1,2}})")
 
 
@@ -68,7 +68,7 @@ class _Entry(NamedTuple):
 
 
 class Copies:
-    """Lookup of the files of cases, with the copies in a result folder as a fallback.
+    """Lookup of input files of cases, with the copies in a result folder as fallback.
 
     The folder is read only if an original file is missing or has changed.
     """
@@ -90,7 +90,9 @@ class Copies:
         if here == source.sha256:
             return Path(source.path)
         name = f"{source.sha256}{source.suffix}"
-        if not _COPY.fullmatch(name):  # a path separator could lead out of the folder
+        if not _COPY.fullmatch(
+            name
+        ):  # a path separator in the name could lead out of the folder
             raise InputError(
                 f"{shortened(source.path)}: {shortened(source.sha256)!r} is not a "
                 f"digest; expected {_DIGITS} hex digits"
@@ -98,7 +100,7 @@ class Copies:
         copy = self._folder / name
         if not os.path.lexists(copy):
             raise self._missing(source.path, source.sha256, here)
-        check_copy(copy, source.sha256, f"put the file back at {source.path}")
+        check_copy(copy, source.sha256, f"restore the file at {source.path}")
         return copy
 
     def digest(self, path: str) -> str:
@@ -129,14 +131,14 @@ class Copies:
         return sorted({entry.path for entry in _entries(self._folder)})
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
-        """Return the error to raise for a file without original and copy."""
+        """Return the error for a file without an available original or copy."""
         sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
-            why = f"was too large to travel with the results ({_mib(size)})"
+            why = f"was too large to be copied with the results ({_mib(size)})"
         other = f" (the file changed: it has {here})" if here is not None else ""
         return InputError(
-            f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}: "
+            f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}; "
             f"put it at {path}"
         )
 
@@ -182,7 +184,7 @@ def check_copies(folder: Path) -> None:
 def keep_copies(
     folder: Path, sources: Iterable[SourceFile], tell: Callable[[str], None]
 ) -> None:
-    """Copy the files of cases into a result folder; equal files share one copy.
+    """Copy the input files of cases into a result folder; equal files share one copy.
 
     tell : called with a message for each file that is too large
 
@@ -204,7 +206,7 @@ def keep_copies(
 def merge_copies(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None]
 ) -> None:
-    """Copy the copies in several result folders to `out`, without duplicates.
+    """Merge the copies in several result folders into `out`, without duplicates.
 
     tell : called with a message for each file that is too large
     """
@@ -235,12 +237,12 @@ def remove_copies(folder: Path) -> None:
 
 
 def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
-    """Check that no case is read from a copy that is about to be deleted.
+    """Check that no case reads its input from a copy that is about to be deleted.
 
     Raises
     ------
     InputError
-        If a case is read from such a copy; the message names the copy.
+        If a case reads its input from such a copy; the message names the copy.
 
     """
     copies = (folder / FOLDER).resolve()
@@ -299,13 +301,13 @@ class _Writer:
     def _has_room(self, name: str, size: int) -> bool:
         if size > MAX_FILE_MIB * MIB:
             self._tell(
-                f"{name} ({_mib(size)}) is larger than {MAX_FILE_MIB} MiB, and does "
-                "not travel with the results"
+                f"{name} ({_mib(size)}) is larger than {MAX_FILE_MIB} MiB, and is "
+                "not copied to the result folder"
             )
             return False
         if self._size + size > MAX_FOLDER_MIB * MIB:
             self._tell(
-                f"{name} ({_mib(size)}) does not travel with the results: their copies "
+                f"{name} ({_mib(size)}) is not copied to the result folder: the copies "
                 f"of files would take more than {MAX_FOLDER_MIB} MiB"
             )
             return False

@@ -14,7 +14,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-#: first characters of formulas; the full-width ones occur in East Asian spreadsheets
+#: first characters of formulas; the full-width characters occur in East Asian
+#: spreadsheets
 _FORMULA = frozenset("=+-@＝＋－＠")
 #: Unicode categories of characters that programs may skip at the start of a cell
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})
@@ -41,7 +42,7 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Prefix a text with an apostrophe if a spreadsheet would evaluate it.
+    """Prefix a text with an apostrophe if a spreadsheet would evaluate it as a formula.
 
     Hidden characters and spaces before the first sign are ignored, since spreadsheets
     may skip them.
@@ -56,7 +57,7 @@ def inert(text: str) -> str:
 
 @lru_cache(1 << 16)
 def visible(text: str) -> str:
-    r"""Escape control characters, direction controls and lone surrogates (``\n``)."""
+    r"""Escape control characters (``\n``), direction controls and lone surrogates."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(

@@ -1,10 +1,10 @@
 """Reading of data files from untrusted sources, within a memory limit.
 
-A small file can declare huge data: an archive that expands a thousandfold, or a matrix
-with a billion columns and no entries. Readers therefore compute the required memory
-from the headers, and refuse a file above the limit before they read its data. The
-environment variable ``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is
-2048.
+A small file can declare huge data, for instance an archive that expands a thousandfold,
+or a matrix with a billion columns and no entries. Readers therefore compute the
+required memory from the headers. If it exceeds the limit, they refuse the file before
+they read its data. The environment variable ``MORTARBENCH_MOST_MIB`` sets the limit in
+MiB; the default is 2048.
 """
 
 from __future__ import annotations
@@ -53,14 +53,14 @@ def max_bytes() -> int:
 
 
 def check_size(what: str, size: int) -> None:
-    """Check that `size` bytes do not exceed the memory limit.
+    """Check that data of `size` bytes do not exceed the memory limit.
 
     what : subject of the error message
 
     Raises
     ------
     InputError
-        If they exceed the limit; the message states the required memory in MiB, and
+        If the data exceed the limit; the message states the required memory in MiB, and
         how to raise the limit.
 
     """
@@ -95,14 +95,14 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
     """Read a whole file, and decompress it with gzip if its name ends in .gz.
 
     expected : description of the file, for messages
-    copies : number of copies of the content that the caller's parser may hold at once;
-        together they must not exceed the memory limit
+    copies : number of copies of the content that the caller's parser may keep in memory
+        at once; their total size must not exceed the memory limit
 
     Raises
     ------
     InputError
-        For the same reasons as in `opened`, and if the content would exceed the limit
-        or cannot be decompressed.
+        For the same reasons as in `opened`, if the content would exceed the limit, or
+        if it cannot be decompressed.
 
     """
     with opened(path, expected) as file:
@@ -115,7 +115,7 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             with gzip.GzipFile(fileobj=file) as pieces:
                 while piece := pieces.read(
                     _PIECE_BYTES
-                ):  # the first pass only counts bytes, and stores none
+                ):  # the first pass counts the bytes without storing them
                     if (size := size + len(piece)) > most:
                         raise InputError(
                             f"{path}: its expanded content would take more than "
@@ -133,11 +133,11 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Convert exceptions that a parser raises in the block to errors about the file.
+    """Convert exceptions that a parser raises in the block to an InputError.
 
     wrong : message of the error
-    room : bytes by which the address space may grow in the block, beyond the 256 MiB
-        that every parser is allowed
+    room : bytes by which the address space may grow in the block, in addition to the
+        256 MiB that every parser may use
 
     Raises
     ------

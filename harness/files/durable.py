@@ -1,8 +1,8 @@
 """Atomic replacement of files, and messages for full disks.
 
-A process may be killed, and a disk may become full, at any time. A file that is being
-replaced contains either its old or its complete new content. For files that grow line
-by line, see `harness.files.lines`.
+A process may be killed at any time, and a disk may become full at any time. After
+either event, a file that was being replaced contains either its old content or its
+complete new content. For files that grow line by line, see `harness.files.lines`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from typing import IO
 
 from mortarbench.harness.errors import InputError
 
-_UNFINISHED = ".mortarbench-*.tmp"  #: name of a file that is not yet complete
-#: patterns of such names in older versions and in case folders
+#: pattern of the names of files that are not yet complete
+_UNFINISHED = ".mortarbench-*.tmp"
+#: patterns of the names of incomplete files in older versions and in case folders
 _OTHERS = ("*.tmp", "*.new", ".*.new")
-_OLD = ("suite.tmp", "environment.tmp")  #: in result folders of older versions
+#: incomplete files in result folders of older versions
+_OLD = ("suite.tmp", "environment.tmp")
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -41,7 +43,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     try:
         with new.open("x+b") as file:
             yield file
-            # otherwise a crash after the rename could leave an empty file
+            # without this flush, a crash after the rename could leave an empty file
             _sync(file)
             move_file(new, path)
     finally:
@@ -56,7 +58,7 @@ def replace_file(path: Path, content: bytes | memoryview) -> None:
 
 
 def move_file(whole: Path, path: Path) -> None:
-    """Rename a file, already flushed, to `path` in the same folder; sync the folder."""
+    """Rename a flushed file to `path` in the same folder, and flush the folder."""
     os.replace(whole, path)
     sync_folder(path.parent)
 
@@ -70,7 +72,7 @@ def _sync(file: IO[bytes]) -> None:
 def remove_unfinished(
     folder: Path, own: Iterable[Path], shared: Iterable[Path] = ()
 ) -> None:
-    """Delete unfinished files that killed processes left in a result folder.
+    """Delete incomplete files that killed processes left in a result folder.
 
     No process may be writing to the folder.
 
@@ -144,7 +146,7 @@ def _full(path: Path, code: int) -> str:
     free = shutil.disk_usage(there).free / _MIB
     return (
         f"{path} cannot be written: {os.strerror(code)} (file system {root}, "
-        f"{free:.1f} MiB free); free some space, and the same command continues"
+        f"{free:.1f} MiB free); free some space; the same command continues the run"
     )
 
 

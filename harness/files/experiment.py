@@ -1,4 +1,4 @@
-"""Data of an experiment as plain files, readable without this package.
+"""Storage of the data of an experiment in plain files, readable without this package.
 
 ::
 
@@ -31,13 +31,14 @@ class Experiment:
     """Tables of measurements, deformed states, and the setting of an experiment."""
 
     setting: Mapping[str, Any]  #: plain data that JSON can represent
-    #: rows by name of the table; all rows of a table have the same keys
+    #: rows of each table, by the name of the table; all rows of a table have the same
+    #: keys
     tables: Mapping[str, Sequence[Row]]
     states: Mapping[str, Fields]  #: deformed states by name
 
 
 def save_experiment(experiment: Experiment, folder: Path) -> None:
-    """Write the files that the docstring of this module lists."""
+    """Write the data of an experiment to the files listed in the module docstring."""
     folder.mkdir(parents=True, exist_ok=True)
     states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
     for name, rows in experiment.tables.items():
@@ -54,7 +55,7 @@ def save_experiment(experiment: Experiment, folder: Path) -> None:
 
 
 def load_experiment(folder: Path) -> Experiment:
-    """Read the files that `save_experiment` wrote; no digits of numbers are lost.
+    """Read the files that `save_experiment` wrote; numbers are restored exactly.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Files that grow line by line, such as a journal.
 
-Such a file contains whole lines and possibly a partial last line, if its writer was
-killed. Readers skip the partial line, and the next writer removes it. Readers limit the
-size of the file and the length of its lines.
+Such a file contains whole lines. If its writer was killed, it may also contain a
+partial last line. Readers skip the partial line, and the next writer removes it.
+Readers limit the size of the file and the length of its lines.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import replace_file, sync_folder
 
-MAX_LINE_BYTES = 2**24  #: longest line that is read, to bound the memory for it
+#: length of the longest line that is read, which bounds the required memory
+MAX_LINE_BYTES = 2**24
 _CHUNK_BYTES = 2**16  #: number of bytes that are read at a time
 
 
@@ -56,7 +57,7 @@ class Lines:
     programs. The digest is compared when the writer ends, and whenever the time stamps
     of the file have changed since the last write. Edits between two runs are allowed.
 
-    restored : called with a message if the file had to be written again
+    restored : called with a message after the file has been written again
     """
 
     def __init__(self, path: Path, restored: Callable[[str], None]) -> None:
@@ -66,7 +67,7 @@ class Lines:
         self._open()
 
     def append(self, text: str) -> None:
-        """Append a line and flush it to the disk; after an error nothing is appended.
+        """Append a line and flush it to the disk; on error, leave the file unchanged.
 
         Raises
         ------
@@ -80,7 +81,7 @@ class Lines:
         whole = f"{text}\n".encode()
         line = memoryview(whole)
         try:
-            while line:  # a write to a disk that is nearly full may be short
+            while line:  # if the disk is nearly full, a write may be incomplete
                 line = line[os.write(self._fd, line) :]
             os.fsync(self._fd)
         except OSError:
@@ -93,8 +94,8 @@ class Lines:
     def restore(self) -> None:
         """Write the file again if it was deleted or replaced since it was opened.
 
-        The open descriptor still refers to the old content, from which missing lines
-        are restored. Lines that only the replacement file has are kept.
+        Missing lines are restored from the old content, to which the open descriptor
+        still refers. Lines that only the replacement file contains are kept.
 
         Raises
         ------
@@ -125,14 +126,13 @@ class Lines:
         self._fd = os.open(self._path, flags, 0o666)
         self._end = _end_of_lines(self._fd)
         os.ftruncate(self._fd, self._end)
-        self._times = _times(
-            os.fstat(self._fd)
-        )  # before reading, to detect an edit while the digest is computed
+        # before the content is read, to detect edits while the digest is computed
+        self._times = _times(os.fstat(self._fd))
         self._digest: Digest = running_digest(self._chunks())
         sync_folder(self._path.parent)
 
     def _refuse_changed(self) -> None:
-        """Check that the file contains exactly the lines read and written here."""
+        """Check that the file contains exactly the lines that were read and written."""
         held = os.fstat(self._fd)
         is_same = held.st_size == self._end
         if is_same:
@@ -143,9 +143,8 @@ class Lines:
                 f"{self._path} was changed by another program while the run wrote it; "
                 "the same command continues with its present content"
             )
-        self._times = _times(
-            held
-        )  # the content is unchanged: the file was only touched, linked or deleted
+        # the content is unchanged; the file was only touched, linked or deleted
+        self._times = _times(held)
 
     def _chunks(self) -> Iterator[bytes]:
         """Yield the whole lines of the open file in chunks."""
@@ -159,7 +158,7 @@ class Lines:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            # Edits within the resolution of time stamps leave these unchanged.
+            # An edit within the resolution of the time stamps does not change them.
             if error is None:
                 self._refuse_changed()
         finally:
@@ -167,7 +166,7 @@ class Lines:
 
 
 def _times(info: os.stat_result) -> tuple[int, int]:
-    """Return the times at which content and status last changed, in ns."""
+    """Return the times of the last changes of content and status, in ns."""
     return info.st_mtime_ns, info.st_ctime_ns
 
 

@@ -1,8 +1,9 @@
-"""One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
+"""One QP in one .mat file, for MATLAB and Octave.
 
-The vectors ``q, h, b, lb, ub`` are columns, the matrices ``P, G, A`` are sparse, and
-``meta`` is a JSON text. Indices of sets, such as ``disc_index``, start at 0. A case may
-add arrays of its own, for instance those of the paper's dual QP: F, d, B, c and R.
+The names of the variables are those of `harness.files.qpfile`. The vectors ``q, h, b,
+lb, ub`` are columns, the matrices ``P, G, A`` are sparse, and ``meta`` is a JSON text.
+Indices of sets, such as ``disc_index``, start at 0. A case may add further arrays, for
+instance the arrays F, d, B, c and R of the paper's dual QP.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetri
 from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
-_WRONG = "not a .mat file; expected one saved with -v7 or older"
-#: bytes of the header of a version 5 file, and of the tag before each element
+_WRONG = "not a .mat file; expected a file saved with -v7 or older"
+#: sizes in bytes of the header of a version 5 file, and of the tag before each element
 _HEADER, _TAG = 128, 8
 _COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: codes of data types
 _TYPES = {  #: NumPy types by code
@@ -52,9 +53,8 @@ _TYPES = {  #: NumPy types by code
     18: "u4",
 }
 _TEXT, _SPARSE = 4, 5  #: codes of the classes of variables
-_CLASSES = frozenset(
-    (_TEXT, _SPARSE, *range(6, 16))
-)  #: classes that are read: texts, sparse matrices and all numeric arrays
+#: codes of the classes that are read: texts, sparse matrices and all numeric arrays
+_CLASSES = frozenset((_TEXT, _SPARSE, *range(6, 16)))
 _COMPLEX = 0x800  #: flag of complex variables
 _COPIES = 8  #: memory limit of a parser, in multiples of the size of the content
 
@@ -91,7 +91,7 @@ def save_mat(
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read the variables of a .mat file by name; None for unsupported types.
+    """Return the variables of a .mat file by name; None for unsupported types.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def read_mat(path: Path) -> dict[str, Any]:
     if b"MATLAB 7.3" in data[:_HEADER] or data.startswith(b"\x89HDF"):
         raise InputError(f"{path}: a .mat file of version 7.3; save it with -v7")
     with parsing(path, _WRONG, _COPIES * len(data)):
-        if 0 in data[:4]:  # version 4, in which nothing is compressed
+        if 0 in data[:4]:  # version 4, which has no compression
             return dict(loadmat(BytesIO(data), spmatrix=False))
         elements = list(_elements(data))
         size = sum(map(_declared, elements))
@@ -161,15 +161,16 @@ def _decompressed(element: _Element) -> _Element:
 
 
 def _variable(element: _Element) -> tuple[str, Any]:
-    """Return the name and the value of a variable; the value may be None.
+    """Return the name and the value of a variable.
 
-    The value is a text, an array or a sparse matrix, and None for other types. SciPy's
-    reader is not used, since some damaged files crash it (SciPy 1.17.1).
+    The value is a text, an array or a sparse matrix, or None if the type is not
+    supported. SciPy's reader is not used, since it crashes on some damaged files (SciPy
+    1.17.1).
     """
     if element.kind == _COMPRESSED:
         element = _decompressed(element)
     if element.kind != _MATRIX:
-        raise ValueError("an element that is not a variable")
+        raise ValueError("the file has an element that is not a variable")
     parts = _parts(element)
     flags, shape = int(next(parts)[0]), tuple(map(int, next(parts)))
     name = next(parts).tobytes().decode("latin-1")
@@ -194,7 +195,7 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # the tag itself contains data of up to four bytes
+        if kind >> 16:  # the tag itself contains the data, of up to four bytes
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:
@@ -210,7 +211,7 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
 
 
 def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
-    """Return the QP and the meta data from the variables of `save_mat`.
+    """Return the QP and the meta data from variables as written by `save_mat`.
 
     Raises
     ------
@@ -228,7 +229,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         meta = json_object(str(text.item()))
         for name in _MATRICES:
             if not np.isfinite(matrices[name].data).all():
-                raise ValueError(f"{name} holds inf; expected finite numbers")
+                raise ValueError(f"{name} contains inf; expected finite numbers")
         for name in listed_dense(meta):
             check_dense(name, matrices[name])
             matrices[name] = matrices[name].toarray()
@@ -259,7 +260,7 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
     if array.ndim > 2:
         raise InputError(f"{name} has {array.ndim} dimensions; expected at most two")
     check_size(
-        f"{name}, {max(array.shape, default=1)} wide or high,",
+        f"{name}, {max(array.shape, default=1)} rows or columns,",
         8 * max(array.shape, default=1),
     )
     try:
@@ -269,5 +270,5 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
         raise InputError(f"{name} is not a matrix: {shortened(str(e))}") from None
     M = canonical(M)
     if np.isnan(M.data).any():
-        raise InputError(f"{name} holds NaN; expected numbers")
+        raise InputError(f"{name} contains NaN; expected numbers")
     return M

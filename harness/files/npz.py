@@ -1,8 +1,9 @@
 """Npz files whose arrays can be mapped into memory.
 
 An npz file is a zip archive of npy files. This module writes the npy files without
-compression, and aligns their values to 64 bytes. ``np.load`` reads such a file as
-usual, and `mapped` returns arrays in the page cache, which all processes share.
+compression and aligns their values to 64 bytes. ``np.load`` can read the resulting npz
+file. `mapped` returns arrays whose values are in the page cache, which all processes
+share.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ from mortarbench.harness.files.datafile import check_size, opened
 from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
-ALIGNMENT = 64  #: size of a cache line in bytes; misaligned arrays would affect times
+#: size of a cache line in bytes; misaligned arrays would affect measured times
+ALIGNMENT = 64
 _LOCAL_HEADER = 30  #: bytes before the name and the extra field of a zip member
-_PADDING = b"\xfe\xca"  #: ID of an extra field that readers skip
+_PADDING = b"\xfe\xca"  #: ID of an extra field, which readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-#: kinds of dtypes that are read; objects, which are pickles, and records are refused
+#: kinds of dtypes that are read; records and objects, which are pickled, are refused
 _KINDS = "biufcSU"
 _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
@@ -57,7 +59,7 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Map all arrays of a file; assignments to an array change only a private copy.
+    """Map all arrays of a file into memory; assignments change only a private copy.
 
     limited : refuse a file larger than the limit of `harness.files.datafile`
 
@@ -82,8 +84,8 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        For the same reasons as in `harness.files.datafile.opened`, and if the arrays
-        would exceed its limit, or one of them is pickled.
+        For the same reasons as in `harness.files.datafile.opened`, if the arrays would
+        exceed the memory limit, or if an array is pickled.
     ValueError, BadZipFile
         If the file is not an npz file of plain arrays.
 
@@ -142,7 +144,7 @@ def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """Read the array of a member, and no more bytes than its header declares."""
+    """Read the array of a member, but no more bytes than its header declares."""
     with archive.open(member) as file:
         shape, fortran, dtype = _header(file)
         count = _count(shape, dtype, member.file_size - file.tell())
@@ -179,7 +181,7 @@ def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
 
     there : number of bytes in the file after the header
     """
-    count = prod(shape)  # Python's integers do not overflow, unlike those of NumPy
+    count = prod(shape)  # Python integers, unlike NumPy integers, do not overflow
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
         raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
     return count

@@ -1,11 +1,12 @@
-"""One QP in one Parquet file, as qpbenchmark's test sets load it.
+"""One QP in one Parquet file, in the format of qpbenchmark's test sets.
 
-A row of the table is a problem, with the columns ``P, q, G, h, A, b, lb, ub`` (lists of
-doubles) and ``name``. All matrices are dense and stored row by row, with as many
-columns as q has components. Absent constraints and bounds are null. qpbenchmark's
-``ParquetTestSet`` reads exactly these columns [1]_. Sets other than bounds, such as
-discs, are stored in further columns, which qpbenchmark ignores. These columns are named
-as in `harness.sets.arrays`, and index arrays are stored row by row.
+Each row of the table is a problem. The columns are ``P, q, G, h, A, b, lb, ub`` (lists
+of doubles) and ``name``. All matrices are dense and stored row by row; their number of
+columns is the number of components of q. Absent constraints and bounds are null.
+qpbenchmark's ``ParquetTestSet`` reads exactly these columns [1]_. Sets other than
+bounds, such as discs, are stored in further columns, which qpbenchmark ignores. The
+names of these columns are those of `harness.sets.arrays`; index arrays are stored row
+by row.
 
 The meta data of `harness.files.qpfile` are stored in the metadata of the schema under
 the key ``mortarbench``, which other readers ignore.
@@ -45,8 +46,8 @@ _KEY = "mortarbench"
 _READER = Path(__file__).with_name("parquetreader.py")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
-#: Largest number of entries of a matrix, equal to 1 GiB. Parquet stores a matrix as one
-#: page, and the size of a page in bytes is an int32.
+#: Largest number of entries of a matrix, which occupy 1 GiB. Parquet stores a matrix as
+#: one page, and the size of a page in bytes is an int32.
 _MAX_ENTRIES = 2**27
 
 
@@ -59,7 +60,7 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         If a matrix is too large for a dense format, or the file cannot be written.
 
     """
-    # imported here, because they load slowly and workers do not need them
+    # imported here, because both modules load slowly and workers do not need them
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -68,7 +69,7 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     for name, count in rows.items():
         if count * n > _MAX_ENTRIES:
             raise InputError(
-                f"{path}: {name} has {count} × {n} entries, and Parquet holds them "
+                f"{path}: {name} has {count} × {n} entries, and Parquet stores them "
                 f"dense, at most {_MAX_ENTRIES}; expected .npz or .mat for a QP of "
                 "this size"
             )
@@ -135,7 +136,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     """Read the columns and the text of the meta data in a separate process.
 
-    A damaged file may crash Arrow, which would otherwise end this process.
+    A damaged file may crash Arrow; the separate process protects this one.
 
     Raises
     ------
@@ -155,7 +156,7 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
         raise InputError(f"{path}: malformed; expected a Parquet file")
     head = json.loads(line)
     if head["rows"] != 1:
-        raise InputError(f"{path}: holds {head['rows']} problems; expected one row")
+        raise InputError(f"{path}: contains {head['rows']} problems; expected one row")
     if missing := head["missing"]:
         raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
     check_size(f"{path}: its content", head["bytes"])
@@ -175,7 +176,7 @@ def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
     if n == 0 or flat.size % n:
         raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
     if not np.isfinite(flat).all():
-        raise ValueError(f"{name} holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
     M = flat.reshape(-1, n)
     return M if dense else csc_array(M)
 

@@ -1,4 +1,4 @@
-"""Process that reads a Parquet file, since damaged files can crash Arrow.
+"""Separate process for reading a Parquet file, since damaged files can crash Arrow.
 
 ::
 
@@ -11,11 +11,11 @@ The process prints a line of JSON with the entries
 * ``bytes``, the size that the file declares, and
 * ``meta``, the text under KEY in the metadata of the schema.
 
-If the file has one row of at most MAX_BYTES and no column is missing, the line also has
-the entry ``columns``. For each COLUMN, and each column whose name matches PATTERN, it
-contains the length of the list in the row, null for a null, or -1 for another type. The
-numbers of these lists follow the line as float64. To start quickly, the process imports
-no other module of this package.
+If the file has exactly one row, declares at most MAX_BYTES and lacks no column, the
+line also has the entry ``columns``. For each COLUMN, and for each column whose name
+matches PATTERN, this entry contains the length of the list in the row, null for a null,
+or -1 for any other type. The numbers of these lists follow the line as float64. To
+start quickly, the process imports no other module of this package.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ import numpy as np
 import pyarrow.parquet as pq
 
 CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
-SECONDS = 600  #: elapsed time after which the kernel kills it, since reading may block
+#: elapsed time after which the kernel kills this process, since reading may block
+SECONDS = 600
 ROOM = 2**29  #: bytes of address space in addition to four times the declared size
 
 
@@ -42,7 +43,8 @@ def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     metadata = file.metadata
-    # A page can encode a billion equal values in a few bytes, so values count as well.
+    # Use also the number of values: a page can encode a billion equal values in a few
+    # bytes.
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
@@ -98,5 +100,5 @@ def _numbers(scalar: Any) -> Any:
 if __name__ == "__main__":
     main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4:])
     sys.stdout.flush()
-    # Do not wait for Arrow's threads, which may never end, or may abort Python.
+    # Do not wait for Arrow's threads, which may never end or may abort Python.
     os._exit(0)

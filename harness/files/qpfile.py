@@ -9,16 +9,17 @@ is stored as
 * the vectors ``q, h, b, lb, ub``,
 * the arrays ``M_data, M_indices, M_indptr, M_shape`` of the CSC format of each matrix M
   of ``P, G, A``, with both triangles of P,
-* the arrays of sets other than bounds, such as ``disc_index, disc_radius``, named as in
-  `harness.sets.arrays`, and
+* the arrays of sets other than bounds, such as ``disc_index, disc_radius``, with the
+  names of `harness.sets.arrays`, and
 * ``meta``, a JSON object, whose entry ``dense`` lists the matrices that were dense.
 
 Absent constraints have zero rows, and absent bounds are ±inf. The optional structure of
 a dual QP (`harness.qp.Structure`) is stored as the matrices ``K, B`` and the vector
 ``fixed``.
 
-Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` are accepted as well: matrices
-are dense arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets are optional.
+Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` are also accepted. In these
+files, matrices are dense arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets
+are optional.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
-    """Return the matrices P, G and A by name, and the names of the dense ones.
+    """Return the matrices P, G and A by name, and the names of the dense matrices.
 
     Raises
     ------
@@ -85,9 +86,9 @@ def save_qp(
 ) -> str:
     """Write `qp` to `path`, and return the digest of its coefficients.
 
-    An operator P is assembled and stored as a dense matrix. Equal digests, of 16 hex
-    digits, mean equal QPs; a serialised operator and its assembled matrix have
-    different digests.
+    An operator P is assembled and stored as a dense matrix. The digest has 16 hex
+    digits. Equal digests mean equal QPs; a serialised operator and its assembled matrix
+    have different digests.
 
     meta : plain data; the keys ``dense`` and ``maker`` are overwritten
     serialised : store a `SerialisableOperator` P by its arrays instead of assembling
@@ -164,9 +165,9 @@ def load_qp(
     """Read a QP and its meta data.
 
     operators : makers of operators by name (`harness.operators`), for a file that the
-        case worker of the same run has written; such a file may contain an operator and
-        be of any size. None for a file of unknown origin, which is refused if P is an
-        operator or asymmetric, or if its size exceeds the limit of
+        case worker of the same run has written. Such a file may contain an operator and
+        may have any size. None for a file of unknown origin. Such a file is refused if
+        P is an operator or asymmetric, or if the file exceeds the size limit of
         `harness.files.datafile`
 
     Raises
@@ -196,7 +197,7 @@ def load_qp(
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            # if no entry is zero, return a view of the values, which may be mapped
+            # if all entries are stored, use a view of the values, which may be mapped
             M = matrices[name]
             rows, columns = M.shape
             full = M.nnz == rows * columns and M.has_canonical_format
@@ -217,7 +218,7 @@ def load_qp(
 
 
 def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
-    """Return the QP whose arrays a user has saved with `np.savez`."""
+    """Return the QP that is defined by arrays saved with `np.savez`."""
     try:
         for name in arrays:
             if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
@@ -246,7 +247,7 @@ def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
     if M.ndim != 2:
         raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
     if not np.isfinite(M).all():
-        raise ValueError(f"{name} holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
     return M
 
 
@@ -274,7 +275,7 @@ def listed_dense(meta: Mapping[str, Any]) -> set[str]:
 
 
 def check_dense(name: str, M: Matrix) -> None:
-    """Check that a matrix, stored as a dense array, would not exceed the memory limit.
+    """Check that a matrix would not exceed the memory limit as a dense array.
 
     Raises
     ------
@@ -288,11 +289,11 @@ def check_dense(name: str, M: Matrix) -> None:
 def _check_foreign(
     matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
 ) -> None:
-    """Check that P is not an operator, and that the dense matrices are small enough."""
+    """Check that P is not an operator, and that dense matrices are within the limit."""
     if "maker" in meta:
         raise ValueError(
-            "holds P as an operator, which is read only where the run itself wrote it; "
-            "expected P as a matrix, as export writes it"
+            "contains P as an operator, which is read only from files of the same run; "
+            "expected P as a matrix, as in files of export"
         )
     for name in dense:
         check_dense(name, matrices[name])
@@ -301,16 +302,16 @@ def _check_foreign(
 def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
     if missing := [name for name in parts if name not in arrays]:
-        raise ValueError(f"{', '.join(missing)} missing beside fixed")
+        raise ValueError(f"{', '.join(missing)} missing, but fixed is present")
     if arrays["fixed"].dtype.kind not in "iu":
-        raise ValueError("fixed must hold integers")
+        raise ValueError("fixed must contain integers")
     fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
     K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
     N = K.shape[0]
     if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
         raise ValueError("the shapes of K, B, fixed and q are inconsistent")
     if ((fixed < 0) | (fixed >= N)).any():
-        raise ValueError(f"fixed holds indices out of range; expected 0 … {N - 1}")
+        raise ValueError(f"fixed contains indices out of range; expected 0 … {N - 1}")
     return Structure(K=K, B=B, fixed=fixed)
 
 
@@ -325,7 +326,7 @@ def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
     if arrays[name].dtype.kind not in "iuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
-    # Values beyond the range of a double become inf, for which callers check.
+    # Values beyond the range of a double become inf, which callers reject.
     with np.errstate(over="ignore"):
         return arrays[name].astype(float, copy=False)
 
@@ -334,10 +335,10 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     """Check the CSC parts of a stored matrix, and return the matrix."""
     data = _vector(arrays, f"{name}_data")
     if not np.isfinite(data).all():
-        raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
+        raise ValueError(f"{name}_data contains NaN or inf; expected finite numbers")
     indices, indptr, shape = (arrays[f"{name}_{part}"] for part in _PARTS[1:])
     if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
-        raise ValueError(f"{name}_indices, _indptr and _shape must hold integers")
+        raise ValueError(f"{name}_indices, _indptr and _shape must contain integers")
     try:
         return compressed(data, indices, indptr, tuple(shape.tolist()))
     except (ValueError, TypeError, OverflowError) as e:

@@ -1,9 +1,9 @@
 """Reading of text files from untrusted sources, within limits.
 
-A file must be regular (a device or a pipe may never end) and declare its size (files in
-/proc do not). Its content must be UTF-8, not exceed a limit that users can raise, and
-not be nested too deeply. All functions raise an `InputError` that states where the
-error is and what was expected.
+A file must be regular, since a device or a pipe may never end. It must also declare its
+size, which files in /proc do not. Its content must be UTF-8, must not exceed a limit
+that users can raise, and must not be nested too deeply. All functions raise an
+`InputError` that states where the error is and what was expected.
 """
 
 from __future__ import annotations
@@ -44,11 +44,10 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
     expected : description of the file, for messages
     """
     try:
-        # Checked before opening, since opening a device may have side effects.
+        # Check the type before opening, since opening a device may have side effects.
         regular = stat.S_ISREG(path.stat().st_mode)
-        flags = (
-            os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
-        )  # does not block if a pipe has replaced the file
+        # opening does not block if a pipe has replaced the file
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
         fd = os.open(path, flags) if regular else -1
     except (OSError, ValueError) as e:  # ValueError: a NUL character in the name
         why = e.strerror if isinstance(e, OSError) else "not a valid file name"
@@ -66,8 +65,8 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
                     f"expected {expected}"
                 )
             yield file
-        # Errors that state a file name or a full disk were caused by other files, which
-        # the block may write.
+        # Errors with a file name, or about a full disk, come from other files that the
+        # block writes.
         except OSError as e:
             if e.errno in (None, *FULL) or e.filename is not None:
                 raise
@@ -97,7 +96,7 @@ def read_text(
 
 
 def read_toml(path: Path, expected: str = "a TOML file") -> dict[str, Any]:
-    """Read and parse a TOML file."""
+    """Read and parse a TOML file; `expected` describes it in messages."""
     text = read_text(path, expected, MAX_TOML_MIB)
     try:
         return toml(text)
@@ -117,7 +116,7 @@ def toml(text: str) -> dict[str, Any]:
         raise InputError(f"{place}: {what}") from None
     except RecursionError:
         raise _too_deep() from None
-    except ValueError:  # Python limits the number of digits
+    except ValueError:  # Python limits the number of digits of an integer
         raise InputError(
             "an integer with too many digits; expected at most "
             f"{sys.get_int_max_str_digits()}"
@@ -126,7 +125,7 @@ def toml(text: str) -> dict[str, Any]:
 
 
 def read_json(path: Path, expected: str = "a JSON file") -> Any:
-    """Read and parse a JSON file."""
+    """Read and parse a JSON file; `expected` describes it in messages."""
     text = read_text(path, expected, MAX_JSON_MIB)
     try:
         data = json.loads(
@@ -146,7 +145,7 @@ def read_json(path: Path, expected: str = "a JSON file") -> Any:
 
 
 def _refuse_deep(data: object) -> None:
-    """Raise RecursionError if data are nested more than `MAX_LEVELS` deep."""
+    """Raise RecursionError if data are nested more than `MAX_LEVELS` levels deep."""
     level = [data]
     for _ in range(MAX_LEVELS + 1):
         level = [

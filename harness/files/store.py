@@ -50,7 +50,7 @@ def load_solution(folder: Path, digest: str, status: Status) -> Solution:
 
 
 def load_history(folder: Path, digest: str) -> History:
-    """Load only the history of a stored point; empty if none was stored.
+    """Load only the history of a stored point; the result is empty if none was stored.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 
 def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Yield the contact sides of a deformed state; files of old versions have none."""
+    """Yield the contact sides of a deformed state; old files contain none."""
     for i in range(len(arrays)):
         side = _with_prefix(_SIDE.format(i), arrays)
         if not set(side) >= {"name", *_ALONG}:
@@ -116,7 +116,7 @@ def write_point(path: Path, solution: Solution) -> None:
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
     """Write arrays to an npz file."""
-    with path.open("wb") as file:  # savez would append .npz to a name
+    with path.open("wb") as file:  # np.savez would append .npz to a path
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
@@ -156,7 +156,7 @@ def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # written by another program, which does not align arrays
+        except ValueError:  # written by a program that does not align arrays
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -173,7 +173,9 @@ def _expected(
             arrays = read(path)
     except InputError:
         raise
-    except Exception:  # zipfile raises many types for texts, pickles, damaged files
+    except (
+        Exception
+    ):  # zipfile raises many types of exceptions for texts, pickles and damaged files
         raise InputError(
             f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
         ) from None
@@ -189,7 +191,7 @@ def point_arrays(solution: Solution) -> Arrays:
 
 
 def _history(path: Path, arrays: Arrays) -> History:
-    """Return the history stored with a point; empty for files of old versions."""
+    """Return the history stored with a point; it is empty for files of old versions."""
     try:
         return checked_history(_with_prefix(_HISTORY, arrays))
     except ValueError as e:
@@ -207,7 +209,7 @@ def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
 
 @contextmanager
 def _restorable() -> Iterator[None]:
-    """Add the remedy to errors about files of a result folder, raised in the block."""
+    """Add a remedy to errors about files of a result folder that the block raises."""
     try:
         yield
     except InputError as e:
@@ -247,7 +249,7 @@ def copy_stored(source: Path, folder: Path, digest: str) -> bool:
 
 
 def _path(folder: Path, digest: str) -> Path:
-    """Check that a text is a digest, and return the path of the arrays stored under it.
+    """Check that a text is a digest, and return the path of the stored arrays.
 
     Any other text might contain a path that leads out of the folder.
     """
@@ -266,7 +268,7 @@ def save(folder: Path, arrays: Arrays) -> str:
         return digest
     archive = BytesIO()
     np.savez(archive, **arrays)  # type: ignore[arg-type]
-    # on the disk before the journal line that refers to the file is written
+    # flushed to the disk before the journal line that refers to the file is written
     replace_file(path, archive.getbuffer())
     return digest
 

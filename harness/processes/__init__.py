@@ -1,1 +1,1 @@
-"""Worker processes of a run: their protocol, their limits and measurements in them."""
+"""Worker processes of a run: protocol, limits and measurements."""

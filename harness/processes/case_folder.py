@@ -41,14 +41,14 @@ def find_or_build(
 ) -> StoredCase:
     """Return a case from the folder, building it first if it is missing or damaged.
 
-    Only one process at a time looks up or builds a given case; the others wait.
+    While one process looks up or builds a case, other processes that need it wait.
 
     folder : created if it does not exist; its parent must exist
     identity : plain data that identify the case and the environment of the build
     make : writes the QP to a file, flushes the file and returns the meta data. If
         `make` raises an exception, nothing is stored and the exception propagates
     """
-    folder.mkdir(exist_ok=True)  # fails if the result folder around it was moved
+    folder.mkdir(exist_ok=True)  # fails if the result folder was moved
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
     with _locked(folder / f"{key}.lock"):
         stored = _look_up(folder, key)
@@ -65,7 +65,7 @@ def find_or_build(
         size = path.stat().st_size
         index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
         text = json.dumps({**index, "check": _check(index)})
-        # The index is written last: a build that is killed earlier leaves no entry.
+        # Write the index last, so that a killed build leaves no entry.
         replace_file(folder / f"{key}.json", text.encode())
         return StoredCase(qp=path, digest=digest, meta=meta)
 
@@ -83,7 +83,7 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
         if index.pop("check") != _check(index):
             return None
         path = folder / f"{index['digest']}.npz"
-        # Compare sizes first: hashing would read all of a file that was enlarged.
+        # Compare sizes first, since hashing would read an enlarged file completely.
         if path.stat().st_size != index["bytes"]:
             return None
         if content_digest(path) != index["digest"]:
@@ -102,7 +102,7 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
 
 
 def _check(index: Mapping[str, Any]) -> str:
-    """Return the digest of an index, since the QP's digest does not cover meta data."""
+    """Return the digest of an index, whose meta data the QP's digest does not cover."""
     return hex_digest([json.dumps(index, sort_keys=True).encode()], 16)
 
 

@@ -1,4 +1,4 @@
-"""Process that builds cases, so that the code of families runs outside the parent.
+"""Process that builds cases; the code of families runs here, not in the parent.
 
 The process follows `harness.processes.protocol` and answers four kinds of requests:
 
@@ -11,11 +11,12 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
   {…}, "notes": […]}``, with the physical quantities of the point and the bounds of its
   error. If ``fields`` is a path and the case defines a deformed state, this state is
   written to ``fields``
-* ``{"shared": NAME}`` asks, without building the case, whether ranks can emit its QP
-  themselves. Reply: ``{"event": "done", "shared": …}``
+* ``{"shared": NAME}`` determines, without building the case, whether MPI ranks can emit
+  the QP of the case. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
-  solver, if the residuals do not decide a verdict, and writes the solution to the
-  second. Reply: ``{"event": "done", "found": …}``, false if the reference solver fails
+  solver and writes the solution to the second file. It is sent if the residuals do not
+  decide a verdict. Reply: ``{"event": "done", "found": …}``, false if the reference
+  solver fails
 
 If a case cannot be built, the reply to the first two requests is ``{"event": "done",
 "unbuilt": REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true if the case
@@ -57,10 +58,11 @@ from mortarbench.harness.verify.verdicts import certified, note_of, plain, quant
 
 MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are cached
 #: The first dual case of a process is built again if its build took less than this
-#: time, in s. First calls (page faults, caches, late imports) took 12 of the 14 ms of
-#: dualising the smallest demo case, and imports alone may take a second. Without a
-#: second build this time would be charged to the dual form. In a build of more than ten
-#: seconds it is negligible, whereas a second build would be expensive.
+#: time, in s. Effects of first calls (page faults, caches, late imports) took 12 of the
+#: 14 ms of dualising the smallest demo case, and imports alone may take a second.
+#: Without a second build, this time would be charged to the dual form. In a build of
+#: more than ten seconds, this time is negligible, whereas a second build would be
+#: expensive.
 MAX_WARM_UP_SECONDS = 10.0
 
 
@@ -79,13 +81,13 @@ class CaseWorker:
     _build_seconds: float = 0.0  # duration of the last build
     _build_peak_mib: float | None = None  # peak memory during that build
     _warm: bool = False  # True once a dual case has been built
-    #: error bounds and objection (see `certified`) by case name and digest of the point
+    #: error bounds and note (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict
     )
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request; the reply reports any failure of the family's code."""
+        """Answer one request; the reply reports failures of the family's code."""
         if "solve" in request:
             return self._solve(Path(request["solve"]), Path(request["point"]))
         fields = request.get("build") or request.get("describe") or request["shared"]
@@ -135,10 +137,11 @@ class CaseWorker:
     def _certify(
         self, case: Case, name: CaseId, s: Solution
     ) -> tuple[dict[str, Any], str]:
-        """Bound the error of a point, or return the bounds of an identical earlier one.
+        """Bound the error of a point, or look up the bounds of an identical point.
 
-        Most solvers return the same digits in every repeat. Then only the answer of the
-        first repeat is certified, and only its record has `certify_seconds`.
+        Most solvers return identical points in all repeats. In this case, only the
+        answer of the first repeat is certified, and only its record has
+        `certify_seconds`.
         """
         key = name.name, digest_of(point_arrays(s))
         if key in self._bounds:
@@ -160,7 +163,7 @@ class CaseWorker:
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
-        # drop cases before the build, since two of them may not fit in memory
+        # drop cases before the build, since two cases may not fit in memory
         while len(self._cases) >= keep:
             del self._cases[next(iter(self._cases))]
         if case is None:

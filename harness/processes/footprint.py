@@ -1,10 +1,10 @@
 """Memory of a tree of processes, including shared memory.
 
-Resident memory (VmRSS) counts shared memory only where it is mapped and touched. A file
-in /dev/shm, however, occupies memory even if no process has mapped it or the process
-that created it has ended. Each such file is therefore counted once, and removed
-together with the tree: libraries that share arrays between processes (joblib,
-multiprocessing, MPI) leave these files behind if they are killed.
+Resident memory (VmRSS) includes shared memory only if a process has mapped and touched
+it. A file in /dev/shm, however, occupies memory even if no process has mapped it or the
+process that created it has ended. Each such file is therefore counted once, and it is
+removed when the tree has ended. Libraries that share arrays between processes (joblib,
+multiprocessing, MPI) would otherwise leave these files behind if they are killed.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Footprint:
 
         Resident sizes are cheap to read, but their sum counts a shared page once per
         process. If this sum exceeds `limit`, in MiB, the proportional set sizes are
-        read instead. They divide a shared page among the processes that map it, but
-        require the kernel to walk all page tables.
+        read instead. They divide the size of a shared page among the processes that map
+        it, but the kernel has to walk all page tables to compute them.
         """
         tree = list(tree)
         self.notice(tree)
@@ -44,7 +44,7 @@ class Footprint:
                     sizes[status.st_ino] = 512 * status.st_blocks
         files = sum(sizes.values()) / 2**20
         private, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
-        # The maximum, not the sum: both include the mapped pages of these files.
+        # Take the maximum, since both numbers include the mapped pages of these files.
         total = private + max(mapped, files)
         if total > limit and len(tree) > 1:
             private, mapped = _sum(
@@ -54,9 +54,9 @@ class Footprint:
         return total
 
     def notice(self, tree: Iterable[int]) -> None:
-        """Record the new files in SHARED that processes of a tree have open or mapped.
+        """Record new files in SHARED that processes of a tree have opened or mapped.
 
-        Other programs create files there as well, so only open or mapped files are
+        Other programs also create files in SHARED, so only open or mapped files are
         attributed to the tree.
         """
         new = dict(set(_listed().items()) - self._before)
@@ -67,7 +67,7 @@ class Footprint:
                     self._created[name] = new[name]
 
     def remove_shared(self) -> None:
-        """Remove the files that the tree left in SHARED; its processes have ended."""
+        """Remove the files that the ended processes of the tree left in SHARED."""
         for path in self._remaining():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():

@@ -1,11 +1,11 @@
-"""Workers forked from the parent, instead of being started as new interpreters.
+"""Workers that are forked from the parent instead of started as new interpreters.
 
 A fork saves half a second of CPU time for loading numpy and scipy. Like a worker
 started by its command, a forked worker runs below a sub-reaper
-(`harness.processes.reaper`), in its own session, on one CPU, with no open files except
-its log and its two pipes. Since it starts with a copy of the parent's memory, it is
-forked before the parent reads or builds any data, and only if the parent has a single
-thread (`is_safe`).
+(`harness.processes.reaper`), in its own session, and on one CPU. Its only open files
+are its log and its two pipes. A forked worker starts with a copy of the parent's
+memory. It is therefore forked before the parent reads or builds any data, and only if
+the parent has a single thread (`is_safe`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Fork:
         self.pid = pid
         # The kernel may reuse the ID of a reaped process, but not the pidfd.
         self._process_fd = os.pidfd_open(pid)
-        self.stdin = stdin  #: pipe to the sub-reaper, which kills the tree if it closes
+        #: pipe to the sub-reaper, which kills the tree if the pipe is closed
+        self.stdin = stdin
 
     def wait(self, timeout: float | None = None) -> None:
         """Wait until the process has ended.
@@ -87,7 +88,7 @@ def fork(
     environment : environment variables to set in the worker
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        stream.flush()  # otherwise the child would write a copy of the buffer
+        stream.flush()  # otherwise the child would write a copy of the buffered output
     child_end, parent_end = os.pipe()
     pid = os.fork()
     if pid:
@@ -109,7 +110,7 @@ def fork(
                     os.close(fd)
         os.environ.update(environment)
         reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)
-    finally:  # the fork must never return into the caller's frames
+    finally:  # the fork must never return to the caller
         os._exit(1)
 
 

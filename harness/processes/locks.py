@@ -1,4 +1,4 @@
-"""Locks between threads of a process that may fork."""
+"""Locks for the threads of a process that may fork."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class ForkSafeLock(ContextDecorator):
         self._lock.release()
 
     def _release_in_child(self) -> None:
-        if self._lock.acquire(blocking=False):  # free, or held by the forking thread
+        # the lock was free, or held by the forking thread
+        if self._lock.acquire(blocking=False):
             self._lock.release()
         else:
             self._lock = RLock()

@@ -46,11 +46,12 @@ from mortarbench.harness.verify.verdicts import (
 #: Largest CPU time that the harness may use between the events "start" and "timed"
 #: while the worker's clock is stopped.
 HARNESS_SECONDS = 0.005
-#: Further CPU time of this kind, per repeat of the solve. On a busy machine 0.12 ms
-#: were measured; the margin avoids false suspicion of a solver.
+#: Largest further CPU time of the harness per repeat of the solve. On a busy machine,
+#: 0.12 ms were measured; the margin prevents false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor, and also by one of the times below: ratios of tiny times are unreliable.
+#: factor. The difference of the times must also exceed `MIN_GAIN_SECONDS` or
+#: `MIN_GAIN_BETWEEN_SECONDS`, because ratios of tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
 #: smallest suspicious difference between the times of solves in one measurement
 MIN_GAIN_SECONDS = 1e-3
@@ -66,8 +67,8 @@ class JudgedMeasurement(NamedTuple):
 
     record: Record
     solution: Solution | None  #: None if the worker ended without an answer
-    #: True if there is a point but its quantities or error bounds are missing. They are
-    #: present if the ranks that solved the QP have evaluated their answer completely.
+    #: True if there is a point but its quantities or error bounds are missing. False if
+    #: the ranks that solved the QP have evaluated their answer completely.
     needs_evaluation: bool = True
 
 
@@ -84,7 +85,7 @@ def measure_and_judge(
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
     whole : returns the entire QP. If ranks emit the QP and evaluate the answer, `whole`
-        is called only for values that they cannot evaluate
+        is called only for values that the ranks cannot evaluate
     request : request to the worker, see `harness.processes.worker`; the tolerance and
         the memory limit are added. The worker writes the point to the file ``out``
     time_limit, memory_limit : limits in s and MiB
@@ -163,7 +164,7 @@ def measure_and_judge(
 
 
 def _as_tuples(data: Any) -> Any:
-    """Convert lists back to tuples, which JSON stores as lists."""
+    """Convert lists to tuples, since JSON stores tuples as lists."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data
@@ -180,7 +181,8 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-    ):  # rank 0 measures only its own memory; the parent measures all ranks
+        # rank 0 measures its own memory, the parent the memory of all ranks
+    ):
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
@@ -189,7 +191,7 @@ def _with_cost(
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Return the entry of a request that states the case whose QP the ranks emit."""
+    """Return the entry of a request that specifies the case whose QP the ranks emit."""
     case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
 
@@ -203,7 +205,7 @@ def sizes_from_ranks(
     unchanged.
 
     emitted : entries of the event "emitted", see `harness.processes.protocol`; None if
-        it was not sent
+        the event was not sent
     """
     if emitted is None or not emitted["sizes"]:
         return qp_of_sizes(0, 0), record
@@ -214,14 +216,14 @@ def sizes_from_ranks(
 
 
 def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
-    """Return the worker's times if they are plausible, else the parent's with a note.
+    """Return the worker's times if plausible, else the parent's time with a note.
 
     The sum T of the worker's times must satisfy
 
         CPU time − harness overhead ≤ T ≤ wall time,
 
-    where the parent measures CPU time and wall time. A larger T means that the worker's
-    clock was wrong, a smaller T that the solver computed while this clock was stopped.
+    where the parent measures CPU time and wall time. If T is larger, the worker's clock
+    was wrong. If T is smaller, the solver computed while this clock was stopped.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
@@ -277,7 +279,7 @@ def _caching_notes(
 
 
 def _check_memory(limit: float, record: Record) -> Record:
-    """Change the verdict if the solver exceeded the memory limit or failed due to it.
+    """Set the verdict MEMORY_LIMIT if the solver exceeded the limit or lacked memory.
 
     limit : MiB
     """
@@ -297,12 +299,12 @@ def _check_memory(limit: float, record: Record) -> Record:
 def single_worker(
     command: list[str], serve: Serve | None = None
 ) -> Iterator[WorkerProcess]:
-    """Provide a worker for one measurement; the worker is ended with the context.
+    """Provide a worker for one measurement; the worker ends with the context.
 
     command : starts the worker; two file descriptors are appended
-    serve : main function of the worker as a fork of this process. If a fork is safe, it
-        is used instead of `command`, and started at once, before this process loads
-        data that the worker does not need
+    serve : main function of the worker as a fork of this process. If forking is safe,
+        the worker is forked at once, before this process loads data that the worker
+        does not need. Otherwise, `command` starts the worker
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")
@@ -324,11 +326,11 @@ def measure_once(
 ) -> tuple[Record, Solution | None]:
     """Measure once without limits, judge the answer, and evaluate its quantities.
 
-    case : returns the case, which the first call builds
+    case : returns the case; the first call builds it
     reference : reference solver, called if the residuals alone do not decide the
         verdict
-    source : origin of the QP. If it is `Source.RANKS`, the ranks judge their answer
-        themselves, and the case is built only for values that they cannot evaluate
+    source : origin of the QP. For `Source.RANKS`, the ranks judge their answer
+        themselves, and the case is built only for values that the ranks cannot evaluate
 
     Raises
     ------
@@ -378,7 +380,7 @@ def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
     Folders that killed processes left behind are removed first. Each process holds a
-    lock on its folder, which the kernel releases when the process ends; a folder whose
+    lock on its folder, which the kernel releases when the process ends. A folder whose
     lock is free is therefore abandoned.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
@@ -391,8 +393,8 @@ def scratch_folder() -> Iterator[Path]:
                 finally:
                     os.close(lock)
     is_ours = False
-    # Before the new folder is locked, another process may mistake it for an abandoned
-    # one and remove it. In that case another folder is created.
+    # Before the new folder is locked, another process may treat it as abandoned and
+    # remove it. In this case, another folder is created.
     while not is_ours:
         with TemporaryDirectory(prefix=_SCRATCH) as name:
             path = Path(name) / _LOCK

@@ -7,12 +7,12 @@ more events. The worker ends when the pipe of requests is closed.
 * ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
 * Every other request is answered by ``{"event": "start"}``, at which the parent starts
   its clock, and by ``{"event": "done", …}`` with the answer. In a measurement, the
-  worker sends ``{"event": "timed"}`` between these two, when its own clock has stopped.
-  The worker then waits for a line from the parent, so that the parent can read the
-  worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
-  "emitted", …}`` before "start", and ``{"event": "measured"}`` after "timed", before
-  the ranks evaluate the answer.
-* ``{"event": "fault", "what": …}`` replaces any of these events if code of the harness
+  worker sends ``{"event": "timed"}`` between these two events, when its own clock has
+  stopped. The worker then waits for a line from the parent, so that the parent can read
+  the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
+  "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
+  answer, rank 0 sends ``{"event": "measured"}``.
+* ``{"event": "fault", "what": …}`` replaces any other event if code of the harness
   fails.
 
 A library that writes to the wrong file descriptor can mix other bytes into the replies;
@@ -32,7 +32,8 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-MAX_REPLY_BYTES = 2**22  #: largest reply that is read, to bound the memory for it
+#: size of the largest reply that is read, which bounds the required memory
+MAX_REPLY_BYTES = 2**22
 MAX_EXCERPT_CHARACTERS = 200  #: longest excerpt of an invalid reply in a message
 MAX_FAULT_CHARACTERS = 2000  #: longest message of the event "fault"
 
@@ -76,8 +77,9 @@ def answer_requests(
                 else:
                     answer = handle(request, _events(requests, replies))
                     reply = {"event": "done", **answer}
-                sys.stdout.flush()  # because the next request truncates the log
-            except Exception as e:  # from our code: handlers catch errors of solvers
+                sys.stdout.flush()  # the next request truncates the log
+            # raised by code of the harness; handlers catch errors of solvers
+            except Exception as e:
                 traceback.print_exc()
                 what = " ".join(f"{type(e).__name__}: {e}".split())
                 reply = {"event": "fault", "what": what[:MAX_FAULT_CHARACTERS]}
@@ -116,9 +118,11 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     try:
         reply = json.loads(line)
     except ValueError:
-        raise ForeignReplyError(f"{_excerpt(line)} came, expected a reply") from None
+        raise ForeignReplyError(
+            f"{_excerpt(line)} was received, expected a reply"
+        ) from None
     if not isinstance(reply, dict) or reply.get("event") not in (expected, "fault"):
-        raise ForeignReplyError(f"{_excerpt(line)} came, expected {expected!r}")
+        raise ForeignReplyError(f"{_excerpt(line)} was received, expected {expected!r}")
     return reply
 
 
@@ -142,8 +146,10 @@ class Source(StrEnum):
     #: The worker and the parent read the QP from a file; the parent judges the answer
     FILE = "file"
     #: Each MPI rank emits its share of the QP. The parent has the entire QP and judges
+    #: the answer
     SHARES = "shares"
-    #: Each rank emits its share, and the ranks judge jointly; none has the entire QP
+    #: Each MPI rank emits its share of the QP, and the ranks jointly judge the answer.
+    #: No process has the entire QP
     RANKS = "ranks"
 
     @property

@@ -1,10 +1,11 @@
 """Workers on several MPI ranks, and the process that starts them.
 
-Runs start `launch` in place of a worker: it calls `mpiexec`, which starts the worker's
-command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
-of `harness.processes.worker` and communicates with the parent; the other ranks execute
-orders that rank 0 sends. Each rank has its own CPU if there are enough CPUs. The memory
-limit applies to the sum over all ranks, and if one rank ends, all others are ended.
+Runs start `launch` in place of a worker. `launch` calls `mpiexec`, which starts the
+worker's command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the
+worker of `harness.processes.worker` and communicates with the parent; the other ranks
+execute orders that rank 0 sends. Each rank has its own CPU if there are enough CPUs.
+The memory limit applies to the sum over all ranks. If one rank ends, all other ranks
+are ended.
 
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
@@ -69,12 +70,13 @@ _IDLE_SECONDS = 2e-4  #: time between two probes for an order
 def launch(ranks: int, command: Sequence[str]) -> int:
     """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
-    A process above each rank records how the rank ended (`harness.processes.reaper`).
-    The message names the rank that ended first, which is the cause of the others' end:
-    if one rank ends while others are running, the others are ended, whatever its exit
-    code. The output of the ranks is not parsed, since its lines may be interleaved.
+    A parent process of each rank records how the rank ended
+    (`harness.processes.reaper`). If one rank ends while others are running, the others
+    are ended, whatever the exit code. The message therefore names the rank that ended
+    first. The output of the ranks is not parsed, since its lines may be interleaved.
 
-    command : the last two elements are file descriptors, which the ranks inherit
+    command : command line; its last two elements are file descriptors, which the ranks
+        inherit
 
     Returns
     -------
@@ -98,15 +100,15 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         pass_fds=(*fds, write),
         env=os.environ | {RECORD: str(write)},
     )
-    # If this process kept an end of a pipe open, a reader would not see end of file
-    # after the ranks or the parent have closed their ends.
+    # Close this process's copies of the pipe ends. Otherwise, readers would not receive
+    # end of file after the ranks or the parent have closed theirs.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
-        message = first or f"one of {ranks} ranks ended: mpiexec says {code}"
-        # The parent quotes the last line of the output, which must not begin with the
+        message = first or f"one of {ranks} ranks ended: mpiexec exited with {code}"
+        # The parent quotes the last line of the output. The newline ends a possibly
         # unfinished line of a rank.
         print(f"\n{message}", file=sys.stderr)
     return 0 if code == 0 else 1
@@ -116,9 +118,10 @@ class _RankExits:
     """Exits of the ranks, in chronological order.
 
     epoll(7) lists file descriptors in the order in which they became ready, even if it
-    is polled late. This identifies the rank that ended first, whereas mpiexec names the
-    one with the lowest number. The process above a rank writes the exit status of the
-    rank; the status is unknown if that process was killed before it could write.
+    is polled late. This order identifies the rank that ended first, whereas mpiexec
+    names the ended rank with the lowest number. The parent process of a rank writes the
+    exit status of the rank. The status is unknown if the parent process was killed
+    before it wrote the status.
     """
 
     def __init__(self, record: int, ranks: int) -> None:
@@ -137,7 +140,7 @@ class _RankExits:
         """Wait until mpiexec has ended; describe the exit of the first rank that ended.
 
         After the first exit, whatever its code, the wait is limited to `PEER_TIMEOUT`.
-        Return "" if mpiexec ended before all ranks.
+        Return "" if mpiexec ended before any rank.
 
         mpiexec : process ID
         """
@@ -161,7 +164,7 @@ class _RankExits:
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
         way = self._exit_description.get(
-            self._first, "killed, as was the process above it"
+            self._first, "killed together with its parent process"
         )
         return f"{one} of {self._ranks} ranks ended: {way}"
 
@@ -254,14 +257,15 @@ def follow(
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
             elif "evaluate" in order and emitted and solution:
-                run = share = None  # free the solver's memory before evaluating
+                run = share = None  # free the solver's memory before the evaluation
                 limit(None)
                 evaluated_by_ranks(emitted, solution, ranks)
             elif run is not None and share is not None:
                 solution, _ = _solve_on_ranks(run, share, ranks)
         except BaseException as e:
-            # If rank 0 failed too, it reports the failure and sends its next order. No
-            # order means that rank 0 is waiting for this rank, so all must be aborted.
+            # If rank 0 also failed, it reports the failure and sends its next order. If
+            # no order arrives, rank 0 is waiting for this rank, so all ranks are
+            # aborted.
             if _wait_for_order(ranks, PEER_TIMEOUT):
                 continue
             abort(ranks, e)
@@ -287,7 +291,7 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
 
 
 class RankCosts(NamedTuple):
-    """Cost of a solve on several ranks, as pairs (mean, largest) over the ranks.
+    """Costs of a solve on several ranks, each a pair (mean, largest) over the ranks.
 
     The tables are empty for a solve in a single process.
     """
@@ -304,8 +308,8 @@ class RankCosts(NamedTuple):
 class ParallelSolver:
     """Solver on rank 0 that sends orders to the other ranks.
 
-    The ranks jointly solve one QP, of which each has a share. If `copies` is True, each
-    rank instead solves a copy of the entire QP.
+    The ranks jointly solve one QP, and each rank has a share of the QP. If `copies` is
+    True, each rank instead solves a copy of the entire QP.
 
     Attributes
     ----------
@@ -316,7 +320,7 @@ class ParallelSolver:
     def __init__(
         self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
     ) -> None:
-        # under this name, messages of failures find the file of the wrapped solver
+        # messages of failures use `__wrapped__` to find the file of the wrapped solver
         self._solver = self.__wrapped__ = solver
         self._ranks = ranks
         self._emit = emit
@@ -382,7 +386,7 @@ class ParallelSolver:
         return getattr(self._solver, "accepts", (Box,))
 
     def declines(self, qp: QP) -> str | None:
-        """Return why the QP cannot be solved on these ranks, or None if it can."""
+        """Return the reason why the ranks cannot solve the QP, or None if they can."""
         if self._copies:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
@@ -408,7 +412,7 @@ class ParallelSolver:
         return self._solver.declines(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks; return once the slowest of them is ready."""
+        """Prepare on all ranks; return when the slowest rank is ready."""
         if self._emission_error is not None:
             raise self._emission_error
         if self._emitted is not None:
@@ -453,7 +457,7 @@ def _emit_on_ranks(
     InputError
         If the family raises it on every rank.
     RankFailedError
-        If some ranks fail in another way.
+        If some ranks fail with another error.
 
     """
     start = time.perf_counter()
@@ -474,7 +478,8 @@ def _emit_on_ranks(
 def qp_of_sizes(variables: int, equality_rows: int) -> QP:
     """Return a placeholder of given sizes for a QP that no single process stores.
 
-    The vectors in the primal variables are broadcast scalars and take no memory.
+    Vectors with a component for each variable are broadcast scalars, which occupy
+    almost no memory.
     """
     n, m = variables, equality_rows
     zeros = np.broadcast_to(0.0, n)
@@ -511,7 +516,7 @@ def _solve_on_ranks(
     """
     ranks.clear()
     s = run()
-    # read before `share.whole`, whose communication is not a part of the solve
+    # copy before `share.whole`, whose communication does not belong to the solve
     seconds, counts = dict(ranks.seconds), dict(ranks.counts)
     solution = share.whole(s)
     peak = memory_mib("VmHWM") or 0.0

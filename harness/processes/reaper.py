@@ -1,27 +1,28 @@
-"""Sub-reaper: the process above a worker that ends all processes the worker started.
+"""Sub-reaper: parent of a worker that ends all processes the worker started.
 
 Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, the script starts COMMAND in a new
-session, bound to one CPU, and exits with the same code or signal. Every worker has a
-sub-reaper, so the script is run by an interpreter without site packages, which starts
-faster. A *sub-reaper* adopts each descendant whose parent ends, see prctl(2), so that
-neither a double fork nor setsid(2) removes a process from its tree. The tree is killed
+session, bound to one CPU, and exits with the same code or signal. The script is run by
+an interpreter without site packages, which starts faster, since every worker has a
+sub-reaper. A *sub-reaper* adopts each descendant whose parent ends, see prctl(2), so
+that neither a double fork nor setsid(2) removes a process from its tree. The tree is
+killed
 
 * when COMMAND ends, and
 * when the other end of the sub-reaper's standard input is closed, either by the process
   that started it or, if that process dies, by the kernel.
 
-System V segments of shared memory that COMMAND created are removed as well, because
-they outlive all processes.
+System V segments of shared memory that COMMAND created are also removed, because they
+persist after all processes have ended.
 
 Run as ``reaper.py rank RECORD COMMAND…``, the script is the parent of one MPI rank: it
-starts COMMAND, writes its process ID and later its wait status to the file descriptor
-RECORD, and exits with the same code or signal. Until then it keeps the inherited
-descriptors open, so that mpiexec does not end the other ranks before the record is
-written.
+starts COMMAND, writes the process ID and later the wait status of COMMAND to the file
+descriptor RECORD, and exits with the same code or signal. Until its exit, the script
+keeps the inherited descriptors open, so that mpiexec does not end the other ranks
+before the record is written.
 
-The process of the run is not a sub-reaper itself, for three reasons: if it were killed,
-it could not clean up; the trees of two workers would be indistinguishable; and it would
-adopt processes unrelated to this package in a Python session that imports it.
+The process of the run is not a sub-reaper itself, for three reasons. If it were killed,
+it could not clean up. The trees of two workers would be indistinguishable. In a Python
+session that imports this package, it would adopt unrelated processes.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
-TYPE_CHECKING = False  # importing typing (or json) would cost each worker 10 ms
+TYPE_CHECKING = False  # importing typing (or json) would take 10 ms in each worker
 if TYPE_CHECKING:
     from typing import NoReturn
 
 #: list of the System V segments of shared memory, see proc(5)
 SEGMENTS = "/proc/sysvipc/shm"
-END_SECONDS = 5.0  #: longest time to wait for the end of processes sent SIGKILL
+END_SECONDS = 5.0  #: longest time to wait for the end of processes after SIGKILL, s
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
@@ -60,7 +61,7 @@ def descendants(root: int) -> list[int]:
     while unseen:
         process = unseen.pop()
         with suppress(OSError):  # the process, or a thread of it, may have ended
-            # children are listed under the thread that forked them
+            # /proc lists children under the thread that forked them
             for task in os.listdir(f"/proc/{process}/task"):
                 with (
                     suppress(OSError),
@@ -85,7 +86,7 @@ def is_alive(process: int) -> bool:
 
 
 def state(process: int, task: int | None = None) -> str:
-    """Return the state of a process or thread, a letter of proc(5); "" if it ended."""
+    """Return the state of a process or thread, a letter of proc(5), or "" if ended."""
     where = str(process) if task is None else f"{process}/task/{task}"
     return _status(where, 0)
 
@@ -106,10 +107,10 @@ def _status(where: int | str, field: int) -> str:
 def kill_descendants(root: int) -> None:
     """Kill every process below `root`, and wait until they have ended.
 
-    All processes are stopped before the first is killed, and the tree is listed again
-    until no new process appears. A stopped process cannot fork, whereas a process that
-    forks quickly could escape if the others were killed singly. The wait, which a
-    process in uninterruptible sleep could prolong, takes at most `END_SECONDS`. Every
+    All processes are stopped before any process is killed, and the tree is listed again
+    until no new process appears. A stopped process cannot fork. If processes were
+    killed one by one, a process that forks quickly could escape. The wait takes at most
+    `END_SECONDS`, since a process in uninterruptible sleep could prolong it. Every
     process is sent SIGKILL at least once, however slow the machine is.
     """
     deadline = time.monotonic() + END_SECONDS
@@ -124,15 +125,15 @@ def kill_descendants(root: int) -> None:
         for process in stopped:
             _send(process, signal.SIGKILL, root)
         if root == os.getpid():
-            _reap()  # because orphans became children of the sub-reaper
-        # checked after the signals, so that each of them is sent at least once
+            _reap()  # orphans became children of the sub-reaper
+        # check after sending the signals, so that each signal is sent at least once
         if time.monotonic() > deadline:
             return
         time.sleep(0.001)
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process below `root`, but not to one that reuses its ID.
+    """Send a signal to a process below `root`, but not to another that reuses its ID.
 
     A pidfd always refers to the same process. If the process with this ID still belongs
     to the tree after the pidfd was opened, the pidfd refers to a process of the tree.
@@ -140,7 +141,8 @@ def _send(process: int, number: int, root: int) -> None:
     process : process ID
     number : number of the signal
     """
-    with suppress(OSError):  # it has ended, or another user's process reuses its ID
+    # the process has ended, or another user's process reuses its ID
+    with suppress(OSError):
         fd = os.pidfd_open(process)
         try:
             if _is_below(process, root):
@@ -188,7 +190,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     pipes : file descriptors of the worker's pipes, closed in this process
     """
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-    # SIGCHLD wakes the poll below through a pipe. Without the pipe, a signal that
+    # SIGCHLD wakes the poll of `events` through a pipe. Without the pipe, a signal that
     # arrives just before the poll would be missed.
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -206,7 +208,8 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         os.close(null)
         os.sched_setaffinity(0, {cpu})
         begin()
-    # If this process kept the pipes open, the parent would not see the worker's death.
+    # If this process kept the pipes open, the parent would not notice the worker's
+    # death.
     for fd in pipes:
         os.close(fd)
     others = os.sched_getaffinity(0) - {cpu}
@@ -227,8 +230,8 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     kill_descendants(reaper)
     # If the init process of a container reaps nothing, zombies would accumulate.
     _reap()
-    # Remove only segments whose creator has ended: a living process with the same ID is
-    # a different one, to which the segment may belong.
+    # Remove only segments whose creator has ended. If a process with the ID of the
+    # creator is alive, the ID was reused, and the segment may belong to this process.
     for segment, creator in shared_segments().items():
         if segment not in before and creator in creators and not is_alive(creator):
             ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
@@ -247,7 +250,7 @@ def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
 
 
 def _write(record: int, **what: int) -> None:
-    """Write a line of JSON by a single write(2), so that lines of ranks do not mix."""
+    """Write a line of JSON by a single write(2); lines of ranks do not interleave."""
     line = ", ".join(f'"{name}": {value}' for name, value in what.items())
     with suppress(OSError):  # raised if the reader has ended
         os.write(record, f"{{{line}}}\n".encode())
@@ -266,7 +269,7 @@ def _fork_bound_to_parent() -> int:
 
 
 def _execute(command: list[str]) -> NoReturn:
-    # Python ignores these signals, and the disposition would survive execve(2).
+    # Python ignores these signals, and execve(2) would preserve this disposition.
     for number in (signal.SIGPIPE, signal.SIGXFSZ):
         signal.signal(number, signal.SIG_DFL)
     try:

@@ -1,10 +1,10 @@
 """Solver objects stored in files, from which worker processes load copies.
 
 Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
-notebook) with their code. It refers to functions and classes of other modules by name.
-A worker would not find plug-ins or modules in the folder of the script, since workers
-do not search the working directory. Such modules are therefore stored with their code
-as well.
+notebook) with their code. It stores only the names of functions and classes of other
+modules. A worker would not find plug-ins or modules in the folder of the script, since
+workers do not search the working directory. Such modules are therefore also stored with
+their code.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def write_solver(path: Path, solver: Solver) -> None:
 def read_solver(path: Path) -> Any:
     """Load a solver that `write_solver` has stored.
 
-    The file is unpickled, so it must be one that a process of the same user wrote.
+    The file is unpickled, so it must have been written by a process of the same user.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def read_solver(path: Path) -> Any:
 
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
-    """Yield loaded modules that a worker cannot find or finds in another file."""
+    """Yield loaded modules that a worker would not find, or find in another file."""
     importable: dict[str, bool] = {}  # by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)

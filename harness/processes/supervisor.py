@@ -1,15 +1,15 @@
-"""Supervision of a worker process by its parent: requests, limits, diagnosis of exits.
+"""Supervision of a worker process: requests, limits and diagnosis of exits.
 
-Only SIGKILL to all processes of a worker stops every solver: C code ignores alarms, and
-some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
-keeps these processes in one tree. Memory is limited by polling the resident size,
-because RLIMIT_AS counts address space that libraries reserve and never touch. The
-module requires /proc of Linux.
+Only SIGKILL to all processes of a worker stops every solver, because C code ignores
+alarms and some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above
+each worker keeps these processes in one tree. Memory is limited by polling the resident
+size, because RLIMIT_AS includes address space that libraries reserve and never touch.
+The module requires the /proc file system of Linux.
 
 The times that a worker reports are checked against the parent's clock and against the
 CPU time that the kernel counts. While one worker executes a request, all other workers
-on its CPU are stopped by SIGSTOP, so that threads which a solver leaves running do not
-disturb the measurement of another solver. Requests from several threads are therefore
+on its CPU are stopped by SIGSTOP, so that running threads of one solver do not disturb
+the measurement of another solver. Requests from several threads are therefore
 serialised. Signals are sent to pidfds, see pidfd_open(2), never to process IDs, which
 the kernel reuses.
 """
@@ -53,15 +53,18 @@ POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit for starting a worker, and for loading a QP
 WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
 POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
-#: time that a worker has to exit after its pipe of requests is closed, before SIGKILL
+#: longest time between the closing of the pipe of requests and the exit of a worker,
+#: after which the worker is killed
 CLOSE_SECONDS = 1.0
-#: time that a sub-reaper has to exit after its descendants have ended
+#: longest time between the end of its descendants and the exit of a sub-reaper
 END_SECONDS = 1.0
-SETTLE_SECONDS = 0.5  #: time that idle threads of pools may spin after an answer
-#: CPU time of a worker between answer and next request, relative to wall time, above
-#: which the worker counts as busy
+#: longest time for which idle threads of pools may spin after an answer
+SETTLE_SECONDS = 0.5
+#: CPU time of a worker between an answer and the next request, relative to wall time,
+#: above which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is ignored
+#: CPU time between an answer and the next request that is ignored
+MIN_BUSY_CPU_SECONDS = 0.01
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
@@ -70,13 +73,13 @@ _MIN_FD = 3  #: smallest descriptor of a pipe; smaller ones are standard streams
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
-_LOCK = ForkSafeLock()  #: held while a thread starts, stops or ends a worker or asks it
+_LOCK = ForkSafeLock()  #: held while a thread starts, stops, ends or queries a worker
 
 REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: bits in the ID of a CPU clock, see clock_getcpuclockid(3)
-#: Signals that solvers do not send to themselves. If one of them ends a worker before a
-#: solve, the worker was killed from outside.
+_CPUCLOCK_SCHED = 2  #: bits in the ID of a CPU clock; see clock_getcpuclockid(3)
+#: Signals that solvers do not send to themselves. If such a signal ends a worker before
+#: a solve, the worker was killed from outside.
 _EXTERNAL_SIGNALS = {
     signal.SIGKILL,
     signal.SIGTERM,
@@ -93,7 +96,7 @@ _MACHINE_FAILURE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """The parent's times of a measurement, which bound the time a worker may report."""
+    """The parent's times of a measurement, which bound the times of the worker."""
 
     min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
     elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
@@ -105,7 +108,7 @@ class Reply:
     """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None if there is an answer, or `fault` is True
+    verdict: Verdict | None = None  #: None if there is an answer or `fault` is True
     fault: bool = False  #: True if the harness or the machine failed, not the solver
     message: str = ""  #: description of the failure, and notes
     peak_mib: float | None = None  #: largest memory that the parent observed
@@ -121,7 +124,7 @@ class WorkerProcess:
     """Worker process, started by the first request and replaced after it has died.
 
     Two file descriptors, for requests and for replies, are appended to `command`. The
-    worker runs in its own session, on one CPU (the last one that this process may use).
+    worker runs in its own session, on the last CPU that this process may use.
     Environment variables set the thread pools of all common libraries to one thread.
     The output of the worker goes to the file `log`.
 
@@ -129,7 +132,8 @@ class WorkerProcess:
     until the previous one is answered. Forks of this process own none of its workers.
     """
 
-    #: times of first solves in s, by keys that the caller chooses; not used here
+    #: times of first solves in s, by keys that the caller chooses; not used in this
+    #: class
     first_seconds: dict[Hashable, float]
 
     _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
@@ -162,8 +166,8 @@ class WorkerProcess:
 
         The fork replaces the command and inherits the loaded modules, see
         `harness.processes.forking`. If forking is not safe or fails, the first request
-        starts the worker by its command. If the fork dies, its replacement is started
-        by the command as well.
+        starts the worker by its command. If the fork dies, its replacement is also
+        started by the command.
         """
         if not is_safe():
             return
@@ -190,7 +194,7 @@ class WorkerProcess:
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
-        # Stop the others before this worker resumes: two must never run on one CPU.
+        # Stop other workers before this one resumes: two must never run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
@@ -211,10 +215,10 @@ class WorkerProcess:
             except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(e))
-        # copy these values, because `_kill` below may reset them
+        # copy these values, because `_kill` may reset them
         peak = self._peak_mib or None
         facts = self._facts
-        if self._others():  # processes left running would disturb the next measurement
+        if self._others():  # remaining processes would disturb the next measurement
             self._kill()
         elif self._stays_busy():
             self._kill()
@@ -247,7 +251,7 @@ class WorkerProcess:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Disown all workers; called in a fork, since they belong to its parent."""
+        """Disown all workers; called in a fork, since workers belong to its parent."""
         for worker in tuple(cls._all):
             worker._disown()
         cls._all.clear()
@@ -277,7 +281,7 @@ class WorkerProcess:
                     elapsed_seconds=ended - started,
                     max_seconds=ended - sent,
                 )
-                # The worker is waiting, so it cannot close a file in shared memory
+                # The worker waits for "go", so it cannot close a file in shared memory
                 # before the file is recorded.
                 self._footprint.notice(self._tree())
                 self._send({"go": True})
@@ -314,8 +318,8 @@ class WorkerProcess:
         elif end.is_oom:
             message = f"{message}: the machine ran out of memory"
             verdict = Verdict.MEMORY_LIMIT
-            # The process that the kernel kills need not be the cause: a worker that
-            # used less than half of the available memory is not blamed.
+            # The process that the kernel kills need not be the cause. If the worker
+            # used less than half of the available memory, the end counts as a fault.
             is_fault = (peak or 0.0) < limits.memory_limit_mib() / 2
         return Reply(
             verdict=None if is_fault else verdict,
@@ -362,7 +366,8 @@ class WorkerProcess:
         try:
             self._log.write_bytes(b"")
             # In append mode, the worker writes at the new end of the file after
-            # `_trim_log`. At its old offset, it would make the file as long as before.
+            # `_trim_log`. Without it, a write at the old offset would restore the old
+            # length of the file.
             with self._log.open("ab") as log:
                 if serve is not None:
                     self._process = fork(
@@ -383,7 +388,8 @@ class WorkerProcess:
                             *map(str, pipes),
                             *self._command,
                         ],
-                        # closed by the kernel if this process dies, which ends the tree
+                        # if this process dies, the kernel closes the pipe, which ends
+                        # the tree
                         stdin=subprocess.PIPE,
                         stdout=log,
                         stderr=log,
@@ -416,7 +422,7 @@ class WorkerProcess:
 
         limit : s
         memory_limit : MiB
-        stage : prefix of the error's message that states the stage of the measurement
+        stage : stage of the measurement, as a prefix of the error message
 
         Raises
         ------
@@ -430,7 +436,8 @@ class WorkerProcess:
 
         deadline = time.monotonic() + limit
         while True:
-            # Checked before reading: the reply of a worker that then dies still counts.
+            # Check before reading: the reply of a worker that dies afterwards still
+            # counts.
             dead = self._is_dead()
             has_more = self._read(0 if dead else POLL_SECONDS)
             line, newline, rest = self._unread.partition(b"\n")
@@ -438,9 +445,8 @@ class WorkerProcess:
                 self._unread = rest
                 break
             if len(self._unread) > MAX_REPLY_BYTES:
-                how = (
-                    f"more than {MAX_REPLY_BYTES >> 20} MiB came without an end of line"
-                )
+                most = MAX_REPLY_BYTES >> 20
+                how = f"more than {most} MiB were received without an end of line"
                 raise ended(Verdict.FAILED, how)
             if dead and not has_more:
                 raise ended(Verdict.CRASHED, *self._death())
@@ -463,7 +469,7 @@ class WorkerProcess:
         return reply
 
     def _trim_log(self) -> None:
-        with suppress(OSError):  # if the folder was deleted, other code reports it
+        with suppress(OSError):  # other code reports a deleted folder
             if self._log.stat().st_size > LOG_BYTES:
                 os.truncate(self._log, 0)
 
@@ -472,12 +478,13 @@ class WorkerProcess:
 
         Return True if a complete line is available, or new bytes were read.
         """
-        if b"\n" in self._unread:  # a further reply was read with the last one
+        if b"\n" in self._unread:  # a further reply was read together with the last one
             return True
         has_more = False
         while select([self._replies], [], [], 0 if has_more else timeout)[0]:
             chunk = os.read(self._replies, 2**16)
-            # At end of file, the worker is dying or its solver closed all descriptors.
+            # At end of file, the worker is dying, or its solver has closed all
+            # descriptors.
             if not chunk:
                 time.sleep(timeout)
                 break
@@ -492,8 +499,8 @@ class WorkerProcess:
         if self._process is None:
             return []
         processes = reaper.descendants(self._process.pid)
-        # Checked after the listing: if the sub-reaper has ended, another process may
-        # have reused its ID, and the listed descendants may belong to that process.
+        # Check after the listing. If the sub-reaper has ended, another process may have
+        # reused its ID, and the listed descendants may belong to this other process.
         return [] if self._is_dead() else processes
 
     def _others(self) -> list[int]:
@@ -501,7 +508,7 @@ class WorkerProcess:
 
     def _cpu_seconds(self) -> float:
         """Return the CPU time of all threads of the worker, as the kernel counts it."""
-        with suppress(OSError):  # it may have ended
+        with suppress(OSError):  # the worker may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
 
@@ -516,10 +523,9 @@ class WorkerProcess:
         self._is_stopped = True
 
     def _resume(self) -> bool:
-        """Resume the worker after `_stop`; return True if it computed between requests.
+        """Resume the worker after `_stop`; return True if it was busy between requests.
 
-        A worker that computed between requests, or has died, is killed; the next
-        request replaces it.
+        A worker that was busy or has died is killed, and the next request replaces it.
         """
         if self._process is None:
             return False
@@ -551,9 +557,9 @@ class WorkerProcess:
     def _stays_busy(self) -> bool:
         """Return True if threads of the worker continue to compute after its answer.
 
-        Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`. Only
-        CPU time decides, not state "R": on a busy machine, a thread that waits for a
-        CPU has this state too.
+        Threads of pools may spin before they sleep, for at most `SETTLE_SECONDS`. The
+        decision depends on CPU time and not on the state "R", because on a busy machine
+        a thread that waits for a CPU also has this state.
         """
         deadline = time.monotonic() + SETTLE_SECONDS
         pause, used = POLL_SECONDS / 100, self._cpu_seconds()
@@ -604,17 +610,19 @@ class WorkerProcess:
             if not self._is_dead():
                 reaper.kill_descendants(self._process.pid)
             if self._process.stdin is not None:
-                self._process.stdin.close()  # the sub-reaper reaps them and exits
+                # the sub-reaper reaps its children and exits
+                self._process.stdin.close()
             try:
                 self._process.wait(END_SECONDS)
-            except subprocess.TimeoutExpired:  # a solver may have sent it SIGSTOP
+            # a solver may have sent SIGSTOP to the sub-reaper
+            except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
             self._footprint.remove_shared()
         self._forget()
 
     def _disown(self) -> None:
-        """Close the copies that this fork has of a worker's file descriptors.
+        """Close this fork's copies of a worker's file descriptors.
 
         The worker belongs to the parent of the fork. If a copy stayed open, the worker
         would survive the death of that parent.
@@ -645,8 +653,8 @@ os.register_at_fork(after_in_child=WorkerProcess.forget_all)
 def _pipe() -> tuple[int, int]:
     """Open a pipe whose descriptors do not collide with the standard streams.
 
-    If the calling program has closed a standard stream, pipe(2) returns its number,
-    which the worker's own standard streams would then replace.
+    If the calling program has closed a standard stream, pipe(2) may return the number
+    of this stream, and the standard streams of the worker would replace the pipe.
     """
     ends = os.pipe()
     if min(ends) >= _MIN_FD:
@@ -697,7 +705,7 @@ class _WorkerEndError(Exception):
             verdict = Verdict.FAILED  # `START_SECONDS` expired, not the suite's limit
         self.verdict = verdict
         self.signal = number
-        self.is_fault = False  #: True if the worker reported a failure of the harness
+        self.is_fault = False  #: True if the worker reported a fault of the harness
         self.is_oom = False  #: True if the kernel killed the worker for lack of memory
 
 
@@ -726,9 +734,10 @@ _ALLOCATION_FAILURE = re.compile(
 def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     """Return True if a failure is attributed to lack of memory.
 
-    A solver that lacks memory raises, aborts, crashes, hangs or returns a wrong result.
-    Evidence of the cause is a peak memory close to the limit or, if a single allocation
-    was refused, the message of the library.
+    A solver that lacks memory may raise an exception, abort, crash, hang or return a
+    wrong result. The failure is attributed to lack of memory if the peak memory was
+    close to the limit or, since a single allocation may have been refused, if the
+    message reports a failed allocation.
 
     message : message of the failure, including the last line of output
     peak_mib : peak memory, in MiB; None if unknown

@@ -22,8 +22,7 @@ def ended_by_signals() -> Iterator[None]:
 
     The block is unwound by a `TerminatedError`. Signals that already have a handler or
     are ignored (nohup ignores SIGHUP) keep their disposition. In threads other than the
-    main thread, nothing changes, because Python sets signal handlers only in the main
-    thread.
+    main thread, no handler is set, because Python permits this only in the main thread.
     """
     numbers = [
         number
@@ -36,7 +35,7 @@ def ended_by_signals() -> Iterator[None]:
     def end(number: int, _: object) -> None:
         now = time.monotonic()
         # A second signal must not interrupt the `finally` blocks that run because of
-        # the first one; but a much later one must end a cleanup that hangs.
+        # the first signal. A much later signal, however, must end a cleanup that hangs.
         if not received or now > received[-1][0] + _ONCE_SECONDS:
             received.append((now, number))
             raise TerminatedError
@@ -46,7 +45,7 @@ def ended_by_signals() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        # The error may also be an OSError, from a write to a terminal that was closed.
+        # The error may also be an OSError, caused by a write to a closed terminal.
         if received:
             raise SystemExit(128 + received[0][1]) from None
         raise

@@ -1,29 +1,29 @@
 """Process that executes all measurements of one solver.
 
 The process follows `harness.processes.protocol`. Its warm-up solves tiny QPs, so that
-imports which a solver defers until its first solve are not timed. It answers three
-kinds of requests:
+imports during the first solve of a solver are not timed. It answers three kinds of
+requests:
 
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are
 
-  - ``digest``: digest of the file, which is checked; without it, QPs with an operator
-    are refused,
+  - ``digest``: digest of the file, which is checked; without a digest, QPs with an
+    operator are refused,
   - ``memory_limit``: limit in MiB,
   - ``sample_seconds``: see `harness.verify.measure`,
   - ``step``: index 0, 1, … of the QP in a sequence, and
   - ``tightens``: true if each step of the sequence has its own tolerance
 
-* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: let the MPI ranks emit the QP
-  of a case (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
+* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: emit the QP of a case on the
+  MPI ranks (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
   If the request has the entry ``first``, the ranks emit the case in that entry
   beforehand. If ``source`` is "ranks", the ranks also evaluate the answer. The event
   ``emitted`` contains the ``sizes`` and the ``digest`` of the QP; the event
   ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads the QP again, so that a solver that modifies the arrays of a QP
-does not affect later measurements.
+Every measurement loads the QP again, so that modifications by a solver do not affect
+later measurements.
 """
 
 from __future__ import annotations
@@ -109,15 +109,15 @@ class _SolverHost:
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
         self._last_step = -1  # last step of the sequence
-        # inode, size and time of each verified file, by the digest of its content
+        # inode, size and modification time of each verified file, by the digest of its
+        # content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        self.parallel: ParallelSolver | None = (
-            None  #: replaces the solver in measurements, on several ranks
-        )
+        #: replaces the solver in measurements, on several ranks
+        self.parallel: ParallelSolver | None = None
 
     def warm_up(self) -> dict[str, Any]:
-        """Solve a QP with bounds and one with constraint rows, ignoring the results.
+        """Solve a QP with bounds and a QP with constraint rows; ignore the results.
 
         Code that is compiled or loaded at its first use must not be timed. The QP
         models a chain of springs, long enough for solvers to enter all of their
@@ -146,11 +146,11 @@ class _SolverHost:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        # Place the arrays at different addresses in each measurement. Otherwise their
-        # alignment to cache lines is random but fixed for the life of the process, and
-        # the times of two processes of one solver differ by 10 % and more, however
-        # often they are measured (Mytkowicz et al., ASPLOS 2009). Varying the alignment
-        # turns this bias into scatter, which confidence intervals include.
+        # Place the arrays at different addresses in each measurement. Otherwise, their
+        # alignment to cache lines is random but fixed for the life of the process. The
+        # times of two processes of one solver then differ by 10 % and more, however
+        # often they are measured (Mytkowicz et al., ASPLOS 2009). A varying alignment
+        # converts this bias into scatter, which confidence intervals include.
         self._ballast = np.empty(0)
         with suppress(AttributeError):  # glibc only
             # otherwise the allocator would reuse freed blocks at their old addresses
@@ -209,7 +209,7 @@ class _SolverHost:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
                 self._verified_files[digest] = version
-        # A file without a digest may be of any origin, so its operators are not built.
+        # A file without a digest may have any origin, so its operators are not built.
         is_ours = digest is not None
         qp, _ = load_qp(path, operators=self._operators if is_ours else None)
         if self.parallel is not None:
@@ -219,8 +219,8 @@ class _SolverHost:
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Return the `prepare` function of a step; step 0 begins a new sequence.
 
-        Return None if the request is not a step, or the solver treats each step as an
-        independent QP.
+        The result is None if the request is not a step of a sequence, or if the solver
+        treats each step as an independent QP.
         """
         step = request.get("step")
         if step is None or not hasattr(self._solver, "chain"):
@@ -235,7 +235,8 @@ class _SolverHost:
         )
 
         def prepare(qp: QP) -> Callable[[], Solution]:
-            # Begin the sequence here, because `prepare` is timed.
+            # Begin the sequence here, so that its time is included in the time of
+            # `prepare`.
             if self._chain is None:
                 self._chain = begin(tol)
             return self._chain(qp, tol)
@@ -249,7 +250,7 @@ def _begin_sequence(
     """Return the `prepare` function of a sequence, called with each QP and tolerance.
 
     tightens : True if each step has its own tolerance; if the solver does not support
-        that, every step is declined
+        varying tolerances, every step is declined
     """
     if not tightens:
         fixed: Prepare = solver.chain(tol)
@@ -257,7 +258,7 @@ def _begin_sequence(
     if hasattr(solver, "tightening"):
         varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
         return varying
-    why = "its chain() has one tolerance for all steps; tightening() would take others"
+    why = "its chain() has one tolerance for all steps; tightening() would take several"
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 
@@ -293,8 +294,8 @@ def _one_thread() -> int:
 def _limit_memory(mib: float | None) -> None:
     """Limit the memory that this process may allocate from now on.
 
-    The parent polls resident memory and kills workers above the limit, which is too
-    late for a single allocation that exceeds the memory of the machine.
+    The parent polls resident memory and kills workers above the limit. For a single
+    allocation that exceeds the memory of the machine, this is too late.
 
     mib : limit in MiB; None lifts the limit
     """
@@ -316,10 +317,10 @@ def _measure_in_process(
     ends: Callable[[], None] = lambda: None,
     **how: Any,
 ) -> Timed:
-    """Measure in this process, and end any forked child that returns from the solver.
+    """Measure in this process; end forked children that return from the solver.
 
-    A solver may fork and let the child return from its call. That child would answer
-    the request a second time.
+    If a solver forks and the child returns from the call, the child would answer the
+    request a second time.
 
     ends : called when the worker's clock has stopped
     how : further arguments of `harness.verify.measure.measure`

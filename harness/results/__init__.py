@@ -1,1 +1,1 @@
-"""Result folders: journal, faults, merging, and repeating stored measurements."""
+"""Result folders: journal, faults, merging, and repetition of stored measurements."""

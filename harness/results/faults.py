@@ -1,9 +1,9 @@
 """Faults of the harness or the machine, in ``FOLDER/faults.jsonl``.
 
 A fault prevents a measurement, but implies nothing about the solver. Faults are
-therefore not written to the journal, but to this file, a JSON object on each line. The
-measurement counts as missing until it is in the journal. If the same run command is
-given again, missing measurements are repeated.
+therefore written to a separate file instead of the journal, with a JSON object on each
+line. The measurement counts as missing until it is in the journal. If the same run
+command is given again, it repeats missing measurements.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _TYPES: dict[str, type] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """A failure of the harness or the machine that prevented a measurement once."""
+    """A failure of the harness or the machine that prevented a measurement."""
 
     time: str  #: time of the fault, UTC, ISO 8601
     run_id: str  #: run_id of the prevented measurement
     case: str  #: canonical name
     solver: str  #: label of the solver
     what: str  #: reason, one line
-    tried_again: bool  #: True if the same run then repeated the measurement
+    tried_again: bool  #: True if the same run repeated the measurement after the fault
 
     def to_json(self) -> str:
         """Return the fault as one line of JSON."""
@@ -47,12 +47,12 @@ class Fault:
 
 
 def read_faults(folder: Path) -> list[Fault]:
-    """Read the faults of a result folder; return [] if it contains no file of faults.
+    """Read the faults of a result folder; return [] if the file is missing.
 
     Raises
     ------
     InputError
-        If a line is damaged, unless it is the last line and incomplete, or if
+        If a line is damaged, except for an incomplete last line, or if
         `harness.files.lines.read_lines` refuses the file.
 
     """

@@ -1,4 +1,4 @@
-"""Result folder, which is locked by a run and has one suite and one environment."""
+"""Result folders; each has one suite and one environment, and a run locks it."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, read_stored
 
-#: Folders and files that commands write to a result folder; ``--fresh`` deletes or
-#: overwrites these, and nothing else.
+#: Folders and files that commands write to a result folder. ``--fresh`` deletes or
+#: overwrites only these folders and files.
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
 #: results of `mortarbench validate`, and faults of runs
@@ -59,15 +59,15 @@ _FILE_PREFIXES = (
 def refuse_links(folder: Path) -> None:
     """Refuse a result folder with links, pipes, devices or too deeply nested folders.
 
-    The folder may come from an untrusted source. Through a link, files elsewhere could
-    be overwritten or deleted; opening a pipe could block for ever; deeply nested
-    folders could cause a stack overflow.
+    The folder may come from an untrusted source. Through a link, files outside the
+    folder could be overwritten or deleted. Opening a pipe could block for ever. Deeply
+    nested folders could cause a stack overflow.
 
     Raises
     ------
     InputError
         If there is a link, a device or a pipe, or a folder that is nested too deeply or
-        cannot be listed; the message names the first of these.
+        cannot be listed; the message names the first such entry.
 
     """
     try:
@@ -155,15 +155,16 @@ def refuse_foreign(folder: Path) -> None:
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
     with suppress(InputError), opened(folder / _LOCK) as lock:
-        # a run that was killed at once leaves nothing but its lock
+        # a run that was killed immediately leaves only its lock
         if lock.read(len(_LOCK_CONTENT) + 1) == _LOCK_CONTENT:
             return
     ours = (*_FOLDERS, *_FILES, *_RESULT_FILES)
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
-            f"{folder} holds {some(taken)} but is not a result folder (no suite.toml "
-            "with environment.json, no journal/*.jsonl); choose another --out"
+            f"{folder} contains {some(taken)} but is not a result folder (no "
+            "suite.toml with environment.json, no journal/*.jsonl); choose another "
+            "--out"
         )
 
 
@@ -191,7 +192,8 @@ class FolderLock:
         Raises
         ------
         InputError
-            If the folder was moved, or if another run has locked a new one.
+            If the folder was moved, or if another run has locked a new folder at its
+            path.
 
         """
         is_there = _is_same_file(self._folder, self._folder_fd)
@@ -240,7 +242,7 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        # only after locking, since another run may still have been writing these files
+        # not before locking, since another run may still have been writing these files
         folders = [folder / name for name in _FOLDERS]
         remove_unfinished(folder, folders, shared=[folder / COPIES])
         yield lock
@@ -254,7 +256,7 @@ def _open_lock(folder: Path) -> int:
     The content of the lock file identifies a result folder, even if the run is killed
     before it has written any other file.
     """
-    # O_NOFOLLOW: if the lock were a link, a file elsewhere would be overwritten
+    # O_NOFOLLOW: if the lock were a link, another file would be overwritten
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     while True:  # until the file at the path is the locked file
         fd = os.open(folder / _LOCK, flags, 0o666)
@@ -287,8 +289,8 @@ def _is_same_file(path: Path, fd: int) -> bool:
 def scratch_in(folder: Path) -> Iterator[Path]:
     """Create a temporary folder in a locked result folder, for use within the block.
 
-    The temporary folder is deleted after the block. If a killed run left such a folder,
-    it is deleted first.
+    The temporary folder is deleted after the block. A temporary folder of a killed run
+    is deleted first.
     """
     scratch = folder / _SCRATCH
     shutil.rmtree(scratch, ignore_errors=True)
@@ -354,7 +356,7 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
             raise InputError(f"{e}; restore it, or use --fresh") from None
         has_grown = old != new
         if has_grown and (difference := incompatibility(old, new)):
-            raise InputError(f"{out} holds another suite ({difference}); {REMEDY}")
+            raise InputError(f"{out} contains another suite ({difference}); {REMEDY}")
     if environment_file.exists():
         stored = _environment(environment_file)
         if stored["digest"] != environment["digest"]:
@@ -390,7 +392,7 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
         malformed.
 
     """
-    # check first, since the digest is part of a path, which might leave the folder
+    # check first, since the digest is part of a path that might lead out of the folder
     if not _DIGEST.fullmatch(digest):
         raise InputError(
             f"{folder}: {shortened(digest)!r} is not the digest of an environment"
@@ -398,7 +400,7 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
     for path in (folder / "environment.json", _node_file(folder, digest)):
         if path.is_file() and (environment := _environment(path))["digest"] == digest:
             return environment
-    raise InputError(f"{folder} does not hold the environment {digest}")
+    raise InputError(f"{folder} does not contain the environment {digest}")
 
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
@@ -427,7 +429,7 @@ def differences(
 
 
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return True if the environments agree in everything that can affect times.
+    """Return True if the environments agree in all values that can affect times.
 
     A plug-in that occurs in only one of the environments is ignored, since it does not
     affect measurements that are possible in both.

@@ -23,9 +23,8 @@ class Journal:
     """Writer of a file ``FOLDER/journal/NAME.jsonl``.
 
     The folder must be locked by `harness.results.folder.lock_folder` while the writer
-    is open: a second writer could truncate a line that this one is writing. All files
-    of the journal are kept open, so that a file that is deleted meanwhile can be
-    restored.
+    is open, because a second writer could truncate an incomplete line. All files of the
+    journal are kept open, so that a file can be restored if it is deleted.
 
     restored : called with a message of one line if a file was restored
     """
@@ -44,7 +43,7 @@ class Journal:
         )
 
     def append(self, record: Record) -> None:
-        """Append a record, and return when its line is on the disk.
+        """Append a record, and flush its line to the disk.
 
         If an error occurs, the journal does not change.
 
@@ -83,8 +82,9 @@ def read_journal(
 ) -> list[Record]:
     """Read all records of a result folder, in the order of file names and lines.
 
-    Every run_id occurs once: a line is skipped if its record equals an earlier one.
-    Equal strings and tables of different records are stored once.
+    Every run_id occurs once in the result: a line is skipped if its record equals an
+    earlier record. Equal strings and tables of different records are stored only once
+    in memory.
 
     tell : called with a message of one line if lines are skipped
 
@@ -92,8 +92,8 @@ def read_journal(
     ------
     InputError
         If the folder or its journal is missing; if the folder contains a link; if a
-        line is damaged, unless it is the last line and incomplete; or if two different
-        records have the same run_id.
+        line is damaged, except for an incomplete last line of a file; or if two
+        different records have the same run_id.
 
     """
     if not os.path.isdir(folder):
@@ -122,13 +122,13 @@ def read_journal(
                 )
                 raise InputError(
                     f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
-                    f"differs from that at {place}; expected one line per run_id; "
-                    "delete the wrong one"
+                    f"differs from the record at {place}; expected one line per "
+                    "run_id; delete the wrong line"
                 )
     if repeated:
         lines = "line repeats" if len(repeated) == 1 else "lines repeat"
         tell(
-            f"{len(repeated)} journal {lines} an earlier one word for word, and count "
+            f"{len(repeated)} journal {lines} an earlier line exactly, and count "
             f"once: {some(repeated)}"
         )
     return records

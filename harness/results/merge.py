@@ -1,13 +1,14 @@
-"""Merging of result folders, in which measurements of all environments are kept.
+"""Merging of result folders that may contain measurements of several environments.
 
 A measurement is identified by its run_id and its environment. If two folders contain
-the same measurement, that of the first folder is kept. Measurements with equal run_ids
-but different environments are all kept; each later one gets a new run_id, a digest of
-its run_id and its environment.
+the same measurement, the measurement of the first folder is kept. Measurements with
+equal run_ids but different environments are all kept. Except for the first, each of
+these measurements gets a new run_id, which is a digest of its old run_id and its
+environment.
 
-The journal of the new folder is written last, in a single step. Without a journal, the
-folder contains no measurements. If a merge was killed, the same command can therefore
-be given again.
+The journal of the new folder is written last, in a single step. A folder without a
+journal contains no measurements, so the same command can be given again if a merge was
+killed.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_DUPLICATES_NOTE = "measurements are already present, and count once"
+_DUPLICATES_NOTE = "measurements are already present and are counted once"
 JOURNAL = "merged"  #: name of the only journal of a merged folder
 
 
@@ -50,7 +51,7 @@ class _Union:
     _contents: set[str] = field(default_factory=set)  # digests without run_id
 
     def add(self, record: Record) -> bool:
-        """Add a measurement; return True if it was present already."""
+        """Add a measurement; return True if it is a duplicate."""
         # Compare the content first, since an earlier merge may have added the same
         # record with a new run_id.
         content = hex_digest([record.replace(run_id="").to_json().encode()], 32)
@@ -86,9 +87,10 @@ def merge(
     ------
     InputError
         If a source contains no measurements, or contains a link; if the suites differ
-        in settings on which measurements depend; if `out` is one of the sources, or
-        lies in one, or contains one; if `out` contains results of a run or files of the
-        user; or if the disk is full. The journal of `out` then does not change.
+        in settings on which measurements depend; if `out` is a source, lies in a
+        source, or contains a source; if `out` contains results of a run or files of the
+        user; or if the disk is full. In these cases, the journal of `out` does not
+        change.
 
     """
     for source in sources:
@@ -132,8 +134,8 @@ def _journal(folder: Path) -> Path:
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
     """Read the records of a folder, and add a session to old records without one.
 
-    This session is a digest of the environment and of the earliest start of such a
-    record in that environment.
+    The session is a digest of the environment and of the earliest start of a record
+    without a session in this environment.
     """
     records = read_journal(source, tell)
     if not records:
@@ -159,7 +161,7 @@ def _refuse_nested(source: Path, out: Path) -> None:
     target, origin = out.resolve(), source.resolve()
     if target == origin:
         raise InputError(
-            f"--out {out} is one of the folders to merge; expected another one"
+            f"--out {out} is one of the folders to merge; expected a different folder"
         )
     for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
@@ -177,7 +179,7 @@ def _refuse_run(out: Path) -> None:
     others = [p.name for p in (out / "journal").glob("*.jsonl") if p != _journal(out)]
     if others:
         raise InputError(
-            f"{out} holds measurements of a run (journal/{min(others)}); expected a "
+            f"{out} contains measurements of a run (journal/{min(others)}); expected a "
             "new folder, or one that was merged before; choose another --out"
         )
 
@@ -204,7 +206,7 @@ def _copy_environments(
     for digest in dict.fromkeys(r.environment for r in records):
         environment = _environment(folders, digest)
         if environment is None:
-            tell(f"no folder holds the environment {digest}")
+            tell(f"no folder contains the environment {digest}")
             continue
         content = {k: v for k, v in environment.items() if k != "digest"}
         keep_environment(out, digest, content)

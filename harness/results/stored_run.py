@@ -1,4 +1,4 @@
-"""Access to stored measurements, in order to repeat them or to rebuild their case."""
+"""Access to stored measurements, for repeating them or rebuilding their cases."""
 
 from __future__ import annotations
 
@@ -33,12 +33,13 @@ class StoredRun:
     """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    #: records that differ only in the repeat, including `record`
+    #: records that differ from `record` only in the repeat, including `record`
     repeats: list[Record]
-    #: case of the measurement; for a sequence, preceded by the earlier steps
+    #: cases to measure: the case of the measurement, preceded by the earlier steps if
+    #: it belongs to a sequence
     cases: tuple[CaseId, ...]
     spec: SolverSpec
-    environment: Mapping[str, Any]  #: environment in which it was measured
+    environment: Mapping[str, Any]  #: environment of the measurement
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
 
@@ -51,13 +52,13 @@ def open_stored_run(
 ) -> StoredRun:
     """Find a measurement, and look up its case and solver in the current registries.
 
-    run_id : a run_id, or an unambiguous prefix of one
+    run_id : a run_id, or an unambiguous prefix of a run_id
 
     Raises
     ------
     InputError
-        If there is no such measurement; if its family or solver, or a key or option of
-        these, is unknown; or if the family refuses the values of the keys.
+        If there is no such measurement; if its family, its solver, a key or an option
+        is unknown; or if the family refuses the values of the keys.
 
     """
     records = read_journal(folder)
@@ -128,20 +129,20 @@ def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record
     if candidates:
         first = ", ".join(sorted(candidates)[:3])
         raise InputError(
-            f"{folder} holds {len(candidates)} measurements whose run_id begins with "
-            f"{run_id!r} ({first}); give more digits"
+            f"{folder} contains {len(candidates)} measurements whose run_id begins "
+            f"with {run_id!r} ({first}); give more digits"
         )
     near = get_close_matches(run_id, by_id, n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
     count = f"{len(by_id)} measurement{'s' * (len(by_id) != 1)}"
-    raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
+    raise InputError(f"unknown run_id {run_id!r}: {folder} contains {count}{hint}")
 
 
 def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
     """Return the spec of the solver that a record's label denotes.
 
-    specs : solvers of the suite by label. A label that is not among them was set by
-        ``--solver``, and is the name of a solver
+    specs : solvers of the suite by label. Any other label was set by ``--solver`` and
+        is the name of a solver
     """
     name = record.solver
     for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):
@@ -168,7 +169,7 @@ def _with_options(
 
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:
-    """Return a hint for a message that a measurement needs plug-ins, or ""."""
+    """Return a hint that a measurement needs plug-ins, for a message, or ""."""
     plugins = environment.get("plugins")
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
@@ -184,8 +185,9 @@ def rebuild(
     ------
     InputError
         If the family is unknown or raises an exception, or if the digest of the QP
-        differs from that in the record. The digests are not compared if several ranks
-        assembled the QP, since their digest is computed in another way.
+        differs from the digest in the record. If several ranks assembled the QP, the
+        digests are not compared, because the digest of a distributed QP is computed in
+        another way.
 
     """
     if r.family not in families:

@@ -1,9 +1,9 @@
-"""Blocks, the work units of a run, as plain data for any process or machine.
+"""Blocks, the work units of a run, as plain data that any process can execute.
 
 In a block, every solver is measured once on one case at one tolerance, in random order.
-A drift of the machine then affects all solvers of a block in the same way. For this
-reason, solvers are compared within blocks. In a block of a sequence, every solver
-solves all steps once, in their order.
+A drift of the machine then affects all solvers of a block similarly. For this reason,
+solvers are compared within blocks. In a block of a sequence, every solver solves all
+steps once, in the order of the sequence.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class WorkUnit:
     """A block: measurements of all solvers on one case, or on one sequence."""
 
     number: int
-    #: incomplete records of each solver, in the order of measurement: a single one for
-    #: a case, or one for each step of a sequence
+    #: incomplete records of each solver, in the order of measurement: one record for a
+    #: case, or one record for each step of a sequence
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
-    #: plain data of a small case. If it is set, a new process builds the small case and
-    #: then the case of the block, whose time then excludes the cost of first calls. If
-    #: it is None, a case that was built for an earlier block may be reused
+    #: plain data of a small case, or None. If set, a new process builds the small case
+    #: and then the case of the block, so that the build time excludes the cost of first
+    #: calls. If None, a case that was built for an earlier block may be reused
     warm_up: Mapping[str, Any] | None = None
 
     @property
@@ -61,8 +61,8 @@ class Result:
     """Outcome of a measurement that was completed."""
 
     record: Record  #: complete except for the digests of `point` and `fields`
-    #: number of the part of the block, if its measurements were interrupted; only
-    #: measurements in the same part ran consecutively
+    #: number of the part of the block; a block has several parts if its measurements
+    #: were interrupted, and only measurements in the same part ran consecutively
     part: int = 0
     point: Arrays | None = None  #: None if the solver returned no point
     fields: Arrays | None = None  #: deformed state; None if it is not to be stored
@@ -92,11 +92,11 @@ Outcome = Result | BuildFailure | MeasurementFault
 class Engine(Protocol):
     """Function that executes blocks, on this machine or on the nodes of a cluster.
 
-    An engine may take several blocks from the iterator before it yields outcomes, yield
-    outcomes of several blocks in any order, and yield those of a lost block again.
-    Since a block is created when it is taken, the decision whether more repeats are
-    needed can take into account only outcomes that were yielded before. An engine
-    should therefore take as few blocks as possible in advance.
+    An engine may take several blocks from the iterator before it yields outcomes. It
+    may yield outcomes of several blocks in any order, and it may yield the outcomes of
+    a lost block again. A block is created when the engine takes it, and the decision on
+    further repeats depends only on outcomes that were yielded before. An engine should
+    therefore take as few blocks as possible in advance.
     """
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:

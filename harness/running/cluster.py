@@ -1,11 +1,11 @@
 """Engine for several machines: the blocks of a run as tasks of Dask distributed.
 
 Every Dask worker executes one block at a time, under the same supervision as in a run
-on one machine. A task is one turn of a block: one solver, measured on one case or on
-the steps of one sequence. The parent stores the records of a turn before it submits the
-next turn. If a worker is lost, another worker measures the turns that the lost one did
-not return, and their records count as a separate block. Only the parent writes to the
-result folder.
+on one machine. A task is one turn of a block: the measurement of one solver on one case
+or on the steps of one sequence. The parent stores the records of a turn before it
+submits the next turn. If a worker is lost, another worker measures the turns that the
+lost worker did not return, and their records count as a separate block. Only the parent
+writes to the result folder.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def on_cluster(
 ) -> Iterator[EngineFactory]:
     """Connect to a Dask cluster, and provide a factory of engines on it.
 
-    The connection is opened first, so that a wrong address is reported before a result
-    folder is created.
+    The connection is opened before a result folder is created, so that a wrong address
+    leaves no folder.
 
     address : address of a scheduler, or "local" to start a scheduler with a worker for
         each CPU of this machine
@@ -84,8 +84,8 @@ def on_cluster(
     Raises
     ------
     InputError
-        If Dask is not installed or the scheduler does not answer; later, while blocks
-        are executed, if a node is unsuitable or the scheduler is lost.
+        If Dask is not installed or the scheduler does not answer. During the execution
+        of blocks, also if a node is unsuitable or the scheduler is lost.
 
     """
     try:
@@ -121,8 +121,8 @@ def on_cluster(
                 try:
                     yield _Cluster(client, name, nodes, address, warn)
                 finally:
-                    # End the processes of this run and of orphaned runs. During the
-                    # calls, the scheduler may end, as a local one does on Ctrl-C
+                    # End the processes of this run and of orphaned runs. The scheduler
+                    # may end during the calls, as a local scheduler does on Ctrl-C
                     # (CommClosedError is an OSError), or may not have the plug-in yet
                     # (KeyError).
                     with suppress(OSError, KeyError):
@@ -170,27 +170,27 @@ class Nodes:
             if key.startswith(_CODE):
                 what = in_words([(key, here, there)], "here", "there")
                 raise InputError(
-                    f"{node} runs other code than this machine ({what}); install the "
-                    "same on every node"
+                    f"{node} runs different code from this machine ({what}); install "
+                    "the same code on every node"
                 )
         self._stored.add(digest)
         self.keep(digest, environment)
         if changed:
             what = in_words(changed, "here", "there")
             self.warn(
-                f"{node} measures under other conditions than this machine ({what}); "
-                f"its times are marked as those of environment {digest}"
+                f"{node} measures under different conditions from this machine "
+                f"({what}); its times are marked as those of environment {digest}"
             )
 
 
 @dataclass(eq=False, kw_only=True)
 class _ActiveBlock:
-    """Block in progress; at any time, one of its turns is a Dask task."""
+    """Block in progress; at any time, exactly one of its turns is a Dask task."""
 
     block: WorkUnit
     turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
     worker: str = ""  #: address of the Dask worker that measures the block
-    #: number of workers that returned some turns of the block and were then lost
+    #: number of workers that were lost after they had returned some turns of the block
     part: int = 0
     is_measured: bool = False  #: True if the current worker has returned a turn
     lost_workers: int = 0  #: number of workers lost while they measured this block
@@ -200,9 +200,9 @@ class _ActiveBlock:
 class _Cluster:
     """Engine in which every Dask worker measures one block, one turn at a time.
 
-    Each task is bound to the worker of its block. Otherwise Dask would reassign the
+    Each task is bound to the worker of its block. Otherwise, Dask would reassign the
     tasks of a lost worker, and turns measured on different machines would be compared
-    as if they were from one block.
+    as if they belonged to one block.
     """
 
     client: Any
@@ -225,8 +225,8 @@ class _Cluster:
                 except Empty:
                     if self.client.status != "running":
                         raise _SchedulerGoneError from None
-                    # A worker may be busy with a run whose parent has died; the
-                    # scheduler detects this only after a delay.
+                    # A worker may be busy with a run whose parent has died. The
+                    # scheduler detects the death of a parent only after a delay.
                     _end_orphaned_runs(self.client)
                 yield from self._recovered()
         finally:
@@ -281,7 +281,7 @@ class _Cluster:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
         except CancelledError as e:  # raised when the connection is lost
             raise _SchedulerGoneError from e
-        except TimeoutError:  # the worker is lost; `_recovered` will detect this
+        except TimeoutError:  # the worker is lost, which `_recovered` will detect
             self._finished.put(future)
             return
         del self._active[future], active.turns_left[0]
@@ -302,8 +302,8 @@ class _Cluster:
     def _recovered(self) -> Iterator[Outcome]:
         """Put the blocks of lost workers back into the queue.
 
-        Yield a failure for each block that is given up instead, because it has lost
-        `MAX_LOST_WORKERS` workers.
+        A block that has lost `MAX_LOST_WORKERS` workers is given up instead, and a
+        failure is yielded for it.
         """
         workers = self._workers()
         lost = {f: b for f, b in self._active.items() if b.worker not in workers}
@@ -317,7 +317,9 @@ class _Cluster:
                 self._queue.append(active)
             else:
                 case = active.block.turns[0][0].case
-                reason = f"{case} was given up: all Dask workers that took it were lost"
+                reason = (
+                    f"{case} was given up: all Dask workers that executed it were lost"
+                )
                 yield BuildFailure(block=active.block, reason=reason)
 
 
@@ -326,9 +328,9 @@ class _SchedulerGoneError(Exception):
 
 
 def _connect(address: str, stack: ExitStack) -> Any:
-    """Connect to a scheduler, after starting one if the address is "local".
+    """Connect to a scheduler, which is started first if the address is "local".
 
-    stack : closes the connection and a local cluster when it is closed
+    stack : stack whose closing closes the connection and a local cluster
 
     Raises
     ------
@@ -338,7 +340,7 @@ def _connect(address: str, stack: ExitStack) -> Any:
     """
     from distributed import Client, LocalCluster
 
-    # Dask would log the errors that are reported here a second time, with tracebacks.
+    # Dask would also log the errors that are reported here, with tracebacks.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address == LOCAL:
         with _delay_interrupt():
@@ -370,11 +372,11 @@ def _connect(address: str, stack: ExitStack) -> Any:
 
 
 def _refuse_unguarded_script() -> None:
-    """Check that importing the main script does not start this run again.
+    """Check that an import of the main script does not start this run again.
 
-    Python imports the main script in each spawned process before anything else. One
-    process is therefore spawned as a trial. If importing the script starts a run, this
-    function is called in the trial process, which then exits with a special code.
+    Each spawned Python process first imports the main script. One process is therefore
+    spawned as a trial. If importing the script starts a run, this function is called in
+    the trial process, which then exits with a special code.
 
     Raises
     ------
@@ -414,13 +416,14 @@ def _delay_interrupt() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     received = []
 
-    # The mask applies to this thread only. The kernel may deliver the signal to another
+    # The mask applies only to this thread. The kernel may deliver the signal to another
     # thread, and Python then runs the handler in the main thread.
     def delay(*_: object) -> None:
         received.append(signal.SIGINT)
         signal.signal(signal.SIGINT, before)
 
-    # Start the resource tracker of multiprocessing now: its start unblocks SIGINT.
+    # Start the resource tracker of multiprocessing now, since its start unblocks
+    # SIGINT.
     resource_tracker.ensure_running()
     signal.signal(signal.SIGINT, delay)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])

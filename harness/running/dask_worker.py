@@ -1,7 +1,7 @@
 """Dask plug-in that executes the blocks of a run on one machine of a cluster.
 
-Each Dask worker keeps an `Executor` open for the duration of the run. Its solver
-processes are bound to a CPU that no other executor on the machine uses.
+Each Dask worker keeps an `Executor` open for the duration of the run. The solver
+processes of the executor are bound to a CPU that no other executor on the machine uses.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Plug-in with an executor in every Dask worker, including workers joining later.
+    """Plug-in with an executor in every Dask worker, including workers that join later.
 
-    commands : commands of the parent; its Python interpreter is replaced by that of the
-        node
+    commands : commands of the parent, in which the Python interpreter of the node
+        replaces the interpreter of the parent
     plugins : files that must exist under the same paths on the node
     operators : makers of operators P by name, except those of `plugins`
     sharing : largest number of Dask workers on one machine; it is recorded in the
@@ -65,7 +65,7 @@ class ExecutorPlugin(WorkerPlugin):
     _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
-        """Prepare the plug-in; the executor is opened later, by the first block.
+        """Prepare the plug-in; the first block opens the executor.
 
         The thread that executes the blocks must open the executor, because the kernel
         kills solver processes when the thread that started them ends.
@@ -74,11 +74,10 @@ class ExecutorPlugin(WorkerPlugin):
         self._busy = Lock()
 
     def teardown(self, worker: Worker | None = None) -> None:
-        """End the executor's processes, if necessary after the current measurement.
+        """End the executor's processes, at the latest after the current measurement.
 
-        Dask cannot stop a block that is being executed. In this case the thread that
-        executes the block holds the lock, and calls this method again after the current
-        measurement.
+        Dask cannot stop the execution of a block. If a block is being executed, its
+        thread holds the lock and calls this method again after the current measurement.
         """
         self._ended = True
         if not self._busy.acquire(blocking=False):
@@ -106,7 +105,7 @@ class ExecutorPlugin(WorkerPlugin):
 
     def _carry_out(self, block: WorkUnit) -> Delivery:
         opened = self._session = self._session or self._open_session()
-        os.sched_setaffinity(0, {opened.cpu.number})  # binds this thread only
+        os.sched_setaffinity(0, {opened.cpu.number})  # binds only this thread
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.replace(**here) for r in turn) for turn in block.turns)
         outcomes = []
@@ -162,7 +161,7 @@ class ExecutorPlugin(WorkerPlugin):
 
 
 def execute(name: str, block: WorkUnit) -> Delivery:
-    """Measure a block with the plug-in of that name; called in a Dask worker.
+    """Measure a block with the plug-in `name`; called in a Dask worker.
 
     Raises
     ------
@@ -191,7 +190,7 @@ class _Session:
 
 
 class _Cpu:
-    """CPU reserved for a Dask worker until no executor refers to it any more."""
+    """CPU that is reserved for a Dask worker as long as an executor refers to it."""
 
     def __init__(self) -> None:
         stack = ExitStack()
@@ -205,7 +204,7 @@ _cpus_lock = Lock()
 
 
 def _cpu_of(worker: str) -> _Cpu:
-    """Reserve a CPU for a Dask worker; all executors in this worker share the CPU.
+    """Reserve a CPU for a Dask worker; all executors in the worker share the CPU.
 
     A worker has several executors if several runs use it, or if the scheduler has not
     yet detected that the parent of an earlier run has died. In either case the worker
@@ -227,7 +226,7 @@ def claim_cpu(stack: ExitStack) -> int:
 
     The reservation is a file lock, which the kernel releases when the process ends.
 
-    stack : releases the reservation when it is closed
+    stack : stack whose closing releases the reservation
 
     Raises
     ------

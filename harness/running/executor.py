@@ -38,7 +38,8 @@ from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
 _MAX_STORED_OPTIMA = 1000  #: largest number of small QPs whose optima are cached
-MAX_STEP_TOL = 1e-2  #: largest tolerance of a step, used far from the fixed point
+#: largest tolerance of a step, which applies far from the fixed point
+MAX_STEP_TOL = 1e-2
 
 
 @dataclass(eq=False)
@@ -89,7 +90,7 @@ class Executor:
         """
         with report_full_disk(self.scratch):
             try:
-                # On a cluster, this method is called once for each turn of a block.
+                # on a cluster, this method is called once for each turn of a block
                 if block.number != self._number:
                     self._number, self._entries = block.number, ()
                     self._limit_hit = None
@@ -103,7 +104,7 @@ class Executor:
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
         """Measure one solver; retry once after a fault that the solver did not cause.
 
-        All steps of a sequence are repeated, because the data that the solver carries
+        For a sequence, all steps are repeated, because the data that the solver carries
         from step to step are lost. No result is yielded twice.
         """
         measured: set[str] = set()  # run IDs
@@ -127,7 +128,8 @@ class Executor:
                     reason = f"{type(e).__name__}: {reason}"
                 refuse_full_disk(self.scratch, reason)
             label = turn[0].solver
-            self._entries = ()  # a lost or damaged file may be the cause: build again
+            # build again, since a lost or damaged file may be the cause
+            self._entries = ()
             with suppress(FileNotFoundError):  # the entire result folder was deleted
                 self.scratch.mkdir(exist_ok=True)
             self._worker(label).close()
@@ -140,13 +142,13 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        If ranks emit a QP and execute no code of plug-ins, they also judge the answer.
-        The case is then built only for values that they cannot evaluate.
+        If ranks emit a QP and execute no code of plug-ins, the ranks also judge the
+        answer. The case is then built only for values that the ranks cannot evaluate.
 
         Raises
         ------
         FaultError, OSError
-            If something other than the solver failed.
+            If the harness or the machine failed.
 
         """
         source = self._source(turn[0])
@@ -180,7 +182,7 @@ class Executor:
             else:
                 yield Result(record=record, point=point_arrays(solution))
             stopped = is_pointless and record.verdict is not Verdict.DECLINED
-            # after a failed step, the solver's data for later steps are lost
+            # a failed step loses the solver's data for later steps
             if block.is_sequence and stopped:
                 yield from _unreached_steps(available[step + 1 :], record)
                 break
@@ -203,7 +205,7 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
-            # each case of a series of growing sizes is emitted by new processes
+            # in a series of growing sizes, new processes emit each case
             if block.warm_up is not None:
                 self._worker(record.solver).close()
                 request["first"] = dict(block.warm_up)
@@ -213,14 +215,14 @@ class Executor:
         if not source.is_shared:
             request |= {"qp": str(entry.qp), "digest": entry.digest}
         keys = ["qp", "build_seconds", "dualise_seconds"]
-        # without a new process, the peak memory may include that of earlier cases
+        # without a new process, the peak memory may include memory of earlier cases
         if block.warm_up is not None:
             keys.append("build_peak_mib")
         meta = {key: entry.meta.get(key) for key in keys}
         return request, record.replace(**meta, step_tol=_step_tol(record, entry))
 
     def _source(self, record: Record) -> Source:
-        """Return the origin of a record's QP, asking the case worker once per case."""
+        """Return the origin of a record's QP; query the case worker once per case."""
         if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
             return Source.FILE
         if record.case not in self._shared:
@@ -234,7 +236,7 @@ class Executor:
         return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
-        """Build the cases of the current block, unless they are built already.
+        """Build the cases of the current block, unless they are already built.
 
         If a sequence ends before the last step of `turn`, fewer cases are built.
         """
@@ -303,9 +305,9 @@ class Executor:
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
         is_limited = block.warm_up is not None
-        for _ in range(
-            2
-        ):  # retry if it was killed from outside, or an earlier case made it crash
+        # retry once: the process may have been killed from outside, or an earlier case
+        # may have crashed it
+        for _ in range(2):
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)},
                 time_limit=block.time_limit if is_limited else inf,
@@ -392,8 +394,8 @@ def _step_tol(record: Record, entry: StoredCase) -> float | None:
 
     The tolerance is θ·δ, but at most `MAX_STEP_TOL`, where δ is the relative distance
     of the QP from the fixed point (`harness.plugin.Case.unsettled`) and θ is
-    `Record.tighten` (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). If this is
-    not looser than the requested tolerance, as in the last step with δ = 0, return
+    `Record.tighten` (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). If this value
+    does not exceed the requested tolerance, as in the last step with δ = 0, return
     None.
     """
     delta = float(entry.meta.get("unsettled", 0.0))
@@ -402,7 +404,7 @@ def _step_tol(record: Record, entry: StoredCase) -> float | None:
 
 
 def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
-    """Yield results for the steps `rest`, which follow the end of their sequence.
+    """Yield results for the steps `rest` after the end of their sequence.
 
     Each of these results has the verdict of `end`, the record that ended the sequence.
     """

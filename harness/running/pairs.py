@@ -18,12 +18,12 @@ Key = TypeVar("Key", Block, int)
 
 
 class Ratio(NamedTuple):
-    """Ratio of times with its confidence interval, by default of 95 % coverage."""
+    """Ratio of times with its confidence interval, by default with 95 % coverage."""
 
     value: float
     low: float  #: lower end of the interval
     high: float  #: upper end of the interval
-    #: number of pairs or, if the samples are not paired, the size of the smaller sample
+    #: number of pairs; for samples that are not paired, the size of the smaller sample
     pairs: int
     paired: bool = True  #: False for samples without a common block
 
@@ -36,9 +36,9 @@ class Ratio(NamedTuple):
 def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None:
     """Return the mean ratio of two solvers' times over their common blocks.
 
-    The logarithms of the ratios within blocks are averaged, and Student's t yields the
-    interval. A disturbance that slows down a whole block cancels in the ratio. If there
-    are fewer than two common blocks, return None.
+    The logarithms of the ratios within blocks are averaged, and the interval follows
+    from Student's t distribution. A disturbance that slows down a whole block cancels
+    in the ratio. If there are fewer than two common blocks, return None.
 
     a, b : times of the two solvers by block, in s
 
@@ -62,9 +62,9 @@ def unpaired_ratio(
 ) -> Ratio | None:
     """Return the ratio of the mean times of two samples that share no block.
 
-    The means are geometric. Their ratio has Welch's interval [1]_. Disturbances do not
-    cancel in this ratio, and the interval does not account for a change of the machine
-    between the two sessions. If a sample has fewer than two values, return None.
+    The means are geometric, and the interval is Welch's interval [1]_. Disturbances do
+    not cancel in this ratio, and the interval does not account for a change of the
+    machine between two sessions. If a sample has fewer than two values, return None.
 
     a, b : times in s
     coverage : coverage probability of the interval
@@ -90,7 +90,7 @@ def unpaired_ratio(
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Return the paired ratio of two solvers' times if possible, else the unpaired one.
+    """Return the paired ratio of times if possible, otherwise the unpaired ratio.
 
     If there are too few times for either ratio, return None.
 

@@ -17,7 +17,7 @@ class Progress(Protocol):
     """
 
     def start(self, total: int) -> None:
-        """Begin a run of `total` cells, including those measured by earlier runs."""
+        """Begin a run of `total` cells, including cells measured by earlier runs."""
 
     def say(self, text: str) -> None:
         """Show the current activity."""

@@ -1,8 +1,7 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process selects the measurements, and is the only one that writes to the result
-folder. The blocks of measurements are executed by an engine: one for this machine, or
-one for a cluster.
+This process selects the measurements. No other process writes to the result folder. An
+engine for this machine or for a cluster executes the blocks of measurements.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Missing:
-    """Measurements that are missing after a run; the same command retries them."""
+    """Measurements that are missing after a run; the same command repeats them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
     faults: list[Fault]  #: measurements prevented by something other than the solver
@@ -90,7 +89,8 @@ def run(
     InputError
         If `out` is not a result folder, contains results of a different suite, case or
         environment, is in use, or was moved or deleted during the run, or if its disk
-        is full. Any other failure affects single measurements, which are then missing.
+        is full. Any other failure affects only single measurements, which are then
+        missing.
 
     """
     refuse_foreign(out)
@@ -159,7 +159,7 @@ class _Recorder:
     journal: Journal
     schedule: Schedule
     progress: Progress
-    was_deleted: bool = False  #: True if the folder was deleted since the last outcome
+    was_deleted: bool = False  #: True if the folder was deleted after the last outcome
     _counted: set[str] = field(default_factory=set)  # run IDs reported to `progress`
     _faults: dict[str, Fault] = field(default_factory=dict)  # last fault by run ID
 
@@ -186,7 +186,7 @@ class _Recorder:
             case MeasurementFault():
                 self._take_fault(outcome)
             case Result() if self.schedule.is_settled(outcome.record):
-                # from a repetition of a block or sequence; the first result counts
+                # a repetition of a block or sequence: only the first result counts
                 self._count(outcome.record, None)
             case Result():
                 self._take_result(outcome)
@@ -205,7 +205,7 @@ class _Recorder:
             number = self.schedule.block_of_part(record.block, result.part)
             record = record.replace(block=number)
         self.was_deleted = not self.lock.is_there()
-        # The line is written last, because it must not refer to missing files.
+        # Write the line last, because it must not refer to missing files.
         if result.point is not None:
             record = record.replace(vectors=save(self.out, result.point))
         if result.fields is not None:
@@ -234,7 +234,7 @@ class _Recorder:
             self._count(record, None)
 
     def _count(self, record: Record, result: Record | None) -> None:
-        """Report a cell as done, but only once even if it has several outcomes."""
+        """Report a cell as done, only once even if it has several outcomes."""
         if record.run_id not in self._counted:
             self._counted.add(record.run_id)
             self.progress.advance(result)
@@ -255,7 +255,7 @@ def _check_same(
     suite: Suite,
     options: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Check that no name has changed its meaning since the last run.
+    """Check that no name changed its meaning since the last run.
 
     Raises
     ------
@@ -269,7 +269,7 @@ def _check_same(
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} holds {record.case}, which is no longer in the suite; cases "
+                f"{out} contains {record.case}, which is no longer in the suite; cases "
                 f"may be added, and --case narrows a run; {REMEDY}"
             )
         today = configured.get(record.solver, record.options)
@@ -277,14 +277,14 @@ def _check_same(
             old, new = record.options.get(key), today.get(key)
             if old != new:
                 raise InputError(
-                    f"{out} holds {record.solver} with {key} = {shown(old)}, now "
-                    f"{shown(new)}; give other options another label"
+                    f"{out} contains {record.solver} with {key} = {shown(old)}, now "
+                    f"{shown(new)}; use a different label for other options"
                 )
         params = now.get(record.case, record.params)
         for key in params.keys() & record.params.keys():
             if record.params[key] != params[key]:
                 raise InputError(
-                    f"{out} holds {record.case} with {key} = {record.params[key]}, "
+                    f"{out} contains {record.case} with {key} = {record.params[key]}, "
                     f"now {params[key]}; {REMEDY}"
                 )
 
@@ -292,8 +292,8 @@ def _check_same(
 def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
     """Check that no step of a sequence was inserted before steps already measured.
 
-    A solver carries data from step to step, so that the measured results would not be
-    those of the new sequence.
+    A solver carries data from step to step, so the measured results would not be
+    results of the new sequence.
 
     Raises
     ------
@@ -311,6 +311,6 @@ def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
             common = [case for case in cases if case in steps]
             if common != steps[: len(common)]:
                 raise InputError(
-                    f"{out} holds a sequence that reached {common[-1]} by other steps; "
-                    f"steps may be added at its end; {REMEDY}"
+                    f"{out} contains a sequence that reached {common[-1]} by "
+                    f"different steps; steps may be added at its end; {REMEDY}"
                 )

@@ -1,13 +1,14 @@
 """Schedule of a suite: remaining measurements, their order, and a stopping rule.
 
 The experimental design is a randomised complete block design. In each block, every
-solver is measured once on one case (or sequence) at one tolerance, in random order;
-every second block reverses the order of the previous one. If the suite sets a
-precision, further blocks are measured after the prescribed repeats. They end when, for
-every verified solver, the confidence interval of the ratio of its time to that of the
-fastest solver (`harness.running.pairs`) is narrow enough, or when a limit is reached.
-This stopping rule is fixed in the suite before the first measurement and depends only
-on the journal, so that a resumed run stops where an uninterrupted run would.
+solver is measured once on one case (or sequence) at one tolerance, in random order.
+Every second block reverses the order of the previous block. If the suite sets a
+precision, further blocks are measured after the prescribed repeats. The ratio of the
+time of each verified solver to the time of the fastest solver has a confidence interval
+(`harness.running.pairs`). No further blocks are measured when all these intervals are
+narrow enough, or when a limit is reached. This stopping rule is fixed in the suite
+before the first measurement. It depends only on the journal, so that a resumed run
+stops at the same block as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -70,9 +71,9 @@ class Schedule:
     def is_settled(self, record: Record) -> bool:
         """Return True if a measurement is in the journal, or is not needed.
 
-        A solver that declined a case once would decline it in every repeat. In a series
-        of cases of growing size, a solver is not measured any more after its first
-        answer that is not verified.
+        A solver that declined a case would decline it in every repeat. In a series of
+        cases of growing size, a solver is no longer measured after its first answer
+        that is not verified.
         """
         cell = record.solver, _cell(record)
         if record.run_id in self._done or cell in self._declined | self._ended:
@@ -96,7 +97,7 @@ class Schedule:
     def block_of_part(self, block: int, part: int) -> int:
         """Return the new block number of a part measured later or on another machine.
 
-        Times are paired within blocks, so that such a part needs a number of its own.
+        Times are paired within blocks, so such a part needs a separate block number.
         """
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next
@@ -104,7 +105,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Exclude all cases of a block as unbuilt; return False if none is new."""
+        """Mark the cases of a block as unbuilt; return False if none is new."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)
@@ -144,7 +145,8 @@ class Schedule:
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
-        # One failure excludes a solver: a time without a solution is not comparable.
+        # A single failure excludes a solver, since a time without a solution is not
+        # comparable.
         failed = {r.solver for r in records if not r.verdict.is_verified}
         times: dict[str, dict[Block, float]] = {}
         for solver in {r.solver for r in records} - failed:
@@ -184,8 +186,9 @@ class Schedule:
                 turns.append(turn)
         if not turns:
             return None
-        # Two consecutive repeats have the same seed, and the second reverses the order
-        # of the first, so that all solvers have the same mean position in the two.
+        # Two consecutive repeats have the same seed, and the second repeat reverses the
+        # order of the first. All solvers thus have the same mean position in the two
+        # repeats.
         seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
         random.Random(seed).shuffle(turns)
         if repeat % 2:
@@ -208,9 +211,9 @@ class Schedule:
 def _by_block(records: Iterable[Record]) -> dict[Block, float]:
     """Return the total time of the steps of each repeat, in s, by block.
 
-    If a sequence was interrupted and resumed, its records are from several sessions.
-    The names of all these sessions then identify its block, so that the sequence is
-    paired only with sequences of the same sessions.
+    If a sequence was interrupted and resumed, its records come from several sessions.
+    The names of these sessions together identify the block, so that the sequence is
+    paired only with sequences from the same sessions.
     """
     repeats: dict[int, list[Record]] = {}
     for r in records:

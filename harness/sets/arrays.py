@@ -1,4 +1,4 @@
-"""Conversion of discs and cones to and from the named arrays in files.
+"""Conversion of discs and cones to and from named arrays in files.
 
 The first set of discs is stored as `disc_index` and `disc_radius`, the first set of
 cones as `cone_index` and `cone_slope`. The names of further sets of the same class,
@@ -42,7 +42,7 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
     for one in sets:
         if not isinstance(one, KINDS):
             raise InputError(
-                f"sets of the kind {type(one).__name__} cannot be stored in files; "
+                f"sets of the class {type(one).__name__} cannot be stored in files; "
                 "expected bounds, Discs and Cones"
             )
         counts[type(one)] += 1
@@ -72,7 +72,7 @@ def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
         while parts := _parts(kind, _prefix(kind, count), arrays, names):
             sets.append(kind(**parts))
             count += 1
-    if names:  # without this array the QP would be a different problem
+    if names:  # ignoring this array would change the problem
         raise InputError(
             f"{min(names)} belongs to no set; expected disc_index and disc_radius, "
             "cone_index and cone_slope, then disc2_index, …"
@@ -87,7 +87,7 @@ def _prefix(kind: type[Discs] | type[Cones], count: int) -> str:
 def _parts(
     kind: Any, prefix: str, arrays: Mapping[str, Any], names: set[str]
 ) -> dict[str, Any]:
-    """Return the constructor arguments of a set; empty if `arrays` does not contain it.
+    """Return the constructor arguments of a set; empty if `arrays` lacks the set.
 
     names : names of the arrays that are not yet assigned to a set; the names of this
         set are removed in place
@@ -97,7 +97,7 @@ def _parts(
     if not here:
         return {}
     if absent := both.keys() - here:
-        raise InputError(f"{absent.pop()} is missing beside {here.pop()}")
+        raise InputError(f"{absent.pop()} is missing, but {here.pop()} is present")
     names -= here
     index, sizes = (np.asarray(arrays[name]) for name in both)
     sizes = sizes.ravel() if sizes.ndim == 2 and 1 in sizes.shape else sizes

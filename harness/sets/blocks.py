@@ -53,7 +53,7 @@ class Blocks(ABC):
         with np.errstate(invalid="ignore"):  # NaN, or out of the range of int64
             whole = index.astype(np.int64)
         if not np.array_equal(whole, index):
-            raise InputError(f"{kind}: index holds a number that is not an integer")
+            raise InputError(f"{kind}: index contains a number that is not an integer")
         bad = np.flatnonzero(~(np.isfinite(sizes) & (sizes >= 0)))
         if bad.size:
             raise InputError(
@@ -95,7 +95,7 @@ class Blocks(ABC):
         return {f"{self.prefix}_{name}": getattr(self, name) for name in names}
 
     def entries(self, T: Any, a: Vector) -> tuple[NDArray[np.int64], Vector]:
-        """Return columns and entries of T in the rows of the blocks, (k, d) each.
+        """Return columns and entries (k, d) of T in the rows of the blocks.
 
         T has a single entry in each row and column, and x = T x' + a is substituted.
 
@@ -114,7 +114,7 @@ class Blocks(ABC):
 
 
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
-    """Return the Euclidean norms (k,) of the rows of (k, d), in the same precision."""
+    """Return the Euclidean norms (k,) of rows (k, d), without a change of precision."""
     return np.asarray(np.linalg.norm(blocks, axis=1))
 
 

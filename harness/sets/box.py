@@ -41,7 +41,8 @@ class Box:
     def block(self) -> NDArray[np.int64]:
         """Indices of the variables with a finite bound, in ascending order."""
         is_bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
-        return np.flatnonzero(np.asarray(is_bounded))  # local slice if distributed
+        # the local slice of a distributed vector
+        return np.flatnonzero(np.asarray(is_bounded))
 
     def check(self, n: int) -> None:
         """Raise ValueError if bounds have a wrong shape, are NaN or exclude all x."""
@@ -49,12 +50,12 @@ class Box:
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
         if not (self.lower < np.inf).all() or not (self.upper > -np.inf).all():
-            raise ValueError("QP bounds hold NaN, lb = +inf or ub = -inf")
+            raise ValueError("QP bounds contain NaN, lb = +inf or ub = -inf")
         if (self.lower > self.upper).any():
             raise ValueError("QP bounds cross: lb > ub in some component")
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
-        """Return the bounds: a box is its own hull."""
+        """Return the bounds of the box, which is its own hull."""
         return self.lower, self.upper
 
     def project(self, x: Vector) -> Vector:
@@ -62,7 +63,7 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Return the slacks of finite bounds: first of lower, then of upper bounds."""
+        """Return the slacks of finite lower bounds, then of finite upper bounds."""
         size, limits = np.abs(x), list[Limits]()
         for bound, sign in ((self.lower, 1), (self.upper, -1)):
             is_finite = np.isfinite(bound)
@@ -114,7 +115,7 @@ class Box:
         return {"lb": self.lower, "ub": self.upper}
 
     def _sides(self, z: Vector) -> Iterator[tuple[Vector, Vector, int]]:
-        """Yield finite bounds, multipliers ≥ 0 and sign of z: lower bounds first."""
+        """Yield the finite bounds, their multipliers ≥ 0, and the sign of z."""
         for bound, sign in ((self.lower, -1), (self.upper, 1)):
             is_finite = np.isfinite(bound)
             if is_finite.any():

@@ -60,7 +60,7 @@ class Cones(Blocks):
         return lower, upper
 
     def project(self, x: Vector) -> Vector:
-        """Project x (n,) onto the cones; the polar cones are mapped to the apex."""
+        """Project x (n,) onto the cones; points of polar cones move to the apex."""
         nearest = x.copy()
         normal, tangent = x[self.index[:, 0]], x[self.index[:, 1:]]
         parts = _projection(normal, tangent, np.ones_like(self.slope), self.slope)

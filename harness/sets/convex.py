@@ -1,15 +1,15 @@
 """Convex sets of the variables of a QP, and the operations on them.
 
-A QP requires x ∈ S₀ × S₁ × …: S₀ is a `Box` of all variables, and each further set
-constrains a block of variables that are free in S₀ and in all other sets. KKT
-residuals, verdicts, transforms and files use only the operations defined below, so that
-they do not depend on the class of a set.
+The feasible set of a QP without its rows is the product S₀ × S₁ × …, where S₀ is a
+`Box` of all variables. Each further set constrains a block of variables that are free
+in S₀ and in all other sets. KKT residuals, verdicts, transforms and files use only the
+operations of `ConvexSet`, so that they do not depend on the class of a set.
 
 A vector z is normal to S at x ∈ S if zᵀ(y − x) ≤ 0 for all y ∈ S. With the support
 function σ(z) = sup zᵀy over y ∈ S, this is equivalent to  σ(z) − zᵀx = 0.  The
 left-hand side, called the support gap, is nonnegative for x ∈ S (Rockafellar 1970,
-Theorem 23.5). For a box, it is the sum of the complementarity terms, multiplier times
-distance to the bound.
+Theorem 23.5). For a box, the support gap is the sum of the complementarity terms, that
+is, of the products of multiplier and distance to the bound.
 """
 
 from __future__ import annotations

@@ -18,7 +18,8 @@ class Discs(Blocks):
     """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
 
     At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
-    radius 0 it is arbitrary. A `QP` converts discs of one variable (d = 1) to bounds.
+    radius 0, the normal vector is arbitrary. A `QP` converts discs of one variable (d =
+    1) to bounds.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """Permitted changes of a suite that has a result folder, and unions of suites.
 
 Such a suite may only be extended: solvers, cases and tolerances may be added, the
-number of repeats may be raised, and a precision may be set or tightened. Limits,
-accuracy, and the solver that belongs to a label must not change, since the stored
-measurements depend on them. Suites in which these settings agree can be united.
+number of repeats may be raised, and a precision may be set or tightened. The limits,
+the accuracy and the solver of each label must not change, since the stored measurements
+depend on these settings. Suites in which these settings agree can be united.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Table = Mapping[str, Any]  #: content of a suite's TOML
 
 
 def incompatibility(old: Table, new: Table) -> str:
-    """Return the first change that is not permitted, or "" if all changes are.
+    """Describe the first change that is not permitted; return "" if all are permitted.
 
-    Cases are not compared: `harness.running.run` compares them with the journal.
+    Cases are not compared here; `harness.running.run` compares them with the journal.
     """
     both = {**DEFAULTS, **old}, {**DEFAULTS, **new}
     return next(chain(_settings(*both), _members(*both)), "")
@@ -40,7 +40,7 @@ def _settings(old: Table, new: Table) -> Iterator[str]:
     for key in GROWING_KEYS:
         if new[key] < old[key]:
             yield f"{_change(key, old[key], new[key])}; it may only grow"
-    finer = "it may only become finer"
+    finer = "it may only be reduced"
     # None counts as the loosest precision, 1
     if old["precision"] is not None and (new["precision"] or 1) > old["precision"]:
         yield f"{_change('precision', old['precision'], new['precision'])}; {finer}"
@@ -70,7 +70,7 @@ def _text(value: object) -> str:
 
 
 def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
-    """Return the union of suites: the settings of the first, the measurements of all.
+    """Return a suite with the settings of the first suite and the measurements of all.
 
     tables : results of `harness.suite.suite.read_stored` by folder
 

@@ -55,8 +55,7 @@ def with_overrides(
                 with checked.located("--solver"):
                     resolve(chosen[name], {**resolved, **registry})
         selected = dict.fromkeys(solvers)
-        # if a solver with an A/A comparison is selected, its second copy is needed for
-        # the ratio
+        # the ratio of an A/A comparison also needs the second copy of a selected solver
         null = [
             name
             for name in chosen
@@ -74,10 +73,10 @@ def with_overrides(
     for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
         if limit is not None:
             changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
-            # A suite with different limits counts as a different suite, since results
-            # depend on them; the stored text must therefore contain the limits. In
-            # contrast, results do not depend on the selection of solvers and cases. In
-            # TOML, top-level keys must precede all tables.
+            # Results depend on the limits, so a suite with different limits counts as a
+            # different suite, and the stored text must contain the limits. Results do
+            # not depend on the selection of solvers and cases. In TOML, top-level keys
+            # must precede all tables.
             line = f"{key} = {limit!r}"
             if key in toml(text):
                 old = rf"^[ \t]*{key}[ \t]*=.*$"

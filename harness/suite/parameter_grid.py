@@ -24,7 +24,7 @@ class Growth:
     """Position of a case in a series of growing sizes."""
 
     smaller: str  #: name of the next smaller case of the series; empty for the smallest
-    warm_up: CaseId  #: the same case with the default size of its family
+    warm_up: CaseId  #: the same case, but with the default size of its family
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,11 +39,12 @@ class Problems:
 def expand_problems(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Problems:
-    """Return all cases of a suite: single cases, sequences and series of growing sizes.
+    """Return all cases of a suite: single cases, sequences, series of growing sizes.
 
     A case that occurs in several blocks is returned once. The cases of a sequence, or
-    of a series of growing sizes, differ only in the key of the sequence or series, and
-    in keys that are zipped with this key. They are in the order of its values.
+    of a series of growing sizes, differ only in the key of the sequence or series and
+    in keys that are zipped with this key. The cases have the order of the values of the
+    key.
 
     blocks : value of ``problems`` in the suite
     folder : folder of the suite, to which relative paths refer if they do not exist in
@@ -94,7 +95,7 @@ def _blocks(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Iterator[_Block]:
     """Check the entries of ``problems``, and yield their cases as blocks."""
-    # number of cases, checked before they are created: a grid may span billions
+    # number of cases, checked before the cases are created: a grid may span billions
     count = 0
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
@@ -160,8 +161,8 @@ def _is_pattern(path: object, folder: Path, family: Family) -> bool:
 def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
     """Return the files that match a pattern, relative to the working directory.
 
-    Files that are missing but have a copy in the result folder are included. If there
-    is no match, the pattern is interpreted relative to the folder of the suite.
+    The result includes files that are missing but have a copy in the result folder. If
+    there is no match, the pattern is interpreted relative to the folder of the suite.
     """
     missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
     if paths := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
@@ -188,8 +189,8 @@ def _located(
     """Return the keys of a case, with a path that leads to its file.
 
     If the path does not exist relative to the working directory, it is interpreted
-    relative to the folder of the suite. If the file is missing there as well, the path
-    is replaced by that of a copy in the result folder, if exactly one matches.
+    relative to the folder of the suite. If the file is also missing in this folder, and
+    exactly one copy in the result folder matches, the path of the copy is returned.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():
@@ -222,7 +223,7 @@ def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, st
 
 
 def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:
-    """Return the axes of a grid; an axis is a list of dicts from keys to values.
+    """Return the axes of a grid, each a list of dicts from keys to values.
 
     Keys that are zipped belong to the same axis; any other key has its own axis.
     """
@@ -255,6 +256,6 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
 
 
 def _points(axes: Sequence[list[dict[str, object]]]) -> Iterator[dict[str, object]]:
-    """Yield the points of a grid as dicts, with the first axis varying slowest."""
+    """Yield the points of a grid as dicts; the first axis varies slowest."""
     for point in product(*axes):
         yield {k: v for part in point for k, v in part.items()}

@@ -1,7 +1,8 @@
 """Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
 
-A value is converted to the type of the option: the annotation of the dataclass field
-or, if the field has no annotation or one of Any and object, the type of the default.
+A value is converted to the type of the option, which is the annotation of the dataclass
+field. If the field has no annotation, or its annotation is Any or object, the type of
+the default is used.
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ from mortarbench.harness.registry import SolverSpec, option_types, options_of, r
 from mortarbench.harness.suite.suite import NULL_SUFFIX
 
 _KEY = re.compile(r"[^\W\d]\w*")
+# stricter than int() and float(), which accept 1_0 and digits of other scripts
 _NUMBERS = {
     int: (re.compile(r"[+-]?[0-9]+"), "an integer"),
     float: (
         re.compile(r"[+-]?(inf|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?)"),
         "a number",
     ),
-}  # stricter than int() and float(), which accept 1_0 and digits of other scripts
+}
 _TRUTH = {"true": True, "false": False}
 _PLAIN = (bool, Real, str, NoneType)  #: types of values that Python callers may pass
 _MAX_VARIANTS = 1000  #: largest number of variants of one solver in a sweep
@@ -65,7 +67,8 @@ def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
     Raises
     ------
     InputError
-        If `options` is not a mapping from names to plain values or lists of these.
+        If `options` is not a mapping from names to plain values or lists of plain
+        values.
 
     """
     if not isinstance(options, Mapping):
@@ -126,16 +129,15 @@ def sweep(
     """Return a variant of each solver for every combination of option values.
 
     The label of a variant contains its values, as in ``LABEL max_iter=50``. If a solver
-    lacks some of the options, only the others are varied; if it lacks all of them, it
-    is returned unchanged.
+    lacks some of the options, only its existing options are varied. A solver without
+    any of the options is returned unchanged.
 
     given : values by option
 
     Raises
     ------
     InputError
-        If one of the options exists for no solver, or a solver refuses one of its
-        values.
+        If no solver has one of the options, or if a solver refuses a value.
 
     """
     if not given:
@@ -207,7 +209,7 @@ def with_options(label: str, options: Mapping[str, Any]) -> str:
 
 
 def without_options(label: str) -> Iterator[str]:
-    """Yield a label, then the label without its last option, its last two, and so on.
+    """Yield a label, then the label without its last option, last two options, etc.
 
     >>> list(without_options("LABEL max_iter=50 scaling=true"))
     ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']
@@ -223,7 +225,7 @@ def _text(value: object) -> str:
     match value:
         case None | bool():
             return str(value).lower()
-        case str():  # replace blanks, at which `without_options` splits labels
+        case str():  # replace blanks, since `without_options` splits labels at blanks
             return "_".join(value.split())
         case Integral():  # includes integers of NumPy
             return repr(int(value))

@@ -85,20 +85,22 @@ class Suite:
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
-    cases: tuple[CaseId, ...]  #: distinct cases, solved without results of others
+    cases: tuple[CaseId, ...]  #: distinct cases, solved without results of other cases
     text: str  #: TOML of the suite, with the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: positions of cases in series of growing sizes, by name of the case
     growing: Mapping[str, Growth] = field(default_factory=dict)
-    #: values of θ, see `harness.record.Record.tighten`; each sequence is solved once
-    #: for each value, and 0 stands for constant tolerances
+    #: values of θ, see `harness.record.Record.tighten`. Each sequence is solved once
+    #: for each value; 0 means constant tolerances
     tighten: tuple[float, ...] = (0.0,)
-    #: relative half-width of confidence intervals: no further repeats are measured once
-    #: it is reached for every ratio to the fastest solver; if None, `repeats` applies
+    #: requested relative half-width of confidence intervals; no further repeats are
+    #: measured when every ratio to the fastest solver attains it. If None, the number
+    #: of repeats is `repeats`
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
-    budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
+    #: largest time per case and tolerance in s, if a precision is set
+    budget: float = 600.0
     #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
     every: frozenset[str] = frozenset()  #: names of all cases, regardless of ``--case``
@@ -201,8 +203,8 @@ def name_in(text: str) -> str:
 def read_stored(path: Path) -> dict[str, Any]:
     """Read the suite of a result folder, and check only the types of its values.
 
-    Names and ranges are not checked, since the suite may have been written by another
-    version, or need a plug-in.
+    Names and ranges are not checked, since another version may have written the suite,
+    or the suite may need a plug-in.
 
     Raises
     ------
@@ -269,13 +271,13 @@ def _toml_value(where: str, value: Any) -> str:
     if hasattr(value, "tolist"):
         value = value.tolist()
     match value:
-        case bool():  # before int, of which bool is a subclass
+        case bool():  # before int, since bool is a subclass of int
             return str(value).lower()
         case int() | float():
             return repr(value)
-        # JSON strings are valid TOML strings with two exceptions, avoided here: JSON
-        # does not escape DEL, and its ASCII form splits characters beyond 16 bits into
-        # surrogate pairs.
+        # JSON strings are valid TOML strings except in two cases, which are avoided
+        # here: JSON does not escape DEL, and its ASCII form splits characters beyond 16
+        # bits into surrogate pairs.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
@@ -359,9 +361,9 @@ def _on_ranks(
     """Return specs of each solver for every number of ranks in the suite.
 
     A solver that does not support ranks is returned for a single rank. If ``copies`` is
-    true, each number of ranks n > 1 is followed by n independent copies of the solver.
-    Sequences on several ranks are refused, since the results that a solver reuses are
-    stored in a single process.
+    true, the result also contains n independent copies of the solver for each number of
+    ranks n > 1. Sequences on several ranks are refused, since the results that a solver
+    reuses are stored in a single process.
     """
     ranks, copies = table["ranks"], table["copies"]
     counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]

@@ -1,16 +1,16 @@
-"""Solution for prescribed closed rows in extended precision, and exchange of rows.
+"""Solution with prescribed closed rows in extended precision, and active-set exchange.
 
-For a set A of closed rows, which hold with equality, displacement u and multipliers λ
-solve linear equations,
+Let A be a set of closed rows, which hold with equality, and N the set of the other
+rows. The displacement u and the multipliers λ_A solve the linear equations
 
     K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,
 
-with prescribed multipliers λ_N of the other rows, and are refined with residuals in
-extended precision. The multiplier of a row that is not closed is on the boundary of the
-set Λ of admissible multipliers: an open contact has λ = 0, and a slipping node has
-‖λ‖ = g with the friction bound g. As in a primal-dual active set method, a closed row
-leaves A if its multiplier is not in Λ, and another row enters A if its motion
-contradicts its multiplier (for contact, if the gap is negative), until A is unchanged.
+with prescribed multipliers λ_N. The solution is refined with residuals in extended
+precision. The multiplier of a row that is not closed is on the boundary of the set Λ of
+admissible multipliers: an open contact has λ = 0, and a slipping node with the friction
+bound g has ‖λ‖ = g. As in a primal-dual active set method, a closed row leaves A if its
+multiplier is not in Λ. A row of N enters A if its motion contradicts its multiplier
+(for contact, if the gap is negative). The exchange ends when A does not change.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.verify.admissible import closing
 
 MAX_EXCHANGES = 60  #: largest number of exchanges of active sets
-#: Number of refinements of a solution, each with a residual in extended precision.
+#: Number of refinement steps, each with a residual in extended precision.
 REFINEMENTS = 6
 
 States = NDArray[np.int8]  #: (m,) state of each row
@@ -62,8 +62,8 @@ class ActiveSet(NamedTuple):
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
     """Solve K u = force with u = 0 on fixed components; return u and its error.
 
-    u (n,) is in extended precision and has no rigid motion. The error is given in
-    the energy norm, √(rᵀK⁺r) with the residual r.
+    u (n,) is in extended precision and has no rigid motion. The returned error is
+    √(rᵀK⁺r) with the residual r, that is, the error in the energy norm.
     """
     K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
@@ -78,10 +78,10 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
 
 
 def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
-    """Guess the states from the displacement without contact: violated rows are closed.
+    """Guess the states from the displacement without contact; violated rows are closed.
 
-    If only contact supports a body, all rows are assumed closed. Friction rows are
-    assumed to stick.
+    If only contact supports a body, all rows are assumed to be closed. Friction rows
+    are assumed to stick.
     """
     exact = mechanics.exact
     none = np.zeros(exact.c.size, dtype=Real)
@@ -95,8 +95,8 @@ def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
 def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
     """Guess the states from a pair (u, λ): rows with λ + v/D inside Λ are closed.
 
-    Here, v = Bu − c, and D is the compliance of the row. Primal-dual active set methods
-    determine the next active set by the same rule.
+    Here, v = Bu − c, and D is the compliance of the row. A primal-dual active set
+    method uses this rule to determine the next active set.
     """
     return predicted(exact.forces, multipliers, exact.compliance, exact.motion(u))
 
@@ -104,9 +104,10 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
 def predicted(
     forces: AdmissibleForces, multipliers: Any, softness: Any, v: Any
 ) -> ActiveSet:
-    """Return the states of rows: closed if λ + v/D is inside Λ.
+    """Return the states of the rows; a row is closed if λ + v/D is inside Λ.
 
-    For other rows, `limits` of the result is the projection of λ + v/D onto Λ.
+    For rows that are not closed, `limits` of the result is the projection of λ + v/D
+    onto Λ.
 
     multipliers : λ (m,)
     softness : (m,) compliances D ≥ 0 of the rows
@@ -141,9 +142,9 @@ def exchanged(
 ) -> tuple[Extended, Extended, ActiveSet]:
     """Exchange rows, starting from a guess; return u (n,), λ (m,) and the active set.
 
-    The direction of slipping friction vectors is fixed. If an active set recurs, or
-    after `rounds` exchanges, the last active set is returned. It need not be optimal;
-    a certificate has to bound the error of u and λ.
+    The direction of slipping friction vectors is fixed. The iteration ends if no row
+    violates a condition, if an active set recurs, or after `rounds` exchanges. The last
+    active set need not be optimal, so a certificate has to bound the error of u and λ.
     """
     exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):
@@ -159,7 +160,7 @@ def exchanged(
 def _next(
     exact: Exact, active: ActiveSet, u: Extended, lam: Extended
 ) -> ActiveSet | None:
-    """Exchange the rows that violate a condition; return None if no row does."""
+    """Return the next active set, or None if no row violates a condition."""
     v, discs = exact.motion(u), exact.forces.discs
     rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
     force = 1e4 * _EPS * np.abs(lam).max(initial=Real(0))
@@ -181,7 +182,7 @@ def _next(
 
 
 def _solved(mechanics: Mechanics, active: ActiveSet) -> tuple[Extended, Extended]:
-    """Solve with equality on the closed rows; return u (n,) and λ (m,)."""
+    """Solve for u (n,) and λ (m,) with equality on the closed rows."""
     exact, motions, closed = mechanics.exact, mechanics.motions, active.closed
     R = motions.constrained
     close = closing(mechanics, closed)

@@ -1,8 +1,8 @@
 """Admissible pairs near an answer: no penetration, and forces in equilibrium.
 
-Moving each slave node separately cannot remove every penetration: end nodes of an arc
-may be prescribed, and a mortar row couples several nodes. Corrections are therefore
-computed for a set of rows together.
+Moving each slave node separately cannot remove every penetration, because end nodes of
+an arc may be prescribed and a mortar row couples several nodes. Corrections are
+therefore computed simultaneously for a set of rows.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ from mortarbench.harness.qp import Vector
 from mortarbench.harness.sets.blocks import norms
 
 MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
-#: Largest number of rows for which F_VV is assembled. For more rows, CG applies it.
+#: Largest number of rows for which F_VV is assembled. Systems with more rows are solved
+#: by CG.
 MAX_DENSE_ROWS = 2000
 #: A combination of rigid motions counts as floating if its singular value in √W G is
 #: at most this fraction of the largest one (`supported_and_floating`).
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
-#: sum of its absolute terms.
+#: sum of the absolute terms of the load.
 LOAD_ROUNDING = 1e-12
 _EPS = Real(np.finfo(Real).eps)
 
@@ -58,9 +59,9 @@ def admissible(
     """Return û near u with Bû ≤ c and equality on the rows `closed`; None on failure.
 
     û is the point nearest to u in the energy norm that satisfies a set V of rows with
-    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα, the compliance
-    F_VV = B_V K⁺B_Vᵀ of the rows, and rigid motions R. V initially consists of the rows
-    `closed` and is extended until Bû ≤ c.
+    equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Here, F_VV = B_V
+    K⁺B_Vᵀ is the compliance of the rows, and the columns of R are rigid motions. V
+    initially consists of the closed and the violated rows and is extended until Bû ≤ c.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
@@ -93,11 +94,12 @@ def _feasible_near(
 ) -> FeasiblePoint | None:
     """Move u into the feasible set, with equality on the rows V.
 
-    V starts with the closed and the violated rows; rows that a correction violates are
-    added. The target of a correction is a few units in the last place inside the
-    feasible set, so that rounding of Bu cannot hide a violation. If MAX_ROUNDS rounds
-    do not suffice, θu with θ < 1 is returned, which is feasible for c ≥ 0. Friction
-    rows belong to V only if they are closed, that is, if they stick.
+    V initially consists of the closed and the violated rows; contact rows that become
+    violated after a correction are added. The target of a correction is a few units in
+    the last place inside the feasible set, so that rounding of Bu cannot hide a
+    violation. If MAX_ROUNDS rounds do not suffice and c ≥ 0, a feasible θu with θ ≤ 1
+    is returned. Friction rows belong to V only if they are closed, that is, if they
+    stick.
 
     nearest : returns, for rows V, the map from violations t (v,) to a
         correction δ with B_V δ = −t
@@ -197,7 +199,7 @@ def _nearest_at_rows(
     """Return the map from t to (δ + Rα, α) with B_V(δ + Rα) = −t and least δ.
 
     The norm of δ is induced by diag(1/softness), which is infinite at prescribed
-    components. The rigid motion Rα does not contribute to it.
+    components. The rigid motion Rα does not contribute to this norm.
     """
     B_V = csr_array(B[np.flatnonzero(rows)])
     moved = csr_array((B_V * softness).T)
@@ -219,17 +221,18 @@ def _nearest_at_rows(
 def closing(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector, Vector], tuple[Vector, Vector]]:
-    """Return the solver for multipliers μ and rigid motions α that close the rows V.
+    """Return a solver for multipliers μ and rigid motions α that close the rows V.
 
     ::
 
         F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
-    for violations t (v,) and loads e (p,) along the motions R that change gaps. α is
-    zero along motions that do not change the gaps of the rows V. F_VV may be singular,
-    since K⁺ is zero on fixed components; it is therefore replaced by F_VV + ρUUᵀ,
-    where U spans the range of G_V. Rows are scaled to similar compliance, since the
-    stiffnesses of bodies may differ by orders of magnitude.
+    The arguments of the solver are the violations t (v,) and the loads e (p,) along the
+    motions R that change gaps. α is zero along motions that do not change the gaps of
+    the rows V. F_VV may be singular, since K⁺ is zero on fixed components. It is
+    therefore replaced by F_VV + ρUUᵀ, where U spans the range of G_V. Rows are scaled
+    to similar compliance, since the stiffnesses of bodies may differ by orders of
+    magnitude.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
@@ -257,11 +260,12 @@ def closing(
 def _compliance(
     mechanics: Mechanics, B_V: Any, U: NDArray[np.float64]
 ) -> Callable[[Vector], Vector]:
-    """Return the solver for F_VV + ρUUᵀ: Cholesky, or CG beyond MAX_DENSE_ROWS rows.
+    """Return a solver for F_VV + ρUUᵀ.
 
-    The matrix may be singular up to rounding, so its diagonal is shifted by 1e-13 of
-    its largest entry; the next round of `_feasible_near` corrects the resulting error.
-    CG is preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    Up to MAX_DENSE_ROWS rows, the solver is a Cholesky factorisation. The matrix may be
+    singular up to rounding, so its diagonal is shifted by 1e-13 of its largest entry;
+    the next round of `_feasible_near` corrects the resulting error. Larger systems are
+    solved by CG, preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:
@@ -315,7 +319,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     """Return True if any motion that leaves all gaps unchanged has a load along it.
 
-    Loads that do not exceed their rounding count as zero.
+    A load that does not exceed its rounding counts as zero.
 
     Parameters
     ----------
@@ -343,7 +347,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
 
 def relative(multipliers: Extended) -> Extended:
-    """Divide by the largest multiplier; return ones if no multiplier is positive."""
+    """Divide multipliers by the largest one; return ones if none is positive."""
     largest = multipliers.max(initial=Real(0))
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
@@ -353,10 +357,10 @@ def supported_and_floating(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Split the space of rigid motions (p,) into supported and floating ones.
 
-    Rows resist a motion ν through the change Gν (m,) of their gaps, with weights
-    w (m,) ≤ 1. A motion is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times the
-    maximum over motions of the same norm. Returns orthonormal bases (p, h) of supported
-    and (p, p − h) of floating motions.
+    Rows resist a motion ν through the change Gν (m,) of their gaps, with weights w (m,)
+    ≤ 1. A motion of unit norm is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times
+    the maximum of this value over all motions of unit norm. Returns orthonormal bases
+    (p, h) of supported and (p, p − h) of floating motions.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
@@ -380,11 +384,12 @@ class Balance(NamedTuple):
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
-        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
-        boundary of Λ (for contact, wᵢ ≈ λᵢ), since corrections at open gaps or slipping
-        nodes would do work. Along motions that λ does not support
-        (`supported_and_floating`), the load must vanish up to rounding; otherwise all
-        rows are corrected, in the last attempt with equal weights.
+        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the relative distance of λᵢ
+        from the boundary of Λ (for contact, wᵢ is proportional to λᵢ), since
+        corrections at open gaps or slipping nodes would do work. Along motions that λ
+        does not support (`supported_and_floating`), the load must vanish up to
+        rounding. Otherwise, all rows are corrected in two further attempts, the last
+        with equal weights.
 
         Raises
         ------
@@ -399,16 +404,16 @@ class Balance(NamedTuple):
             if (balanced := self._solved(multipliers, shares)) is not None:
                 return balanced
         raise UncertifiableError(
-            "contact would have to pull to balance the load, which moves some body "
+            "only tensile contact forces could balance the load, which moves some body "
             "away from its contacts, and no support holds the body"
             if self.forces.contact.all()
-            else "contact would have to pull, or friction to exceed its bound, to "
+            else "only tensile contact forces or friction above its bound could "
             "balance the load, which moves some body away from its contacts or along "
             "them, and no support holds the body"
         )
 
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
-        """Solve with corrections of the rows with w > 0; return None if that fails.
+        """Solve by correcting only the rows with w > 0; return None on failure.
 
         λ̂ is the projection of λ + WGν onto Λ, with W = diag(w); ν minimises a convex
         function with one variable per motion.
@@ -449,7 +454,7 @@ def _newton(
 ) -> Extended | None:
     """Solve the equilibrium equations, scaled to GᵀWG = I; return None on failure.
 
-    Newton's method with damping is applied to the dual function of the minimisation in
+    Damped Newton's method is applied to the dual function of the minimisation in
     `Balance.near`. Rows with w = 0 keep their multipliers.
     """
     on = w > 0
@@ -467,8 +472,8 @@ def _newton(
         if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
         hessian = _curvature(forces, free, w, G).astype(np.float64)
-        # the Hessian is singular if every row that a motion changes is at a bound; the
-        # shift is relative, because GᵀWG = I
+        # The Hessian is singular if all rows that depend on a motion are at a bound.
+        # The shift is relative, because GᵀWG = I.
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):
@@ -483,7 +488,7 @@ def _newton(
 def _curvature(
     forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
 ) -> Extended:
-    """Return GᵀWΠ'(λ)G (p, p), with the projection Π onto Λ, at a trial point λ (m,).
+    """Return GᵀWΠ'(λ)G (p, p) at a trial point λ (m,), with the projection Π onto Λ.
 
     Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
     radius g.

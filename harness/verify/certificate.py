@@ -1,4 +1,4 @@
-"""Proven bound of the error of an answer, independent of the solver.
+"""Proven bound of the error of an answer, without trust in the solver.
 
 Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the displacement
 in equilibrium with λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
@@ -32,28 +32,28 @@ Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ less the
 This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
-rigid motions R; otherwise D(λ̂) = −∞. In this case ‖v‖ is a seminorm, the energy norm of
-v − RRᵀv, and the error of the rigid motion itself is not bounded. Motions that do not
-change any gap (BR = 0 up to rounding), or that λ̂ does not support, are disregarded, and
-so is the rounding of K and f along such motions.
+rigid motions R; otherwise D(λ̂) = −∞. In this case ‖v‖ is a seminorm, the energy norm
+of v − RRᵀv, and the error of the rigid motion itself is not bounded. Motions that do
+not change any gap (BR = 0 up to rounding) or that λ̂ does not support are disregarded.
+The rounding of K and f along these motions is also disregarded.
 
 The bounds are evaluated for the stored K = TᵀK_T T + E, where T maps displacements to
-those of one or more subdomains, K_T contains the stiffness of the subdomains and E is
-rounding (`harness.verify.substructured`). Let the error e = û − u* = e' + Rγ consist of
-a deformation and a rigid motion, let ρ = Kû − f + Bᵀλ̂ and u_λ = Tû − d with any d. By
-(R2) of docs/certificates.md, (1) becomes
+their copies in one or more subdomains, K_T contains the stiffness matrices of the
+subdomains, and E is rounding (`harness.verify.substructured`). Let the error e = û − u*
+= e' + Rγ consist of a deformation and a rigid motion, let ρ = Kû − f + Bᵀλ̂ and u_λ =
+Tû − d with any d. By (R2) of docs/certificates.md, (1) becomes
 
     ‖Te‖² + ‖Te − d‖² + 2λ̂ᵀ(c − Bu*) + 2λ*ᵀ(c − Bû)
         = ‖d‖² + 2λ̂ᵀ(c − Bû) + 2eᵀ(ρ − TᵀK_T d) − 2eᵀEe                          (4)
 
-where the last two terms are rounding. Inequality (R3) bounds them by ‖e'‖ and γ, and
-(R4) bounds γ by the contact conditions.
+where the last two terms are rounding. Inequality (R3) of docs/certificates.md bounds
+these terms by ‖e'‖ and γ, and (R4) bounds γ by the contact conditions.
 
 If P is not a stored stiffness matrix, as for half-spaces, a proven lower bound μ > 0 of
-its eigenvalues is used. Let x̂ be in the product S of the sets, z normal to S at x̂, and
-r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies
-(Px* + q)ᵀ(x̂ − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. The two inequalities
-imply ‖x̂ − x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
+its eigenvalues is used. Let S be the product of the sets, x̂ ∈ S, z normal to S at x̂,
+and r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies (Px* + q)ᵀ(x̂
+− x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. The two inequalities imply ‖x̂ −
+x*‖²_P ≤ rᵀ(x̂ − x*) ≤ ‖r‖‖x̂ − x*‖_P/√μ,  hence
 
     ‖x̂ − x*‖_P ≤ ‖r‖/√μ                                                          (5)
 """
@@ -94,7 +94,8 @@ from mortarbench.harness.verify.substructured import (
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
-#: Largest residual of a combination of contact rows that has to equal a rigid motion.
+#: Largest residual with which a combination of contact rows counts as equal to a rigid
+#: motion.
 COMBINATION_RESIDUAL = 1e-9
 #: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: its error grows like the
 #: logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002, Theorem
@@ -106,8 +107,8 @@ POWER_ITERATION_FACTOR = 2.0
 #: `distance` d: without work, the bound √(d² + 2·work) would decrease by only 5 %.
 SHARP_WORK = 0.05
 SHARP_BOUND = 1e-7  #: bound below which no further pair is tried
-#: Largest bound for which the closed rows are taken from the answer. With a larger
-#: error, a solution for these rows may be far from the answer.
+#: Largest bound for which the closed rows are taken from the answer. If the error is
+#: larger, the solution for these rows may be far from the answer.
 MAX_EXCHANGE_BOUND = 1e-3
 #: Largest number of exchanges of closed rows in search of a better pair.
 EXCHANGE_ROUNDS = 5
@@ -160,7 +161,7 @@ class Certificate:
 
     @property
     def error(self) -> float:
-        """Bound of the errors of û, of u_λ and of the answer."""
+        """Bound of the energy norms of the errors of û, of u_λ and of the answer."""
         return max(self.pair * self.stretch, self.claimed)
 
     @property
@@ -223,10 +224,10 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
     With the projection Π, x̂ = Π(t) is the projected gradient step t = x − (Px + q)/L,
-    and z = L(t − x̂) is normal at x̂ for any L > 0. Multipliers are not used. If rounding
-    leaves ‖x̂_I‖ = (1 + δ)r on a disc I of radius r, then x̂ and z are exact for the
-    radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ, which the
-    bound covers as part of the rounding of the residual (docs/certificates.md).
+    and z = L(t − x̂) is normal at x̂ for any L > 0. Multipliers are not used. If
+    rounding leaves ‖x̂_I‖ = (1 + δ)r on a disc I of radius r, then x̂ and z are exact
+    for the radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ.
+    The rounding term of the residual covers this distance (docs/certificates.md).
 
     least : μ > 0, a proven lower bound of the eigenvalues of P
 
@@ -237,7 +238,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
 
     """
     if not np.isfinite(s.x).all():
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     if qp.b.size + qp.h.size:
         raise UncertifiableError("the QP has rows; expected bounds, discs and cones")
     L = largest_eigenvalue(qp)
@@ -270,11 +271,11 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     returned:
 
     1. the pair of the answer, changed as little as admissibility requires;
-    2. if most of g is work, as for an interior point with positive multipliers and
-       gaps: a pair with the active rows that the answer suggests;
-    3. if only contact supports a body: the solution for the closed rows of the answer,
-       provided that a pair above proves the answer to be accurate;
-    4. if none of these proves a bound: the pair near zero, which does not depend on the
+    2. if the first certificate is not sharp, as for an interior point with positive
+       multipliers and gaps: a pair with the active rows that the answer suggests;
+    3. if only contact supports a body, and one of the first two pairs proves the answer
+       to be accurate: the solution for the closed rows of the answer;
+    4. if no other pair proves a bound: the pair near zero, which does not depend on the
        answer.
 
     Raises
@@ -284,7 +285,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     if mechanics.certify_by_subdomains is not None:
         certificate: Certificate = mechanics.certify_by_subdomains(
             s.x, mechanics.multipliers(s)
@@ -335,7 +336,7 @@ def _least_norm(split: Undivided) -> float:
 
 
 def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
-    """Yield a certificate of each pair, or why it has none, until one is sharp."""
+    """Yield certificates of pairs, or reasons for their absence, until one is sharp."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0
@@ -359,7 +360,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
-    """Return the certificate of the pair near u = 0, λ = 0, or why it has none."""
+    """Return the certificate of the pair near zero, or the reason why it has none."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
@@ -387,7 +388,7 @@ def proof(
     multipliers: Extended,
     closed: Any,
 ) -> Certificate:
-    """Evaluate the bounds (4) and (3) for an admissible pair near u and λ.
+    """Evaluate bounds (4) and (3) for an admissible pair near u and λ.
 
     claimed : (n,) displacement of the answer
     closed : (m,) mask of the rows that û satisfies with equality
@@ -458,7 +459,7 @@ def proven(
     supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    # the θ of a small û may differ from that of the error; for û = 0, it is 0
+    # If û is small, its θ may differ from the θ of the error. For û = 0, θ is 0.
     if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)
@@ -473,8 +474,8 @@ def proven(
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
-            "the answer is too far off: along such large rigid motions, the rounding "
-            "of the stiffness outweighs the contact forces"
+            "the error of the answer is too large: along its rigid motions, the "
+            "rounding of the stiffness outweighs the contact forces"
         )
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
@@ -564,12 +565,12 @@ def _reach(
 ) -> _Reach:
     """Bound the rigid part γ of û − u* by the contact conditions (R4).
 
-    Every combination of the inequalities (R4) of docs/certificates.md, with
-    coefficients y ≥ 0, whose left-hand side equals ±γₖ yields a bound. A combination
-    with a small bound is sought for the squared error `square`, with the compliance of
-    row i approximated by Bᵢdiag(K)⁻¹Bᵢᵀ; the dual norm ‖Σ±yᵢBᵢ‖ of the result is then
-    evaluated. Motions that λ̂ does not support are disregarded, and so are motions that
-    do not change gaps: the rounding of K along them is not part of the problem.
+    A combination of the inequalities (R4) of docs/certificates.md with coefficients y ≥
+    0 yields a bound if its left-hand side equals ±γₖ. A combination with a small bound
+    is sought for the squared error `square`, with the compliance of row i approximated
+    by Bᵢdiag(K)⁻¹Bᵢᵀ; the dual norm ‖Σ±yᵢBᵢ‖ of the result is then evaluated. Motions
+    that λ̂ does not support and motions that do not change gaps are disregarded,
+    because the rounding of K along these motions is not part of the problem.
     """
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
@@ -600,7 +601,7 @@ def _reach(
                 (pressed * y).max(initial=0.0),
             )
             bounds[:, k] = np.maximum(bounds[:, k], bound)
-    # combinations equal ±γₖ up to COMBINATION_RESIDUAL of the largest motion
+    # combinations equal ±γₖ up to COMBINATION_RESIDUAL times the largest motion
     return _Reach(*(v + 2 * COMBINATION_RESIDUAL * v.sum() for v in bounds))
 
 

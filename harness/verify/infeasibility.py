@@ -1,4 +1,4 @@
-"""Certificates of infeasibility from Farkas' lemma, without rounding.
+"""Certificates of infeasibility by Farkas' lemma, evaluated without rounding.
 
 Multipliers y and z ≥ 0 of the rows Ax = b and Gx ≤ h, with c = Aᵀy + Gᵀz, prove that
 no x satisfies both the rows and lb ≤ x ≤ ub if
@@ -8,13 +8,13 @@ no x satisfies both the rows and lb ≤ x ≤ ub if
 since cᵀx ≤ bᵀy + hᵀz at every x that satisfies the rows. Such multipliers are called a
 ray here, since their positive multiples are equivalent. In the convention of
 `harness.qp`, z_box = −c. If cⱼ > 0 and lbⱼ is absent, or cⱼ < 0 and ubⱼ is absent, V is
-infinite, however small cⱼ is. An approximate ray therefore proves nothing. It is first
-corrected such that cⱼ = 0 holds exactly for these j, either in rational arithmetic or
-by an enclosure of an exact ray, which is proven to exist. V is then evaluated in
+infinite, however small cⱼ is. An approximate ray is therefore first corrected such that
+cⱼ = 0 holds exactly for these j. The correction is computed in rational arithmetic, or
+an enclosure is computed that provably contains an exact ray. V is then evaluated in
 rational arithmetic from the doubles of the QP.
 
-The margin of a ray is the ratio of −V to the sum of the absolute terms of V; it does
-not depend on the units of rows and variables. Since right-hand sides are rounded
+The margin of a ray is the ratio of −V to the sum of the absolute terms of V. The margin
+does not depend on the units of rows and variables. Since right-hand sides are rounded
 numbers, the margin of a proof must exceed `MIN_MARGIN`.
 """
 
@@ -45,9 +45,9 @@ from mortarbench.harness.verify.rational import (
 #: contradict one another by a smaller margin if their right-hand sides are rounded sums
 #: of thousands of terms.
 MIN_MARGIN = 1e-12
-#: Multipliers below these fractions of the largest one, in scaled rows, are dropped;
-#: the fractions are tried in turn. Iterative solvers return small multipliers for rows
-#: that do not contribute to the proof.
+#: Fractions of the largest multiplier of the scaled rows, tried in turn: smaller
+#: multipliers are set to zero. Iterative solvers return small multipliers for rows that
+#: do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 #: Largest |cⱼ| that counts as an approximation of 0, relative to the sum of its
 #: absolute terms.
@@ -60,9 +60,9 @@ MAX_PIVOTS = 40
 #: this size takes seconds.
 MAX_TABLEAU = 1500
 MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
-#: Bounds larger than this multiple of the largest right-hand side are left out of the
-#: first search, since the linear program cannot resolve costs of such different
-#: magnitudes.
+#: Bounds larger than this multiple of the largest right-hand side are omitted in the
+#: first search, because the accuracy of the linear program does not suffice for costs
+#: of such different magnitudes.
 MAX_BOUND_RATIO = 1e6
 LP_SECONDS = 20.0  #: time limit of the search for a ray
 EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
@@ -86,10 +86,10 @@ _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 def infeasibility_margin(qp: QP, s: Solution) -> float | None:
     """Return the margin of a proof that `qp` is infeasible; None if none is found.
 
-    The multipliers of `s`, which claims infeasibility, are tried first. If they prove
-    nothing, a ray is searched for, once per QP object. Sets other than bounds are
-    relaxed to their smallest enclosing box; an infeasible relaxation implies an
-    infeasible QP.
+    The multipliers of `s`, which claims infeasibility, are tried first. If these
+    multipliers do not yield a proof, a ray is searched for, once per QP object. Sets
+    other than bounds are relaxed to their smallest enclosing box; if the relaxation is
+    infeasible, the QP is infeasible.
 
     Returns
     -------
@@ -153,9 +153,10 @@ def _corrected(
 ) -> Iterator[Ray]:
     """Yield rays near w that satisfy cⱼ = 0 exactly where required.
 
-    cⱼ = 0 is required for variables without bounds, and for those with a single bound
-    if cⱼ is small and has the wrong sign. Three rays are tried: w itself, a ray with
-    cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ = 0 only where required.
+    cⱼ = 0 is required for variables without bounds. It is also required for variables
+    with a single bound if cⱼ is small and has the sign for which V is infinite. Three
+    rays are tried: w itself, a ray with cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ
+    = 0 only where required.
 
     M, w : rows with a nonzero multiplier, and their multipliers
     """
@@ -201,7 +202,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
     k, n = M.shape
     if n > k or k > MAX_ENCLOSURE:
         return None
-    # powers of two, so that scaling is exact
+    # scale by powers of two, which is exact
     unit, weight = (2.0 ** np.floor(np.log2(v)) for v in (terms, np.abs(w)))
     ratio = weight / unit[:, None]
     B = M.toarray().T * ratio
@@ -218,7 +219,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
 
 
 def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
-    """Return the least margin over the rays of an enclosure; None below MIN_MARGIN."""
+    """Bound the margin from below over an enclosure of rays; None below MIN_MARGIN."""
     m = qp.b.size
     if (ray.centre < ray.radius)[ray.rows >= m].any():
         return None
@@ -238,7 +239,7 @@ def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
             if np.isinf(bound):
                 return None
             products.append(-end * Fraction(bound))
-        value += max(products)  # convex in c, so that the maximum is at an end
+        value += max(products)  # convex in cⱼ: the maximum is at an end
         terms += max(map(abs, products))
     return float(-value / terms) if -value > Fraction(MIN_MARGIN) * terms else None
 
@@ -282,7 +283,7 @@ def _solved(
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))
     eye = csr_array(eye_array(n))
     cost = np.concatenate([rhs, -rhs[:m], ub[upper], -lb[lower]])
-    # unknowns in units of the terms of V, in which the program is well scaled
+    # the unknowns are multiplied by their costs, so that the program is well scaled
     unit = np.maximum(np.abs(cost), 1 / MAX_BOUND_RATIO)
     balance = hstack([M.T, -M[:m].T, eye[:, upper], -eye[:, lower]])
     balance = csr_array(balance @ diags_array(1 / unit))
@@ -314,9 +315,10 @@ def _solved(
 def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
     """Return a ray with a margin above `MIN_MARGIN` in rational arithmetic, or None.
 
-    For a small QP the search is complete: by Farkas' lemma, such a ray exists if and
+    For a small QP, the search is complete. By Farkas' lemma, such a ray exists if and
     only if the QP remains infeasible when all right-hand sides and bounds are relaxed
-    by `MIN_MARGIN` times their size.
+    by `MIN_MARGIN` times their absolute value. For larger QPs (`MAX_TABLEAU`), the
+    result is None.
     """
     m, k, n = qp.b.size, M.shape[0], M.shape[1]
     lower, upper = (np.flatnonzero(np.isfinite(v)) for v in (qp.lb, qp.ub))
@@ -340,8 +342,8 @@ def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
 def _equilibrated(M: csr_array) -> tuple[Vector, Vector]:
     """Return powers of two that scale rows and columns to entries of about one.
 
-    Ruiz (2001): rows and columns are repeatedly divided by the square root of their
-    largest entry.
+    As in the method of Ruiz (2001), rows and columns are repeatedly divided by the
+    square root of their largest entry.
     """
     row, column = np.ones(M.shape[0]), np.ones(M.shape[1])
     size = abs(M)

@@ -1,11 +1,12 @@
-"""Optimality of a primal-dual point, measured independently of the solver.
+"""Measures of the optimality of a primal-dual point, independent of the solver.
 
 All residuals are scale-free: they do not change if the objective, a row or the unit of
 a variable is multiplied by a constant, so that one threshold suits every problem.
-All four residuals vanish exactly at a KKT point. A KKT point is a solution if P is
-positive semidefinite, which is not examined here. docs/verdicts.md states what small
-residuals prove about the objective. If they prove too little, `harness.verify.optimum`
-compares the objective of the point with a proven optimum.
+All four residuals vanish if and only if the point is a KKT point. A KKT point is a
+solution if P is positive semidefinite, which is not checked here. docs/verdicts.md
+states what small residuals prove about the objective. If residuals do not suffice for a
+verdict, `harness.verify.optimum` compares the objective of the point with a proven
+optimum.
 """
 
 from __future__ import annotations
@@ -25,25 +26,25 @@ from mortarbench.harness.sets.convex import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify import scales
 
-#: Rounding error of a sum, relative to the sum of its absolute terms: the error of k
-#: terms grows like √k·2⁻⁵³, and this value covers k = 256. With 0, a row that is
-#: satisfied exactly is reported as violated
+#: Rounding error of a sum, relative to the sum of its absolute terms. The error of a
+#: sum of k terms grows like √k·2⁻⁵³, and this value covers k = 256. With 0, a row that
+#: is satisfied exactly is reported as violated
 #: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest error, as a fraction of its scale, that may be attributed to rounding.
 #: `MAX_CANCELLATION` allows a relative error of 5e-4 of the objective at tol 1e-8. This
-#: fraction is added twice, for the uncertainty of the optimum and for rounding; the sum
-#: is below 1e-3, so that three digits of the objective are correct. With 2e-3,
+#: fraction is added twice, for the uncertainty of the optimum and for rounding. The
+#: total is below 1e-3, so that three digits of the objective are correct. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
 #: `test_what_is_left_when_terms_cancel_is_known_exactly` fails.
 NEGLIGIBLE = 2e-4
 #: Smallest scale of energy, as a fraction of a natural energy (`_natural_energies`).
-#: If the energy of a point is smaller, as it is near x = 0, errors are divided by this
-#: fraction of the natural energy. With 1e-3,
+#: If the energy of a point is smaller, for instance near x = 0, errors are divided by
+#: this fraction of the natural energy. With 1e-3,
 #: `test_rounding_errors_about_a_zero_solution_are_small` fails.
 LEAST_ENERGY = 1e-2
-#: With generous scales, if the energy of a point is below this fraction of a natural
-#: energy, its errors are divided by the natural energy. With 1,
+#: Fraction of a natural energy below which the energy of a point is negligible. With
+#: generous scales, errors of such a point are divided by the natural energy. With 1,
 #: `test_the_code_of_your_own_solver` fails: answers with residuals of 1.2e-2 and 3.6e-2
 #: are then compared with the proven optimum at tol 1e-3 and verified.
 NO_ENERGY = 1e-6
@@ -53,11 +54,11 @@ NO_ENERGY = 1e-6
 LOAD_ROUNDING = 1e-13
 #: Largest number of passes over the rows. Each pass determines the sizes of variables
 #: without curvature and cost that share a row with variables of known size. The limit
-#: bounds the time. With 3,
+#: bounds the run time. With 3,
 #: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails.
 MAX_PASSES = 100
-#: Number of power iterations for the largest eigenvalue of P. They underestimate it by
-#: a few percent, which changes the natural map by a similar percentage.
+#: Number of power iterations for the largest eigenvalue of P. The estimate is a few
+#: percent too small, which changes the natural map by a similar percentage.
 POWER_STEPS = 20
 
 
@@ -79,8 +80,8 @@ class Normality(NamedTuple):
     """Distances from optimality for discs and cones; NaN if the point contains NaN.
 
     The complementarity of a disc, r‖z‖ − zᵀx, is of second order in the angle between z
-    and x, whereas these distances are of first order. They do not affect verdicts:
-    verdicts bound the error of the objective, which is of second order as well.
+    and x, whereas these distances are of first order. Verdicts do not depend on these
+    distances: verdicts bound the error of the objective, which is also of second order.
     """
 
     natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖, see `normality`
@@ -96,7 +97,7 @@ class Scales(NamedTuple):
 
 
 class _Constraints(NamedTuple):
-    """Slacks of all constraints at a point: b − Ax, h − Gx, and limits of the sets."""
+    """Slacks of all constraints at a point: b − Ax, h − Gx, and slacks of the sets."""
 
     equalities: Limits
     inequalities: Limits
@@ -112,7 +113,7 @@ class _Constraints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Products of the matrices with a point, and sums of their absolute terms."""
+    """Quantities in the KKT conditions at a point, and sums of their absolute terms."""
 
     x: Vector  #: |x|
     constraints: _Constraints
@@ -130,15 +131,15 @@ class _Terms:
 
 @np.errstate(all="ignore")  # a point may contain NaN, inf, or 1e300
 def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
-    """Return the scale-free residuals of `s` in the KKT conditions of `qp`.
+    """Return the scale-free residuals of the KKT conditions of `qp` at `s`.
 
     Let E be the scale of energy, Xⱼ the sizes of the variables (`scales_at`), and
     r = Px + q + Aᵀy + Gᵀz⁺ + z_box without the multipliers of absent bounds, where
     v⁺ = max(v, 0) and v⁻ = min(v, 0). Each residual is the largest of these quantities:
 
     * primal: violations of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, divided by |bᵢ| + Σ|aᵢⱼ|Xⱼ
-      or, if bᵢ ≠ 0 and this is smaller, by 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ do not
-      depend on energies (`own_size` in scales.h)
+      or, if bᵢ ≠ 0 and this is smaller, by 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ are
+      computed without a scale of energy (`own_size` in scales.h)
     * dual: |rᵢ|/S, |zᵢ⁻|‖gᵢ‖∞/S and multipliers of absent bounds divided by S, where S
       is the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and √(E·min Pⱼⱼ); the smaller
       of |rᵢ|Dᵢ/E and the ratio of |rᵢ| to the largest of |Px|ᵢ, |qᵢ| and
@@ -151,8 +152,8 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     in that direction. Before a residual is divided by its scale, `ROUNDING` times the
     sum of its absolute terms, but at most `NEGLIGIBLE` times the scale, is subtracted.
 
-    generous : use the largest scale of energy that can be justified, and subtract the
-        rounding of energies even if it exceeds `NEGLIGIBLE` times the scale
+    generous : use the largest justifiable scale of energy, and subtract the rounding of
+        energies even if it exceeds `NEGLIGIBLE` times the scale
 
     Examples
     --------
@@ -348,9 +349,9 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     size = t.Px_size + np.abs(qp.q) + t.forces_size
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
-    # with neither curvature nor cost, the minimum along i is undetermined: use Xᵢ
+    # without curvature and cost, the minimum along i is undetermined: use Xᵢ
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    # an operator without diagonal: use its Rayleigh quotient at x, unless x is zero
+    # if P has no diagonal, use its Rayleigh quotient at x instead
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
     lower, upper = hull(qp.sets, qp.q.size)
@@ -395,10 +396,10 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     """Return the scale of energy E at a point.
 
     E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|, where σ is the support
-    function of the sets. The third sum is not split, since multipliers that cancel
-    could make its terms arbitrarily large. E is at most `MAX_CANCELLATION` times the
-    objective (`energy_scale` in scales.h), and at least `LEAST_ENERGY` times the
-    smallest natural energy of a variable (`_natural_energies`).
+    function of the sets. The terms of the third sum are not used separately, since they
+    can be arbitrarily large if multipliers cancel. E is at most `MAX_CANCELLATION`
+    times the objective (`energy_scale` in scales.h), and at least `LEAST_ENERGY` times
+    the smallest natural energy of a variable (`_natural_energies`).
 
     generous : do not limit E by `MAX_CANCELLATION`; use the median of the natural
         energies instead of the smallest, and return it if the energy of the point is
@@ -416,7 +417,9 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
         qp, t.curvature, bounds, by_length=by_length or not qp.q.any()
     )
     natural = pick(energies)
-    if E < LEAST_ENERGY * natural:  # rare: tightening bounds is expensive
+    if (
+        E < LEAST_ENERGY * natural
+    ):  # only in this rare case, since tightening bounds is expensive
         energies = _natural_energies(qp, t.curvature, tightened(qp), by_length=True)
         natural = pick(energies)
     if not natural < np.inf:
@@ -438,7 +441,7 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """Return the energies that single variables can gain, omitting undetermined ones.
+    """Return the energies that single variables can gain; omit undetermined energies.
 
     The energy of variable i is |½Pᵢᵢxᵢ² + qᵢxᵢ| at its minimum within the bounds. If
     the minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ
@@ -539,8 +542,8 @@ def _sizes_from_rows(
 ) -> Vector:
     """Derive the sizes of variables with neither curvature nor cost from active rows.
 
-    A row of G is active if its slack is negligible. Inactive rows are left out: the
-    large right-hand side of a distant row would hide the violation of another row
+    A row of G is active if its slack is negligible. Inactive rows are omitted, because
+    the large right-hand side of a distant row would hide the violation of another row
     (`test_a_row_that_is_far_away_excuses_no_violation`).
     """
     size, has_size = np.abs(x), has_size.copy()
@@ -579,14 +582,14 @@ def verdict(
     error: float | None = None,
     infeasible: bool = False,
 ) -> Verdict:
-    """Return the verdict on a point, which follows from its residuals.
+    """Return the verdict on a point, given its residuals.
 
-    A point is verified if every residual is at most factor·tol, whatever the solver
-    claimed. Otherwise, the claim determines the kind of failure. The error relative to
-    a proven optimum, `error`, replaces all residuals if it is given. A refuted claim of
-    success is `inaccurate` if the point has at least half of the requested digits
-    (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
-    above 0.1 is not verified at any tolerance.
+    A point is verified if every residual is at most factor·tol (`allowed`), regardless
+    of the claim of the solver. Otherwise, the claim determines the type of failure. If
+    the error relative to a proven optimum, `error`, is given, it replaces all
+    residuals. A refuted claim of success is `inaccurate` if the point has at least half
+    of the requested digits (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A
+    point with a residual above 0.1 is not verified at any tolerance.
 
     infeasible : True if the QP is proven to have no feasible point, which verifies a
         claim of infeasibility regardless of the point
@@ -614,9 +617,9 @@ def rejudged(record: Record, factor: float) -> Verdict:
 
     The verdict follows from the stored claim and residuals, or from the error relative
     to a proven optimum if that error decided the stored verdict (`Record.decided_by`).
-    Verdicts that do not follow from these numbers are returned unchanged: those on
-    limits, crashes and steps after the end of a sequence, and proofs of infeasibility,
-    which do not depend on a tolerance.
+    Verdicts that do not follow from these numbers are returned unchanged. These are
+    verdicts on limits, on crashes and on steps after the end of a sequence, and
+    verdicts by proofs of infeasibility, which do not depend on a tolerance.
     """
     if record.claimed is None:
         return record.verdict

@@ -29,11 +29,12 @@ from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: approximate total time of repetitions; see `measure`
+SAMPLE_SECONDS = 0.005  #: approximate total time of all repetitions (s); see `measure`
 MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
-MAX_COUNT = 2**53  #: larger integers are not exact in programs that store doubles
+#: programs that store numbers as doubles do not represent all larger integers
+MAX_COUNT = 2**53
 MAX_MESSAGE = 1900  #: largest length of a message of a solver, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
@@ -61,10 +62,10 @@ def measure(
     starts: Callable[[], None] = lambda: None,
     ends: Callable[[], None] = lambda: None,
 ) -> Timed:
-    """Prepare and solve `qp` with `solver`, and time both.
+    """Time the preparation and the solution of `qp` by `solver`.
 
-    Errors of the solver are not raised: after an exception, a missing library or a
-    malformed answer, the result is a solution without a point, with a status and a
+    Errors of the solver are not raised. After an exception, a missing library or a
+    malformed answer, the result is a solution without a point that has a status and a
     message. The call of `declines` counts as preparation. If the solver cannot use an
     operator P (`harness.needs_matrices`) and P has at most MAX_ASSEMBLED_ROWS rows, P
     is assembled, which also counts as preparation.
@@ -72,16 +73,17 @@ def measure(
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
         `harness.plugin.Chained`
     sample_seconds : if preparation and solve take less than half of this time, they are
-        repeated until the repetitions together take about this time. The answer is that
-        of the first solve; the times are means over the repetitions, since the first
-        solve runs with cold caches. Every repetition receives a QP of new objects, so
-        that the solver cannot recognise the QP by identity
-    starts, ends : called just before the clock starts and just after it stops
+        repeated until the repetitions together take about this time. The returned
+        answer is the answer of the first solve. The times are means over the
+        repetitions, because the first solve runs with cold caches. Every repetition
+        receives a QP of new objects, so that the solver cannot recognise the QP by
+        identity starts, ends : called just before the clock starts and just after it
+        stops
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
         starts()
-        try:  # only code of the solver, so that bugs of the harness are raised
+        try:  # only solver code may run here: bugs of the harness must be raised
             answer, seconds, peaks = _timed(preparation, qp)
             first = sum(seconds)
             inner = _inner(first, sample_seconds)
@@ -141,10 +143,10 @@ class ReasonError(Exception):
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
-    """Return the reason why `solver` does not accept `qp`, or None if it does.
+    """Return the reason why `solver` declines `qp`, or None if `solver` accepts it.
 
-    A solver does not accept a QP with a set whose class is not in `accepts`. A solver
-    without the attribute `accepts` accepts bounds only.
+    A solver accepts only sets of the classes in its attribute `accepts`. A solver
+    without this attribute accepts only bounds.
 
     Raises
     ------
@@ -162,7 +164,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
         )
     for one in qp.sets:
         if not isinstance(one, accepted):
-            return f"does not accept sets of the kind {type(one).__name__}"
+            return f"does not accept sets of the class {type(one).__name__}"
     reason: object = solver.declines(qp)
     if reason is None or isinstance(reason, str):
         return reason
@@ -183,7 +185,7 @@ def _explicit(qp: QP) -> QP:
 
 
 class _DeclinedError(Exception):
-    """Refusal of a QP by a solver; the message is the reason."""
+    """Refusal of a QP by a solver; the message contains the reason."""
 
 
 def _timed(
@@ -231,13 +233,13 @@ def _fresh_copy(qp: QP) -> QP:
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
     """Copy a dataclass, and apply `other` to each attribute of the copy."""
-    new = copy(whole)  # without __init__, whose checks may take longer than a solve
+    new = copy(whole)  # skip __init__: its checks may take longer than a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
 
 def _inner(seconds: float, sample_seconds: float) -> int:
-    """Return the number of repetitions for a sample of `sample_seconds`."""
+    """Return the number of repetitions that together take about `sample_seconds`."""
     if seconds >= sample_seconds / 2:
         return 1
     return min(ceil(sample_seconds / max(seconds, 1e-9)), MAX_INNER_LOOPS)
@@ -246,7 +248,7 @@ def _inner(seconds: float, sample_seconds: float) -> int:
 def memory_mib(key: str, process: int | str = "self") -> float | None:
     """Return VmRSS (resident memory) or VmHWM (its peak) in MiB, or None if unknown.
 
-    ``ru_maxrss`` is not a substitute: a process inherits it from its parent, even after
+    ``ru_maxrss`` is not used: a process inherits this value from its parent, even after
     exec.
     """
     try:
@@ -312,7 +314,7 @@ def _file_of(kind: type) -> str:
 
 
 def _text_of(e: BaseException) -> str:
-    """Return the text of an exception, whose __str__ may itself raise."""
+    """Return the text of an exception, or a placeholder if its __str__ fails."""
     try:
         return str(e)
     except Exception:
@@ -320,7 +322,7 @@ def _text_of(e: BaseException) -> str:
 
 
 def _checked(answer: object, qp: QP) -> Solution:
-    """Return an answer if it is a solution of matching shapes, otherwise a failure."""
+    """Return the answer if it is a solution of matching shapes, otherwise a failure."""
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)
@@ -364,7 +366,9 @@ def _numbers(name: str, values: object) -> Vector:
 def _count(name: str, value: Any) -> int:
     count = int(value)
     if not 0 <= count <= MAX_COUNT:
-        got = count if abs(count) < 10 * MAX_COUNT else "a number far out of range"
+        got = (
+            count if abs(count) < 10 * MAX_COUNT else "a number far outside this range"
+        )
         raise ValueError(f"{name} = {got}, expected 0 to 2**53")
     return count
 

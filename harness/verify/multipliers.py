@@ -1,24 +1,25 @@
-"""Best multipliers for a primal point.
+"""Multipliers that minimise the KKT residuals at a given primal point.
 
 At x, with g = Px + q, the multipliers minimise
 
     Σᵢ wᵢ²(g + Aᵀy + Gᵀz + z_box)ᵢ²  +  Σⱼ (zⱼsⱼ/E)²    over y, z ≥ 0 and z_box,
 
-where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
-and 1/wᵢ the scale of the stationarity residual; z_box has the sign required by the
-bound. The second sum measures complementarity and makes a threshold between active and
-inactive rows unnecessary: the slack of a nearly active row limits its multiplier.
+where sⱼ is the slack of a row or bound, E is the scale of energy of
+`harness.verify.kkt`, and 1/wᵢ is the scale of the stationarity residual. The sign of
+z_box must be admissible for the bound. The second sum measures complementarity. It
+makes a threshold between active and inactive rows unnecessary, because the slack of a
+nearly active row limits the multiplier of the row.
 
-If the remaining terms of the stationarity condition require a force f from a disc or
-cone with projection Π, this set contributes z = (v − Π(v))/τ with v = x + τf. This z is
-normal to the set at Π(v). As τ grows, the remainder f − z becomes smaller and the
-complementarity residual larger. The multipliers of rows are first fitted as if discs
-and cones could balance any force. Newton's method for f − z, with the derivative of Π,
-then corrects them.
+Let f be the multiplier of a disc or cone for which stationarity would hold exactly, and
+Π the projection onto this set. The multiplier z = (v − Π(v))/τ with v = x + τf is used
+instead. This z is normal to the set at Π(v). As τ increases, the remainder f − z
+decreases and the complementarity residual increases. The multipliers of rows are first
+computed under the assumption that discs and cones can balance any force. They are then
+corrected by Newton's method for f − z, with the derivative of Π.
 
-Multipliers with small residuals prove that a point is optimal, regardless of their
-origin. Several weights w are therefore tried, and the multipliers with the smallest
-`kkt_residuals` are returned.
+Multipliers with small residuals prove that a point is optimal, no matter how the
+multipliers were computed. Several weights w are therefore tried, and the multipliers
+with the smallest `kkt_residuals` are returned.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 from mortarbench.harness.verify.optimum import EPS
 
-#: Rows are left out if a multiplier that changes the stationarity residual by ε would
+#: A row is omitted if a multiplier that changes the stationarity residual by ε would
 #: change the complementarity residual by more than this multiple of ε. Because of the
-#: large slack, such a multiplier cannot reduce both residuals.
+#: large slack of this row, its multiplier cannot reduce both residuals.
 MAX_COMPLEMENTARITY_RATIO = 100.0
 #: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
 #: 8, a residual of 6e-7 remains for rows whose variables are all in balls
@@ -106,7 +107,9 @@ def with_multipliers(
     for one in others:
         block[one.block] = True
     steps = NEWTON_STEPS if others and unknown & {"y", "z"} else 1
-    for _ in range(2):  # relative to the largest force, then to that of each component
+    for _ in range(
+        2
+    ):  # weights from the largest force, then from the forces of each component
         scales = _Scales(1 / size, E)
         linearised = _Linearisation(qp.sets[1:], block, x, scales.reach())
         for k in range(steps):
@@ -132,17 +135,16 @@ def _worst(qp: QP, s: Solution) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Linearisation:
-    """Projections onto discs and cones, linearised at x + τ·force."""
+    """Linearised projections onto discs and cones at x + τ·force."""
 
     sets: Sequence[ConvexSet]
-    block: NDArray[
-        np.bool_
-    ]  #: (n,) mask of the variables of the sets; all False if z_box is prescribed
+    #: (n,) mask of the variables of the sets; all False if z_box is prescribed
+    block: NDArray[np.bool_]
     x: Vector  #: (n,)
     tau: float  #: step τ of the natural map
     force: Vector | None = None  #: (n,); None: sets balance any force
-    #: True for damped steps, which apply the derivative to the residual as well: they
-    #: converge more slowly than Newton's method, but from more distant points
+    #: True for damped steps, which apply the derivative also to the residual. Damped
+    #: steps converge more slowly than Newton's method, but from more distant points
     is_careful: bool = True
     #: True to assign to the sets only the part of a force that the natural map yields
     is_shared: bool = False
@@ -150,8 +152,9 @@ class _Linearisation:
     def normal_part(self, force: Vector, *, shared: bool = True) -> Vector:
         """Return the part (n,) of a force (n,) that is normal to the sets near x.
 
-        shared : use the natural map, which excludes a part of the force if x is not on
-            the boundary; otherwise, return the part that is normal at some point
+        shared : if True, use the natural map, which excludes a part of the force if x
+            is not on the boundary; if False, return the part of the force that is
+            normal to the set at some point of the set
         """
         total = np.zeros(self.x.size)
         if self.block.any():
@@ -179,7 +182,7 @@ class _Linearisation:
         for j, along in enumerate(forces.T):
             size = np.abs(along[self.block]).max(initial=0.0)
             if size > 0:
-                # the norm is zero if all cones are at their apices: use 1
+                # the norm is zero if x is at the apex of all cones: use 1
                 h = STEP * (float(np.abs(at[self.block]).max()) or 1.0) / size
                 for one in self.sets:
                     ends = one.project(at + h * along), one.project(at - h * along)
@@ -195,7 +198,7 @@ def _fitted(
     unknown: set[str],
     linearised: _Linearisation,
 ) -> Solution:
-    """Minimise both sums over the unknown multipliers; take the others from `s`.
+    """Minimise both sums over the unknown multipliers; the others are those of `s`.
 
     g : (n,) Px + q + Aᵀy + Gᵀz + z_box with the multipliers of `s`
     """
@@ -214,7 +217,7 @@ def _fitted(
         if (n + k) * (k + m) > MAX_ENTRIES:
             raise InputError(
                 f"multipliers of {k} nearly active rows and bounds and {m} equality "
-                "rows are too many to compute; expected y, z and z_box beside x"
+                "rows are too many to compute; expected y, z and z_box in addition to x"
             )
         columns = np.zeros((n, k))
         columns[:, : rows.size] = _dense(qp.G[rows].T)
@@ -256,7 +259,7 @@ def _least_squares(
     rank = int((size > RANK_TOLERANCE * size[:1].sum()).sum())
     Q, R = Q[:, :rank], R[:rank, :rank]
     norms = np.linalg.norm(w * columns, axis=0)
-    norms[norms == 0] = 1  # sets balance the whole column
+    norms[norms == 0] = 1  # the sets balance the whole column
     C, target = w * columns / norms, -scales.w * g
     price = np.divide(
         np.abs(slack), scales.E * norms, out=np.zeros(slack.size), where=slack != 0
@@ -264,7 +267,7 @@ def _least_squares(
     zeta = np.zeros(slack.size)
     if slack.size:  # without columns, scipy's nnls (1.17.1) would crash Python
         reduced = C - Q @ (Q.T @ C)
-        reduced -= Q @ (Q.T @ reduced)  # again, against rounding in the range of Q
+        reduced -= Q @ (Q.T @ reduced)  # repeat to remove rounding in the range of Q
         stacked = np.vstack([reduced, np.diag(price)])
         rhs = np.concatenate([target - Q @ (Q.T @ target), np.zeros(slack.size)])
         try:

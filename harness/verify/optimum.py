@@ -1,4 +1,4 @@
-"""Proof of the optimal value of a small QP, used if residuals do not decide a verdict.
+"""Proof of the optimal value of a small QP, for verdicts that residuals do not decide.
 
 Residuals bound the error of the objective f only through two unknown quantities: the
 distance from the solution, and the size of the true multipliers. A reference solver,
@@ -10,9 +10,9 @@ Lagrangian L, convexity implies for the solution x* and the optimal value f* = f
 
 where L is evaluated in extended precision. Conversely, f* ≤ f(x̃) = L(x̃, λ̂) for a
 point x̃ that satisfies the active rows exactly and differs from x̂ by rounding. The
-difference L(x̃, λ̂) − L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) plus a term quadratic in the rounding, so
-that L(x̂, λ̂) equals f* up to the sum above. Two assumptions are not proven: the bound
-`MAX_DISTANCE` of |x*ᵢ − x̂ᵢ|, and the same bound of |x̃ᵢ − x̂ᵢ|.
+difference L(x̃, λ̂) − L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) plus a term quadratic in the rounding.
+Hence L(x̂, λ̂) equals f* up to the sum in the inequality. Two assumptions are not
+proven: |x*ᵢ − x̂ᵢ| and |x̃ᵢ − x̂ᵢ| do not exceed the bound given by `MAX_DISTANCE`.
 
 If the terms of the objective cancel, the sum may leave f* too uncertain. In this case,
 the KKT equations of the rows with a nonzero multiplier are solved in rational
@@ -53,10 +53,11 @@ from mortarbench.harness.verify.kkt import (
 from mortarbench.harness.verify.rational import rational, solutions
 from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
-#: Largest number of coupled variables and rows of a QP that the reference solver
-#: solves; its dense solve takes several times as long as the solve under test.
+#: Largest number of coupled variables and rows of a QP that is passed to the reference
+#: solver, whose dense solve takes several times as long as the solve under test.
 MAX_COUPLED = 400
-#: Largest number of variables of such a QP; an uncoupled variable costs one division.
+#: Largest number of variables of a QP that is passed to the reference solver; an
+#: uncoupled variable costs one division.
 MAX_VARIABLES = 4000
 #: Largest number of variables and rows of a QP whose operator P is assembled, which
 #: takes one product per variable.
@@ -70,8 +71,8 @@ MAX_RATIONAL = 40
 #: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
-#: Largest KKT residual, beyond rounding, with which a reference point is accepted: the
-#: reference solver does not reach smaller residuals. With 1e-8,
+#: Largest KKT residual, beyond rounding, with which a reference point is accepted. The
+#: reference solver does not attain smaller residuals. With 1e-8,
 #: `test_residuals_refute_no_point_between_nearly_parallel_rows` fails.
 MAX_RESIDUAL = 1e-14
 
@@ -82,7 +83,8 @@ class Optimum:
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
-    doubt: float  #: bound of the error of f*, plus the rounding of f at an exact answer
+    #: bound of the error of f*, plus the rounding of f at an exact solution
+    doubt: float
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
     own: Vector  #: (n,) sizes that do not depend on energies, see `own_sizes`
@@ -108,15 +110,15 @@ def decided(
 
     Returns
     -------
-    the larger of the error |f(x) − f*| and the violation, both relative to the scales
-    of the optimum; the scale of the error is 10 times the smaller of the sum of the
-    absolute terms of f* and 500·|f*|
+    the larger of the error |f(x) − f*| and the violation of the constraints, both
+    relative to the scales of the optimum; the scale of the error is 10 times the
+    smaller of 500·|f*| and the sum of the absolute terms of f*
 
     """
     if not is_small(qp):
         return None
     most = allowed(tol)
-    if not qp.is_explicit:  # the rounding of its products is unknown
+    if not qp.is_explicit:  # the rounding of products with P is unknown
         optimum = prove(qp)
         if optimum is None:
             return None
@@ -131,7 +133,7 @@ def decided(
 
 
 def is_small(qp: QP) -> bool:
-    """Return True if a reference solve of `qp`, or assembling its P, is cheap."""
+    """Return True if a reference solve, or the assembly of an operator P, is cheap."""
     n, rows = qp.q.size, qp.b.size + qp.h.size
     if not qp.is_explicit:
         return n + rows <= MAX_ASSEMBLED
@@ -208,7 +210,8 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
     work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
     least = energy_at(qp, s)
     if abs(value) > ROUNDING * max(work, least) + doubt:
-        # 100·tol of this scale is half of the error that `kkt_residuals` allows
+        # an error of 100·tol times this scale is half of the error that `kkt_residuals`
+        # allows
         scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
     elif work > NEGLIGIBLE * least:  # f* vanishes
         scale = magnitude = work
@@ -257,9 +260,10 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
 
     The rows and bounds with a nonzero multiplier in `s` become equations. Unknowns that
     the KKT equations leave undetermined are set to zero. If the result is not optimal,
-    undetermined multipliers are set close to the least ones (`_least_multipliers`); if
-    that fails, undetermined unknowns are set to the values of `s`. The result must
-    satisfy the KKT conditions of all rows and bounds exactly.
+    undetermined multipliers are set to values close to the least multipliers
+    (`_least_multipliers`). If this result is not optimal either, undetermined unknowns
+    are set to the values of `s`. The result must satisfy the KKT conditions of all rows
+    and bounds exactly.
     """
     if len(qp.sets) > 1:
         return None
@@ -310,10 +314,10 @@ class _ExactPoint(NamedTuple):
 
 
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
-    """Solve the KKT equations of the rows with a nonzero multiplier, for three guesses.
+    """Yield solutions of the KKT equations of rows with a nonzero multiplier.
 
-    The guesses set undetermined unknowns to zero, to values close to the least
-    multipliers, and to the values of `s`.
+    In three solutions, undetermined unknowns are zero, close to the least multipliers,
+    and equal to the values of `s`.
     """
     lower = (s.z_box < 0) & np.isfinite(qp.lb)
     upper = (s.z_box > 0) & np.isfinite(qp.ub)
@@ -343,10 +347,10 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Return masks of the KKT conditions that a solution of the KKT equations violates.
+    """Return masks of violated KKT conditions at a solution of the KKT equations.
 
-    These are Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a
-    bound that is absent or inactive.
+    The masks are Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box ≠ 0 (n,)
+    at a bound that is absent or inactive.
     """
     below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
     under, over = np.zeros(qp.q.size, dtype=bool), np.zeros(qp.q.size, dtype=bool)
@@ -410,11 +414,11 @@ def _dense(M: Any) -> Any:
 
 
 def proves(solve: Reference) -> Proves:
-    """Return a function that proves optima, and caches them by the identity of QPs."""
+    """Return a function that proves optima of QPs and caches them by `id(qp)`."""
     optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
-        if id(qp) not in optima:  # the QP is kept alive, so that its id stays unique
+        if id(qp) not in optima:  # storing the QP keeps its id unique
             optima[id(qp)] = qp, proven_optimum(qp, solve)
         return optima[id(qp)][1]
 
@@ -426,7 +430,7 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 
 
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
-    """Return `s` with the least multipliers that balance the gradient.
+    """Return `s` with the smallest multipliers that balance the gradient.
 
     Equality rows, fixed variables, and rows and bounds with a nonzero multiplier in `s`
     receive multipliers λᵢ. These minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute
@@ -465,7 +469,7 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
 
 def _size(qp: QP, s: Solution) -> float:
-    """Sum the absolute terms of f and of λᵀ(Bx − c), which bound their rounding."""
+    """Sum the absolute terms of f and of λᵀ(Bx − c), to bound the rounding of both."""
     x = np.abs(s.x)
     rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
     work = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)

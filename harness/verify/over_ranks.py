@@ -1,15 +1,15 @@
-"""Certificate of decomposed bodies, computed by the ranks that store the subdomains.
+"""Certificates for decomposed bodies, computed by the ranks that store the subdomains.
 
-The mathematics is that of `harness.verify.substructured`; MPI reductions complete the
-sums. Each rank stores the components of its subdomains. A component on several ranks
-has the same value on each of these ranks. Two kinds of data are replicated on all
-ranks: the rows of contact and friction, whose number is similar to that of the nodes of
-the contact sides, and the coarse problem.
+The method is described in `harness.verify.substructured`; MPI reductions complete the
+sums. Each rank stores the components of its subdomains. A component that several ranks
+store has the same value on all of them. The contact and friction rows and the coarse
+problem are replicated on all ranks. The number of these rows is similar to the number
+of nodes of the contact sides.
 
-If only contact supports a body, its rigid motions R are a few distributed columns, and
-products with Rᵀ are reductions in extended precision. The equilibrium of λ̂ with the
-load (`harness.verify.admissible.Balance`) requires only the load along R and the
-replicated motion of the contact rows.
+If only contact supports a body, its rigid motions are the few columns of a distributed
+matrix R, and products with Rᵀ are reductions in extended precision. The equilibrium of
+λ̂ with the load (`harness.verify.admissible.Balance`) requires only the load along R
+and the replicated motion of the contact rows.
 
 K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so that the
 certificate includes no rounding from assembly.
@@ -105,7 +105,8 @@ class LocalBodies:
     contact: Contact
     floating: FloatingBodies
     #: (n, n) K as assembled by a single process; None on several ranks. The rounding of
-    #: this K affects the error if an answer moves bodies together with their supports
+    #: the assembled K affects the error if an answer moves bodies together with their
+    #: supports
     stored: csr_array | None = None
 
     @cached_property
@@ -128,8 +129,8 @@ class MPIReduction:
         first = np.full(interface.size, comm.size)
         first[self._place[local.shared]] = comm.rank
         lowest = np.min(comm.allgather(first), axis=0)
-        #: (n,) mask of the components that no lower rank stores: this rank adds them to
-        #: sums
+        #: (n,) mask of the components that no lower rank stores; this rank contributes
+        #: these components to sums
         self.is_owner = np.ones(local.components.size, dtype=bool)
         self.is_owner[local.shared] = lowest[self._place[local.shared]] == comm.rank
 
@@ -190,7 +191,7 @@ class MPIReduction:
         """
         r, comm = self._local.motions, self._local.ranks.comm
         place = self._place[at]
-        # unshared components enter the local matrix; only shared components are sent
+        # the local matrix contains unshared components; only shared components are sent
         inner, jointly = place < 0, place >= 0
         S_inner = csr_array(S[inner])
         mine = coo_array(M - S_inner.T @ scaled_rows(S_inner, scale[inner]))
@@ -216,10 +217,10 @@ class MPIReduction:
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
-    """Bound the error of an answer; all ranks call this and obtain the same bound.
+    """Bound the error of an answer; called by all ranks, which obtain the same bound.
 
-    The same pairs are tried as in `harness.verify.certificate.certify`, except for the
-    pair that results from an exchange of closed rows.
+    The pairs are those of `harness.verify.certificate.certify`, except the pair that
+    results from an exchange of closed rows.
 
     Parameters
     ----------
@@ -238,7 +239,7 @@ def certify_over_ranks(
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:
-        raise UncertifiableError("the answer holds NaN or inf")
+        raise UncertifiableError("the answer contains NaN or inf")
     u = claimed.astype(Real)
     u[local.fixed] = 0
     split = _OnRanks(local)
@@ -294,6 +295,7 @@ def _admissible_pair(
     """Return û at the components in rows (w,), û at local components (n,), and λ̂.
 
     trace : global components in rows (w,), and 1/Kᵢᵢ (w,) and u (w,) at these
+        components
 
     Raises
     ------
@@ -314,7 +316,7 @@ def _admissible_pair(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows, restricted to their w components, and 1/Kᵢᵢ (w,); 0 if fixed."""
+    """Return the rows at the components `at`, and 1/Kᵢᵢ (w,), 0 at fixed components."""
     contact = local.contact
     B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
@@ -433,8 +435,8 @@ def _rigid_motions(
 def _orthonormal(local: LocalBodies, R: csr_array) -> Any:
     """Orthonormalise sparse columns R (n, r) in extended precision.
 
-    The columns are orthonormal to double precision. One iteration, R(3I − RᵀR)/2,
-    squares the error of RᵀR = I.
+    On entry, the columns are orthonormal to double precision. One iteration, R(3I −
+    RᵀR)/2, squares the error of RᵀR = I.
     """
     R = csr_array(R.astype(Real))
     owned = R[local.reduction.is_owner]
@@ -457,7 +459,7 @@ class _OnRanks:
     """
 
     def __init__(self, local: LocalBodies) -> None:
-        """Compute the data that are common to all pairs."""
+        """Compute the data that all pairs need."""
         self._local = local
         #: (w,) global components that occur in rows
         self.at = np.unique(local.contact.rows.indices).astype(np.int64)
@@ -528,7 +530,7 @@ class _OnRanks:
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         if self._local.stored is not None:
-            # if w moves bodies together with their supports, the terms of Kw cancel
+            # If w moves bodies together with their supports, the terms of Kw cancel.
             v = self.spread(w)
             Kw, Kv = cancelling(self._local.stored, w[:, None])[:, 0], self.product(v)
             off = Kw - self.joined(Kv)

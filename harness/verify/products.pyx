@@ -1,9 +1,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 """Products of sparse matrices of doubles with vectors of extended precision.
 
-Entries are converted one by one: a copy of a stiffness matrix in extended precision
-would need more than twice its memory, and more time than the product. The module is
-compiled when the package is installed; `products.pyi` declares its types.
+Entries are converted one by one. Converting the whole stiffness matrix to extended
+precision would more than double its memory and take longer than the product. The module
+is compiled when the package is installed; `products.pyi` declares its types.
 """
 
 import numpy as np

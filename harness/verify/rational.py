@@ -51,8 +51,8 @@ def nonnegative_solution(M: Any, b: Any) -> Any | None:
 
     Phase one of the method minimises the sum of one artificial variable per row.
     Bland's rule (1977) selects the first column with a negative cost and, among the
-    binding rows, the row whose basic variable has the lowest index. No basis recurs, so
-    that the method terminates in spite of degenerate steps.
+    binding rows, the row whose basic variable has the lowest index. With this rule, no
+    basis recurs, and the method terminates even if steps are degenerate.
 
     M, b : arrays of fractions
     """

@@ -5,7 +5,8 @@ and friction rows. Its solution identifies the closed rows, which hold with equa
 contacts that touch and friction that sticks. `harness.verify.active_set_refinement`
 then computes the solution in extended precision, and `harness.verify.certificate`
 bounds its error. The cache contains only the states of the rows and the multipliers,
-which determine the directions of slip. These serve as an initial guess for a later run.
+which determine the directions of slip. A later run uses the cached data as an initial
+guess.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ class ReferencePoint:
     u: Extended  #: (n,) admissible displacement
     multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
     equilibrium: Extended  #: u_λ (n,), in equilibrium with the multipliers
-    states: States  #: (m,) row closed, or multiplier at a bound
+    states: States  #: (m,) states of the rows: closed, or multiplier at a bound
     norm: float  #: ‖u‖_K
-    bound: float  #: certified relative error, as `Certificate.bound`
+    bound: float  #: certified bound of the relative error; see `Certificate.bound`
 
     @property
     def active(self) -> NDArray[np.bool_]:
@@ -109,7 +110,7 @@ def _stored(path: Path, exact: Exact) -> ActiveSet | None:
     if not fits or (np.abs(states) > 1).any() or not np.isfinite(multipliers).all():
         return None
     states = np.where(exact.contact & (states == UPPER), CLOSED, states)
-    # the multipliers replace the motion, of which only the direction matters
+    # pass the multipliers as the motion, since only the direction is used
     pushed = predicted(
         exact.forces, 0 * multipliers.astype(Real), exact.compliance, multipliers
     )
@@ -137,8 +138,8 @@ def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
     """Guess the states of the rows from the solution of the dual QP.
 
-    If there are no rows, or if supports fix all bodies and the rows are too many for a
-    dense matrix, the guess follows from the displacement without contact.
+    The guess follows from the displacement without contact if there are no rows, or if
+    supports fix all bodies and there are too many rows for a dense matrix.
     """
     inverse = mechanics.inverse
     R, exact = (

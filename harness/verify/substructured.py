@@ -1,4 +1,4 @@
-"""Stiffness as a sum over subdomains, and the local problems of the certificate.
+"""Stiffness as a sum over subdomains, and the local problems that certificates require.
 
 The certificate (`harness.verify.certificate`) is formulated for a stiffness
 
@@ -6,28 +6,29 @@ The certificate (`harness.verify.certificate`) is formulated for a stiffness
 
 where T maps the n components of a displacement to their N copies in S subdomains, the
 kernel of every K_s consists exactly of the rigid motions of its subdomain, and E is
-rounding. For admissible û and λ̂, the certificate requires two vectors: the residual
-ρ = Kû − f + Bᵀλ̂ on components without support, in extended precision and with the
-stored K, and a solution d of
+rounding. For admissible û and λ̂, the certificate requires two vectors. One is the
+residual ρ = Kû − f + Bᵀλ̂ on components without support, in extended precision and with
+the stored K. The other is a solution d of
 
     TᵀK_T d = ρ                                                                  (5)
 
-in double precision, whose residual is measured. An undivided body is a single
-subdomain, T = I, with its supports eliminated: d = K⁺ρ (`Undivided`). For decomposed
-bodies, ρ is distributed over the subdomains as in balancing domain decomposition
-(Mandel 1993). The forces b with Tᵀb = ρ are in equilibrium on every subdomain,
-R_Tᵀb = 0, where the columns of R_T are the rigid motions of subdomains. With the
-diagonal matrix W of the stiffnesses of all copies,
+in double precision; the residual of d is evaluated in extended precision. An undivided
+body is a single subdomain with eliminated supports: T = I and d = K⁺ρ (`Undivided`).
+For decomposed bodies, ρ is distributed over the subdomains as in balancing domain
+decomposition (Mandel 1993). The forces b with Tᵀb = ρ are in equilibrium on every
+subdomain, R_Tᵀb = 0, where the columns of R_T are the rigid motions of subdomains. With
+the diagonal matrix W of the stiffnesses of all copies,
 
     b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
       Z = W − WT(TᵀWT)⁻¹TᵀW
 
-where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all others: the
-range of Z contains the gluing and support forces. Then K_T d = b is a small Neumann
-problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three rows per plane
-subdomain. It is singular along motions of whole bodies that only contact resists; λ̂
-balances the load along these motions (`harness.verify.admissible.balanced`).
-The multipliers of gluing and supports in an answer are not used.
+where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all other
+components. The range of Z contains the gluing and support forces. Then K_T d = b is a
+small Neumann problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three
+rows per plane subdomain. The matrix is singular along motions of whole bodies that only
+contact resists; λ̂ balances the load along these motions
+(`harness.verify.admissible.balanced`). The multipliers of gluing and supports in an
+answer are not used.
 """
 
 from __future__ import annotations
@@ -54,19 +55,20 @@ from mortarbench.harness.qp import Vector
 from mortarbench.harness.verify.products import times_columns
 
 #: Safety factor for the relative difference of the energies in K and K_T, which is
-#: estimated at û. The difference is largest for soft displacements such as û.
+#: estimated at û. The relative difference is largest for displacements of low energy,
+#: such as û.
 SAFETY = 16
 #: Error of the sum over a row of K in `sample`, with a random sign, in units in the
 #: last place. The measured standard deviation is 0.4 to 0.5 for sums in extended
 #: precision, and 0.2 to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
-#: Error of the same sum with the sign of u, in units in the last place. Random signs
-#: may fail to excite the few soft modes of a slender body: with 0.25, the error for a
-#: plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
+#: Error of a sum over a row of K in `sample`, with the sign of u, in units in the last
+#: place. Random signs alone may fail to excite the few soft modes of a slender body.
+#: With 0.25, the error for a plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative norm of a correction of d below which the refinement ends. Bounds are
-#: reported to fewer digits.
+#: reported with fewer digits.
 REFINEMENT_TOLERANCE = 1e-6
 
 
@@ -114,7 +116,7 @@ class Split(Protocol):
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.
 
-        Unlike other vectors, w may be nonzero on fixed components.
+        In contrast to other vectors, w may be nonzero on fixed components.
         """
 
     def scattered(self, v: Extended) -> Extended:
@@ -204,11 +206,11 @@ def sample(
     """Return a sample (n,) of the rounding of Ku in the precision `real`.
 
     The error of each sum is a few units in the last place of √`variances`, the root of
-    the sum of the squared terms. It has two parts: RANDOM_ULPS with a random sign,
-    which excites all modes, and SMOOTH_ULPS with the sign of u, since u is softer than
-    most modes. The random sign is a hash of the number of the component, so that all
-    ranks use the same sign. The hash is splitmix64: signs that alternate too regularly
-    would do no work along smooth modes.
+    the sum of the squared terms. The first contribution is RANDOM_ULPS with a random
+    sign, which excites all modes. The second is SMOOTH_ULPS with the sign of u, since u
+    is softer than most modes. The random sign is a hash of the number of the component,
+    so that all ranks use the same sign. The hash function is splitmix64, because signs
+    that alternate too regularly would do no work along smooth modes.
 
     variances : (n,) sums of the squared terms
     components : (n,) global numbers of the components
@@ -276,8 +278,8 @@ class _Stored(ABC):
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Kw − TᵀK_T Tw on free components, and the difference of the energies.
 
-        Kw is computed by `cancelling`: if w moves bodies far together with their
-        supports, the terms of Kw cancel.
+        Kw is computed by `cancelling`, because the terms of Kw cancel if w moves bodies
+        far together with their supports.
         """
         K, v = csr_array(self.mechanics.primal.P), self.spread(w)
         Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
@@ -340,10 +342,10 @@ class Undivided(_Stored):
 
 
 class Reduction(Protocol):
-    """Completion of sums over subdomains by contributions of other processes.
+    """Sums over the subdomains of all processes.
 
-    Components (n,) belong to the local subdomains, coarse unknowns (r,) to all
-    subdomains.
+    Vectors (n,) contain the components of the local subdomains; vectors (r,) contain
+    the coarse unknowns of all subdomains.
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:

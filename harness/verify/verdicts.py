@@ -100,8 +100,9 @@ def judged(
 ) -> Record:
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
-    prove : returns the proven optimum of `qp`; called if residuals do not decide
-    values : residuals and objective as evaluated by ranks; None to evaluate them here
+    prove : returns the proven optimum of `qp`; called if residuals do not decide the
+        verdict values : residuals and objective as evaluated by ranks; None to evaluate
+        them here
     """
     record = record.replace(
         sizes=qp.sizes,
@@ -150,7 +151,8 @@ def judged(
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     """Return the physical quantities of a point, and a note on failure.
 
-    The note is empty on success; both are empty if the answer has no finite point.
+    The note is empty on success. Quantities and note are empty if the answer has no
+    finite point.
     """
     if not has_point(s):
         return {}, ""
@@ -171,8 +173,8 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     alone), `moved` = ‖u − û‖, and `friction`, the frictional part of `work`. `seminorm`
     is 1 if bodies can move rigidly; the errors of these motions are not bounded.
 
-    If the case has no mechanics, a positive `least_eigenvalue` of an operator P yields
-    a bound of the error of x in the norm of P (`certify_by_eigenvalue`).
+    If the case has no mechanics but an operator P with a positive `least_eigenvalue`,
+    the error of x is bounded in the norm of P (`certify_by_eigenvalue`).
     """
     if not has_point(s):
         return {}, ""
@@ -198,7 +200,7 @@ def evaluated_by_ranks(
     """Evaluate an answer on all ranks, from the local slices of the solution.
 
     The evaluation uses a new copy of the local part of the QP, which the solver cannot
-    have modified. All ranks must call this function, and all of them report the failure
+    have modified. All ranks must call this function, and all ranks report the failure
     of any rank (`harness.distributed.failures`).
 
     Returns
@@ -243,8 +245,9 @@ def evaluated_by_ranks(
 def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | None:
     """Evaluate objective and residuals; return None if they are not finite.
 
-    The result is also None if a scale of energy requires the whole QP: a distributed
-    vector raises TypeError for operations that its local slice does not determine.
+    The result is also None if a scale of energy requires the whole QP. In this case, an
+    operation that needs more than the local slice of a distributed vector raises
+    TypeError.
     """
     qp = emitted.share().qp
     try:

@@ -1,4 +1,4 @@
-"""Bounds on user input: a message of one line states the admissible values."""
+"""Limits of user input: messages of one line state the admissible values."""
 
 import json
 import os
@@ -32,7 +32,9 @@ def record(run_id="a", **changes):
 
 @pytest.fixture
 def journal(tmp_path):
-    """Write lines, records or changed fields of one, into a journal; its folder."""
+    """Write lines, records or changed fields of a record to a journal; return its
+    folder.
+    """
 
     def journal(*entries):
         (tmp_path / "journal").mkdir(exist_ok=True)
@@ -50,7 +52,7 @@ def journal(tmp_path):
 
 @pytest.fixture
 def refused(capsys, monkeypatch, tmp_path):
-    """Run a command that must end with exit code 2; returns its one line."""
+    """Run a command that must exit with code 2; return its message of one line."""
     monkeypatch.chdir(tmp_path)
     registries = Registries()
 
@@ -134,7 +136,7 @@ def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
 
     assert [r.run_id for r in read_journal(folder, told.append)] == ["a", "b"]
     [line] = told
-    assert line.startswith("2 journal lines repeat an earlier one word for word, ")
+    assert line.startswith("2 journal lines repeat an earlier line exactly, ")
     assert "here.jsonl, line 3" in line
 
 
@@ -143,7 +145,9 @@ def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(jou
 
     with pytest.raises(InputError) as e:
         read_journal(folder)
-    assert "line 3: the record of run_id 'a' differs from that at " in str(e.value)
+    assert "line 3: the record of run_id 'a' differs from the record at " in str(
+        e.value
+    )
     assert "here.jsonl, line 2; expected one line per run_id" in str(e.value)
 
 
@@ -152,12 +156,12 @@ def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
 ):
     folder = journal(record("a"), record("a"))
     assert main(Registries(), ["report", str(folder), "--format", "csv"]) == 0
-    assert "1 journal line repeats an earlier one" in capsys.readouterr().err
+    assert "1 journal line repeats an earlier line" in capsys.readouterr().err
 
     folder = journal(record("a"), record("a", tol=1e-3))
     for command in ("report", "validate"):
-        assert "differs from that at" in refused(command, folder)
-    assert "differs from that at" in refused("replay", folder, "a")
+        assert "differs from the record at" in refused(command, folder)
+    assert "differs from the record at" in refused("replay", folder, "a")
 
 
 def test_equal_tables_of_a_journal_are_one_in_memory_but_1_is_not_true(journal):

@@ -1,7 +1,8 @@
-"""Whatever is damaged or odd is taken or refused: no traceback, no hang, no GiB.
+"""Damaged or unusual input is accepted or refused without a traceback or a hang.
 
-Texts of every reader, files of result folders, names, options, command lines, arguments
-from Python. Data files: `tests/harness/files/test_hostile_files.py`.
+The input comprises texts of all readers, files of result folders, names, options,
+command lines and arguments from Python. Data files are tested in
+`tests/harness/files/test_hostile_files.py`.
 """
 
 import json
@@ -151,7 +152,7 @@ ENVIRONMENT = {
 
 
 def tried(text, read):
-    """Read one text: whether it was taken; anything but an InputError is a fault."""
+    """Read a text; return True if it was accepted. Only InputError may be raised."""
     try:
         with bounded(), warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -204,7 +205,7 @@ def test_a_damaged_name_of_a_case_is_read_or_refused(count):
 
 
 def lines(count, chance):
-    """Journal lines with odd values, each under a run_id of its own."""
+    """Return journal lines with unusual values, each with a distinct run_id."""
     sound = [json.loads(r.to_json()) for r in synthetic_results.records(3, 4, 2)]
     for i in range(count):
         row = chance.choice(sound) | {"run_id": f"{i:012x}"}
@@ -279,14 +280,14 @@ def test_a_damaged_suite_of_a_folder_is_refused_or_reported_and_merged(tmp_path,
 
 
 def in_lines(table):
-    """Write any table as TOML, what is in it in a line each."""
+    """Write a table as TOML, with one line for each entry."""
     return as_toml({f"{key}_": value for key, value in table.items()}).replace(
         "_ = ", " = "
     )
 
 
 def without_none(data):
-    """Drop what TOML cannot hold."""
+    """Remove values that TOML cannot represent."""
     match data:
         case dict():
             return {k: without_none(v) for k, v in data.items() if v is not None}
@@ -372,7 +373,7 @@ def test_damaged_options_are_taken_or_refused(count):
         )
 
 
-#: what a Python program may pass by mistake
+#: values that a Python program may pass by mistake
 ODD = (
     None, True, False, 0, 3, -1, 2.5, float("nan"), float("inf"), 10**400, 1j, "", "x",
     "a b", "\0", "\ud800", "x" * 5000, "nowhere/x", "/dev/zero", "/proc/self/mem", "-",
@@ -380,7 +381,7 @@ ODD = (
     frozenset({"x"}), frozenset(), range(3), str, InputError, np.float64(0.5),
     np.int64(2), np.bool_(True), np.str_("x"), Decimal(1), Fraction(1, 3), ...,
 )  # fmt: skip
-#: functions, sound arguments by position and by name
+#: functions, with valid arguments by position and by name
 ENTRIES = (
     (mb.build, ["obstacle/dim=1/n=4/primal"], {"plugins": ()}),
     (mb.load, ["run"], {"warn": len}),

@@ -1,4 +1,4 @@
-"""The one digest: known values, and those of a result folder that was kept."""
+"""Digests: known values, and digests in a stored result folder."""
 
 from io import BytesIO
 from pathlib import Path
@@ -10,7 +10,7 @@ OLD = Path(__file__).parents[1] / "data" / "results-2026-11"
 
 
 def test_a_digest_is_the_beginning_of_sha_256():
-    """The example of FIPS 180-2, appendix B.1."""
+    """Test the example of FIPS 180-2, appendix B.1."""
     assert hex_digest([b"abc"]) == "ba7816bf8f01"
     assert hex_digest([b"a", b"", b"bc"], 16) == "ba7816bf8f01cfea"
 

@@ -1,4 +1,4 @@
-"""Families by class, and those that are wrapped when they are offered."""
+"""Families: subclasses of `Family`, and wrapped objects."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from tests.support.toy_problem import Well
 
 
 class Bare:
-    """Family with the required attributes only."""
+    """Family with only the required attributes."""
 
     name, defaults, forms = "bare", {"n": 1}, ("only",)
 

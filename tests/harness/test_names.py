@@ -1,4 +1,4 @@
-"""Case names: strict to read, canonical to write."""
+"""Case names: strict parsing, and canonical names."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from mortarbench.harness.plugin import as_family
 
 @dataclass(frozen=True)
 class Ring:
-    """Layers derive from Nh, step from steps, as in the paper's benchmark."""
+    """Family whose default layers depend on Nh, and step on steps, as in beam-ring."""
 
     name: str = "ring"
     defaults: Mapping = field(

@@ -1,4 +1,4 @@
-"""A QP from arrays: accepted input, and the message of every refusal."""
+"""QPs from arrays: accepted input, and error messages."""
 
 import doctest
 from importlib import import_module
@@ -85,8 +85,8 @@ WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)
         ({"P": [[1, 2], [2, 1]]}, "it has a negative eigenvalue; expected a convex QP"),
         ({"P": None}, "P is missing; expected an array of numbers"),
         ({"P": np.eye(3)}, r"P has shape \(3, 3\); expected \(2, 2\)"),
-        ({"P": np.nan * I2}, "P holds NaN or inf; expected finite numbers"),
-        ({"P": csc_matrix(np.inf * np.ones((2, 2)))}, "P holds NaN or inf"),
+        ({"P": np.nan * I2}, "P contains NaN or inf; expected finite numbers"),
+        ({"P": csc_matrix(np.inf * np.ones((2, 2)))}, "P contains NaN or inf"),
         ({"P": 1j * I2}, "P is of type complex128; expected an array of numbers"),
         ({"P": csc_matrix(1j * I2)}, "P is of type complex128; expected an array"),
         ({"P": [[1, 2], [3]]}, "P is ragged; expected an array of numbers"),
@@ -95,23 +95,23 @@ WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)
         ({"q": None}, "q is missing"),
         ({"q": []}, "q is empty; expected at least one variable"),
         ({"q": 1.0}, r"q has shape \(\); expected one dimension"),
-        ({"q": [1, np.nan]}, "q holds NaN or inf"),
+        ({"q": [1, np.nan]}, "q contains NaN or inf"),
         ({"q": {1: 2}}, "q is of type dict"),
-        ({"G": I2}, "h is missing beside G"),
-        ({"h": ZERO}, "G is missing beside h"),
-        ({"A": I2}, "b is missing beside A"),
-        ({"b": ZERO}, "A is missing beside b"),
+        ({"G": I2}, "h is missing, but G is present"),
+        ({"h": ZERO}, "G is missing, but h is present"),
+        ({"A": I2}, "b is missing, but A is present"),
+        ({"b": ZERO}, "A is missing, but b is present"),
         (
             {"G": np.ones((2, 3)), "h": ZERO},
             r"G has shape \(2, 3\); expected \(rows, 2",
         ),
         ({"A": [1, 1], "b": ZERO}, "b has 2 entries; expected 1, one per row of A"),
-        ({"G": [1, 1], "h": np.inf}, "h holds NaN or inf"),
+        ({"G": [1, 1], "h": np.inf}, "h contains NaN or inf"),
         ({"lb": [0, 0, 0]}, r"lb has shape \(3,\); expected \(2,\)"),
-        ({"lb": np.nan}, "bounds hold NaN"),
+        ({"lb": np.nan}, "bounds contain NaN"),
         ({"lb": 1, "ub": 0}, "bounds cross: lb > ub"),
         ({"lb": "low"}, "lb is of type <U3"),
-        ({"sets": (1,)}, "expected a tuple of convex sets, beside lb and"),
+        ({"sets": (1,)}, "expected a tuple of convex sets in addition to lb"),
     ],
 )
 def test_what_is_no_qp_is_refused_in_one_line(changes, message):

@@ -1,4 +1,4 @@
-"""Solvers by name, options by name and type, plug-ins by path."""
+"""Registries: solvers by name, options by name and type, plug-ins by path."""
 
 import sys
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Generic(Method):
 
 @dataclass(frozen=True)
 class Open(Method):
-    """A generic adapter that cannot list its backends."""
+    """Generic adapter that cannot list its backends."""
 
     backend: str = ""
 
@@ -261,7 +261,7 @@ def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Install a package, whose files are metadata alone, that offers something."""
+    """Install a package that has only metadata and offers an entry point."""
 
     def install(metadata, offers):
         folder = tmp_path / "installed" / metadata
@@ -315,7 +315,7 @@ def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
         merged("solver", {"a": 1}, {"a": 2})
 
 
-# plug-ins in two versions, and with neighbours
+# two versions of plug-ins, and plug-ins with neighbours
 
 WITH_NEIGHBOURS = """
 import helper
@@ -335,7 +335,7 @@ SOLVERS = {"mine": Mine()}
 
 
 def version(folder, number):
-    """Write a plug-in, and beside it modules of its own that say which version."""
+    """Write a plug-in with neighbours that contain a version."""
     (folder / "tools").mkdir(parents=True)
     (folder / "mine.py").write_text(WITH_NEIGHBOURS)
     (folder / "helper.py").write_text("from .constants import VERSION")
@@ -347,7 +347,7 @@ def version(folder, number):
 
 
 def test_two_versions_of_a_plugin_keep_their_neighbours_apart(tmp_path):
-    """Whenever an import statement runs: at the start, or in a call."""
+    """Import statements may run at the start or in a call."""
     files = {n: version(tmp_path / f"v{n}", n) for n in (1, 2)}
     solvers = {}
     for number, file in files.items():
@@ -396,7 +396,7 @@ SOLVERS = {"mine": Mine()}
 
 
 def test_the_names_that_packages_of_ours_had_go_on_working_in_plugins(tmp_path):
-    """In calls, too; a neighbour of such a name goes before our package."""
+    """Test also imports in calls; a neighbour with the same name has precedence."""
     (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
     (tmp_path / "plug.py").write_text(OF_OLD)
     of_user = sys.modules.get("harness")

@@ -1,4 +1,4 @@
-"""Operations of convex sets, against what defines them; and QPs that have several."""
+"""Operations of convex sets, compared with definitions; QPs with several sets."""
 
 from dataclasses import dataclass, replace
 
@@ -60,7 +60,7 @@ def test_the_projection_is_the_nearest_point(one):
 
 @names
 def test_what_projection_removes_is_normal(one):
-    """Moreau: z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
+    """By Moreau, z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
     for v in points(100):
         x = one.project(v)
         z = v - x
@@ -88,13 +88,13 @@ def test_the_support_function_bounds_the_work_on_every_member(one):
 
 @names
 def test_what_is_not_admissible_has_no_bounded_work(one):
-    """σ(e) = ∞ for each component that is left out of e."""
+    """σ(e) = ∞ for each unit vector e of a component that is not admissible."""
     e = np.eye(N)
     for z in (*e, *-e):
         if not one.admissible(z).any():
             reached = max(z @ one.project(1e9 * z + x) for x in points(5))
             assert reached > 1e8
-    for z in points(50):  # so is the rest of any vector: it is a direction of the set
+    for z in points(50):  # the inadmissible part of any z is a direction of the set
         rest = z - one.admissible(z)
         far = one.project(1e9 * rest)
         assert far == pytest.approx(1e9 * rest + one.project(0 * z), abs=1e-5)
@@ -113,7 +113,7 @@ def test_the_hull_is_the_smallest_box_around_a_set(one):
 
 
 def test_projections_on_cones_are_exact():
-    """‖t‖ ≤ ¾n; (0, 3, 4) is off by (n, t) = (2.4, 1.8·(0.6, 0.8))."""
+    """For ‖t‖ ≤ ¾n, the projection of (0, 3, 4) is n = 2.4, t = 1.8·(0.6, 0.8)."""
     cone = Cones([[0, 1, 2]], [0.75])
     for x, nearest in [
         ([0, 3, 4], [2.4, 1.08, 1.44]),
@@ -204,11 +204,11 @@ def test_blocks_are_substituted_with_their_variables():
         ),
         (
             lambda: Discs([[0.5, 1]], [1]),
-            "Discs: index holds a number that is not an in",
+            "Discs: index contains a number that is not an in",
         ),
         (
             lambda: Discs([[np.nan, 1]], [1]),
-            "Discs: index holds a number that is not an",
+            "Discs: index contains a number that is not an",
         ),
         (
             lambda: Discs([[0, 1], [2]], [1, 1]),
@@ -225,7 +225,7 @@ def test_blocks_are_substituted_with_their_variables():
         ),
         (
             lambda: Discs([[1e300, 1]], [1]),
-            "Discs: index holds a number that is not an",
+            "Discs: index contains a number that is not an",
         ),
     ],
 )
@@ -310,15 +310,17 @@ def test_sets_that_do_not_fit_are_refused(sets, message):
 
 def test_a_box_beside_bounds_is_refused():
     arrays = dict(P=np.eye(N), q=np.ones(N))
-    with pytest.raises(InputError, match="expected a tuple of convex sets, beside lb"):
+    with pytest.raises(
+        InputError, match="expected a tuple of convex sets in addition to"
+    ):
         QP.from_arrays(**arrays, sets=(BOX,))
     assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
 
 
 def with_solution(seed, radius=None):
-    """A QP with bounds, rows and balls, and its solution, strictly complementary.
+    """Return a QP with bounds, rows and balls, and its strictly complementary solution.
 
-    Balls 0, 2, … are active, with z = c·x; 1, 3, … are not.
+    Balls 0, 2, … are active with z = c·x; balls 1, 3, … are inactive.
     """
     rng = np.random.default_rng(seed)
     k, d, m = 5, int(rng.integers(1, 4)), 2
@@ -358,7 +360,7 @@ def test_a_planted_solution_has_no_residual_and_others_have(seed):
     assert kkt_residuals(qp, replace(s, z_box=wrong_sign)).worst > 1e-2
     inside = s.z_box.copy()
     inside[index[1]] = 0.3 * np.linalg.norm(s.z_box[first])
-    q = qp.q - inside + s.z_box  # so that it is stationary
+    q = qp.q - inside + s.z_box  # makes the point stationary
     r = kkt_residuals(replace(qp, q=q), replace(s, z_box=inside))
     assert r.complementarity > 1e-5
     assert r.dual <= 1e-14
@@ -427,7 +429,7 @@ def test_points_over_other_sets_are_compared_with_a_proven_optimum():
 
 
 def test_a_ball_without_a_point_beyond_a_row_is_infeasible():
-    """x₁ + x₂ ≥ 3 over ‖x‖ ≤ 1; with √2 at most, even its box proves that."""
+    """On ‖x‖ ≤ 1, x₁ + x₂ ≤ √2; the enclosing box already contradicts x₁ + x₂ ≥ 3."""
     balls = Balls(np.array([[0, 1]]), np.ones(1))
     qp = QP(
         P=np.eye(2), q=np.zeros(2), A=np.zeros((0, 2)), b=np.zeros(0),
@@ -442,7 +444,7 @@ def test_a_ball_without_a_point_beyond_a_row_is_infeasible():
 
 @dataclass(frozen=True)
 class Careless:
-    """Says of every QP that it can take it."""
+    """Solver that accepts every QP."""
 
     def declines(self, qp):
         return None
@@ -459,7 +461,9 @@ class Conic(Careless):
 
 def test_a_solver_that_declares_nothing_accepts_bounds_alone():
     qp = qp_with(FREE, BALLS)
-    assert reason_to_decline(Careless(), qp) == "does not accept sets of the kind Balls"
+    assert (
+        reason_to_decline(Careless(), qp) == "does not accept sets of the class Balls"
+    )
     assert reason_to_decline(Careless(), qp_with(BOX)) is None
     assert reason_to_decline(Conic(), qp) is None
 

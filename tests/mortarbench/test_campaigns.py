@@ -137,11 +137,11 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(camp
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"depths": "2"}, "holds well/dual, which is no longer in the suite"),
+        ({"depths": "2"}, "contains well/dual, which is no longer in the suite"),
         ({"time_limit": 5}, r"time_limit was 60, now 5\); choose another --out"),
         (
             {"solvers": '{name = "exact", options = {factor = 1.5}}, "lax"'},
-            "holds exact with factor = 1.0, now 1.5; give other options another label",
+            "contains exact with factor = 1.0, now 1.5; use a different label for",
         ),
     ],
 )
@@ -173,7 +173,7 @@ def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
         r.run_id for name in "ab" for r in read_journal(tmp_path / name)
     }
     assert [line.rpartition(": ")[2] for line in again] == [
-        "4 of 4 measurements are already present, and count once"
+        "4 of 4 measurements are already present and are counted once"
     ] * 2
     assert all(is_stored(tmp_path / "all", r.vectors) for r in held)
     assert read_toml(tmp_path / "all/suite.toml") == {
@@ -272,7 +272,9 @@ def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path)
     a, b = stored
     with pytest.raises(mb.InputError, match="is one of the folders to merge"):
         mb.merge(a, b, out=b)
-    with pytest.raises(mb.InputError, match=r"holds measurements of a run \(journal/"):
+    with pytest.raises(
+        mb.InputError, match=r"contains measurements of a run \(journal/"
+    ):
         mb.merge(a, out=b)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/suite.toml").write_text("mine")

@@ -488,7 +488,8 @@ WRONG = {
     ),
     "out of memory": (
         ("export", "well/depth=98/primal", "a.npz"),
-        "well/depth=98/primal could not be built: it needs more memory than there is",
+        "well/depth=98/primal could not be built: "
+        "it needs more memory than is available",
     ),
     "plug-in that cannot build": (
         ("export", "deeper/depth=99/primal", "a.npz", "--plugin", "deeper.py"),
@@ -903,7 +904,7 @@ def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypat
     sliding = "greco/n=2/dim=3"  # friction in space: cones, and discs in the dual
     for solver, is_named in (("smalbe", True), ("osqp", False)):
         message = declined(f"{sliding}/primal", solver)
-        assert "sets of the kind Cones" in message
+        assert "sets of the class Cones" in message
         assert (f"solve {sliding}/dual\n" in message) is is_named
 
 

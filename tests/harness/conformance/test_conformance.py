@@ -1,4 +1,4 @@
-"""Conformance: every solver passes every check; every check catches its fault."""
+"""Conformance checks: solvers pass all checks, and each check detects its fault."""
 
 import gc
 import json
@@ -48,7 +48,7 @@ OTHERS = {
 }
 
 
-#: variants of a solver that stands for them
+#: variants, each represented by another solver
 VARIANTS = ("proxqp-dense", "proxqp-sparse", "piqp-dense", "piqp-sparse", "scs-qdldl")
 
 
@@ -65,11 +65,11 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: equivalent formulations are not a condition of conformance; they have their own test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-#: take seconds for all equivalent formulations
+#: solvers that take seconds for all equivalent formulations
 REWRITTEN = {
     "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
 }  # fmt: skip
-#: accepts only equations, and so none of these QPs
+#: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
@@ -92,12 +92,14 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 
 UNBOUNDED = "claims no success: unbounded"
-#: iterate to their limit, for many seconds; `smalbe` represents its variants
+#: solvers that take many seconds to reach the iteration limit; `smalbe` represents its
+#: variants
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
     ("projected-gradient", UNBOUNDED),
 ]  # fmt: skip
-#: planted solutions for all solvers: each shape once, and one of them in every storage
+#: planted solutions for all solvers: each shape once, and one shape in all storage
+#: formats
 PLANTED = re.compile(
     r"(finds the planted solution|reaches the tolerance [\d.e-]+): (.*)"
 )
@@ -106,7 +108,7 @@ ONCE = ", sparse"
 
 
 def is_for_all(name, check):
-    """Return True if a check runs by default; for our own solver, all do."""
+    """Return True if a check runs by default; all checks run for `smalbe`."""
     planted = PLANTED.match(check)
     return name == "smalbe" or planted is None or (
         planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
@@ -145,7 +147,7 @@ def test_variants_and_other_backends_conform(name, check):
 
 
 def weaknesses(solver):
-    """Return each (form, change) with a weakness, and the number of solved ones."""
+    """Return each (form, change) with a weakness, and the number of solved pairs."""
     weak, solved = [], 0
     for form in FORMS:
         old = None
@@ -167,11 +169,14 @@ def weaknesses(solver):
         pytest.param(
             name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
         )
-        for name in CONCRETE  # the others pass the same QPs to libraries of these
+        # other solvers pass the same QPs to the libraries of these
+        for name in CONCRETE
     ],
 )
 def test_weaknesses_are_documented(name):
-    """`make weaknesses` writes the page; it may list weaknesses that are gone."""
+    """The page, written by `make weaknesses`, may also list weaknesses that
+    are gone.
+    """
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
 
@@ -190,7 +195,7 @@ def test_our_own_solvers_have_no_weakness():
 
 @dataclass(frozen=True)
 class Sound:
-    """PIQP under another name, base class of the faulty solvers."""
+    """PIQP under another name; base class of the faulty solvers."""
 
     spoilt: str = ""
 
@@ -248,7 +253,7 @@ class Wanders(Sound):
 
 
 class Scales(Sound):
-    """Correct answers, after scaling the read-only data in place."""
+    """Solver that scales read-only data in place but returns correct answers."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -288,7 +293,9 @@ class TakesOperatorsForZero(Sound):
 
 
 class StopsAtTheStart(Sound):
-    """Claim of optimality at the first point, as by HiGHS 1.15.1 for bounds only."""
+    """Solver that claims that its first point is optimal, like HiGHS 1.15.1 without
+    rows.
+    """
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -302,7 +309,7 @@ class Slow(Sound):
 
 
 class MindsUnits(Sound):
-    """Failure for large numbers, like with an absolute tolerance."""
+    """Solver that fails for large numbers, as with an absolute tolerance."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -310,7 +317,7 @@ class MindsUnits(Sound):
 
 
 class SlowInNewtons(Sound):
-    """49 times the iterations for large unknowns, as OSQP takes."""
+    """Solver that takes 49 times the iterations for large unknowns, like OSQP."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -319,7 +326,7 @@ class SlowInNewtons(Sound):
 
 
 class MindsTheOrder(Sound):
-    """Failure if the first unknown has the lower bound zero."""
+    """Solver that fails if the first unknown has the lower bound zero."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -405,7 +412,7 @@ def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
 
 
 def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
-    """The line of the message, inserted at its place, makes the check pass."""
+    """If the line quoted in the message is inserted, the check passes."""
     check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
     ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)
@@ -413,7 +420,7 @@ def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
     exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
     told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
 
-    # it declines, and the harness multiplies the operator out
+    # the solver declines, and the harness assembles the operator
     assert run_check(check, told()) == (Grade.PASS, "", None)
 
 
@@ -438,7 +445,7 @@ def test_a_form_that_is_not_solved_has_no_weakness():
 
 
 def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
-    # a fake clock: real threads need idle cores to show
+    # a fake clock, since real threads are detected only with idle cores
     monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
     slow = Slow()
     assert run_check("computes in one thread", slow).grade is Grade.FAIL
@@ -449,7 +456,7 @@ def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
 def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
-    assert Grade.PASS in grades  # its options
+    assert Grade.PASS in grades  # the check of options
     result = run_check("gives multipliers our signs", DeclinesAll())
     assert result == (Grade.DECLINE, "never on a Monday", None)
 

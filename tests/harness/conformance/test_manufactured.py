@@ -1,4 +1,4 @@
-"""Manufactured QPs."""
+"""Manufactured QPs: planted solutions and verdicts."""
 
 import doctest
 from dataclasses import dataclass, replace
@@ -55,7 +55,7 @@ def test_points_planted_over_sets_are_strictly_complementary_solutions(shape):
 
 @dataclass(frozen=True)
 class Projections:
-    """The reference solve, as a solver that accepts all sets."""
+    """The reference solver as a solver that accepts all sets."""
 
     accepts: ClassVar = (Box, Discs, Cones)
 
@@ -67,7 +67,7 @@ class Projections:
 
 
 class OnBounds(Projections):
-    """Leaves out the sets, and balances the gradient by z_box."""
+    """Solver that ignores the sets and balances the gradient by z_box."""
 
     def prepare(self, qp, tol):
         def solve():
@@ -87,7 +87,7 @@ class OtherSign(Projections):
 
 
 class Stops(Projections):
-    """Returns a point close to the solution, with its best multipliers."""
+    """Solver that returns a point close to the solution, with its best multipliers."""
 
     def prepare(self, qp, tol):
         x = reference_solution(qp).x * (1 + 1e-4)
@@ -119,4 +119,4 @@ def test_a_solver_of_bounds_declines_all_checks_over_sets():
     for check in OVER_SETS:
         result = run_check(check, SOLVERS["osqp"])
         assert result.grade is Grade.DECLINE
-        assert "does not accept sets of the kind" in result.message
+        assert "does not accept sets of the class" in result.message

@@ -64,14 +64,14 @@ every_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
 def random_point(qp):
-    """Return a random point, with multipliers of any sign, also on absent bounds."""
+    """Return a random point with multipliers of any sign, including absent bounds."""
     rng = generator()
     x, y, z, z_box = (rng.standard_normal(v.size) for v in (qp.q, qp.b, qp.h, qp.q))
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
 def lagrangian(qp, s):
-    """Return objective + yᵀ(Ax − b) + zᵀ(Gx − h) + the terms of finite bounds."""
+    """Return objective + yᵀ(Ax − b) + zᵀ(Gx − h) + terms of finite bounds."""
     box = np.where(s.z_box > 0, s.x - qp.ub, s.x - qp.lb)
     box = s.z_box @ np.where(np.isfinite(box), box, 0)
     return (
@@ -120,7 +120,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
 def test_violated_constraints_stay_violated(manufactured, transform, shape):
-    """Rows, bounds and signs of multipliers, at a random point."""
+    """Test rows, bounds and signs of multipliers at a random point."""
 
     def violated(qp, s):
         z_lb, z_ub = s.z_box < 0, s.z_box > 0
@@ -140,7 +140,7 @@ def test_violated_constraints_stay_violated(manufactured, transform, shape):
 def test_names_and_units_change_no_residual_at_any_point(
     manufactured, transform, shape
 ):
-    """Test the promise of `harness.verify.kkt` at good points, bad points and NaN."""
+    """Residuals are invariant at good points, at bad points and for NaN."""
     qp, expected = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)
@@ -162,7 +162,7 @@ def test_names_and_units_change_no_residual_at_any_point(
 
 
 def preimage(qp, new):
-    """Invert the map back, which is affine, from its images of unit vectors."""
+    """Invert the affine map `recover`, given its images of unit vectors."""
     parts = ("x", "y", "z", "z_box")
     sizes = [new.qp.q.size, new.qp.b.size, new.qp.h.size, new.qp.q.size]
     cuts = np.cumsum(sizes)[:-1]
@@ -176,7 +176,7 @@ def preimage(qp, new):
 
     zero = back(np.zeros(sum(sizes)))
     columns = np.array([back(e) - zero for e in np.eye(sum(sizes))]).T
-    to = abs(columns).argmax(axis=0)  # monomial: one entry in each row and column
+    to = abs(columns).argmax(axis=0)  # one entry in each row and column
     entry = columns[to, np.arange(to.size)]
 
     def there(old):
@@ -192,7 +192,9 @@ def preimage(qp, new):
 def test_a_duplicated_row_changes_residuals_by_a_factor_of_two_at_most(
     manufactured, shape
 ):
-    """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ can shrink, by two."""
+    """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ decrease, by a
+    factor of two.
+    """
     qp, _ = manufactured(shape, dense=True)
     new = duplicate_rows(qp, np.arange(qp.b.size), np.arange(qp.h.size))
     old = random_point(qp)
@@ -234,7 +236,7 @@ def test_the_structure_of_a_dual_is_that_of_the_changed_dual(form, transform):
 
 
 def test_units_of_the_strings_are_those_of_textbooks():
-    """K is in Pa, MPa and GPa, λ in N/m, N/mm and GN/m, for the same body."""
+    """For the same body, K is in Pa, MPa or GPa, and λ in N/m, N/mm or GN/m."""
     nd = strings("primal").P.toarray().max()
     pascal = nd * 2.0**26  # F₀/l
     for units, factor in [("N, m", 1), ("N, mm", 2.0**-20), ("GN, m", 2.0**-30)]:
@@ -249,7 +251,7 @@ def test_units_of_the_strings_are_those_of_textbooks():
 
 
 def test_the_three_forms_of_the_strings_are_one_problem():
-    """λ_I is the multiplier of the contact rows; energies add up to strong duality."""
+    """λ_I is the multiplier of the contact rows, and strong duality holds."""
     points = {form: PIQP().prepare(strings(form), 1e-11)() for form in FORMS}
     pressures = points["primal"].z
     assert (pressures > 1e-4).sum() == 9

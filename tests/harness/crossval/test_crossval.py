@@ -1,4 +1,4 @@
-"""Cross-validation: planted errors are measured, their solver named, nobody else."""
+"""Cross-validation: planted errors are measured and attributed to the right solver."""
 
 import json
 import shutil
@@ -53,7 +53,7 @@ def record_of(text, label, tol=1e-8, **more):
 
 
 def write(folder, answers, tol=1e-8):
-    """Write a result folder of (solver, case, solution or verdict)."""
+    """Write a result folder with entries (solver, case, solution or verdict)."""
     cases = {}
     with Journal(folder, "here") as journal:
         for label, text, answer in answers:
@@ -72,7 +72,7 @@ def write(folder, answers, tol=1e-8):
 
 @pytest.fixture
 def cli(capsys):
-    """Validate a folder; returns the exit code, stdout and stderr."""
+    """Validate a folder; return the exit code, stdout and stderr."""
 
     def cli(*argv, **more):
         registries = Registries(
@@ -86,7 +86,7 @@ def cli(capsys):
 
 
 def write_text_alone(directory, data, meshes=()):
-    """Write the page as Markdown; no figure is drawn."""
+    """Write only the Markdown page, without figures."""
     path = directory / "report" / "validation.md"
     return [write_text(path, markdown(compose(data, meshes)))]
 
@@ -102,7 +102,7 @@ def culprits(verdict):
 
 @pytest.fixture(scope="module")
 def truths():
-    """The exact answer to each form of two load steps, with its case."""
+    """Return the exact answer to each form of two load steps, with its case."""
     found = {}
     for step in (1, 2):
         for form in ("primal", "dual", "dual-bounds"):
@@ -112,7 +112,7 @@ def truths():
 
 
 def disturbed(case, s, size):
-    """Move an answer by `size`·‖u*‖ in the energy norm, whatever its form."""
+    """Displace an answer of any form by `size`·‖u*‖ in the energy norm."""
     rng = np.random.default_rng(141421)
     point = reference_point(case.mechanics, reference_solution)
     if case.qp.h.size:
@@ -120,7 +120,7 @@ def disturbed(case, s, size):
         v[case.mechanics.exact.fixed] = 0
     else:
         v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
-        if case.qp.b.size:  # what the rigid motions do not feel
+        if case.qp.b.size:  # keep the equality rows satisfied
             A = np.asarray(case.qp.A)
             v = v - np.linalg.pinv(A) @ (A @ v)
     return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)
@@ -194,7 +194,7 @@ def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_pat
 
 
 def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
-    """Two steps of one problem could share them; it is u that is wrong here."""
+    """If only u is wrong, the contact forces are not attributed to another step."""
     case, s = truths[2, "primal"]
     answers = [("a", f"{BEAM}/primal", s), ("a", f"{BEAM}/step=1/primal",
                                             truths[1, "primal"][1])]  # fmt: skip
@@ -251,13 +251,13 @@ def test_penetration_is_measured_in_mesh_sizes_and_balance_per_body(truths):
 
     assert found.penetration == pytest.approx(np.max(B @ deep.x - c) / h)
     assert found.penetration >= 0.5 * (1 - 1e-9)
-    assert unheld.balance == 1  # nothing holds the load
+    assert unheld.balance == 1  # no support balances the load
     assert exact.balance < 1e-9
     assert exact.penetration < 1e-12
 
 
 class Dense:
-    """K⁻¹ of a K that is regular."""
+    """Inverse of a regular K."""
 
     def __init__(self, K):
         self.inverse, self.kernel = np.linalg.inv(K), np.zeros((len(K), 0))
@@ -276,7 +276,9 @@ def stored_answer(case, label, s, tol=1e-8):
 
 @pytest.fixture
 def duplicate():
-    """Two springs whose end is pushed by 2 against a wall at 1, which has two rows."""
+    """Return two springs pushed by 2 against a wall at 1, with a duplicated
+    contact row.
+    """
     K = np.array([[2.0, -1.0], [-1.0, 1.0]])
     primal = QP(
         P=csc_array(K), q=np.array([0.0, -2.0]), A=no_rows(2), b=np.zeros(0),
@@ -301,7 +303,9 @@ def pushed(z, x=(0.5, 1.0)):
 def test_a_certificate_that_the_reference_contradicts_is_our_fault(
     truths, tmp_path, cli
 ):
-    """The error is 2e-5, which the claim allows, but certified as 1e-7."""
+    """The error of 2e-5 is permitted by the claim, but exceeds a certified bound of
+    1e-7.
+    """
     _, s = truths[2, "dual-bounds"]
     answers = [("a", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5)))]
     write(tmp_path, answers, tol=1e-5)
@@ -336,7 +340,7 @@ def finds_nothing(qp):
 
 
 def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
-    """All forces and all gaps are positive, as at an interior point."""
+    """All forces and gaps are positive, as at an interior point."""
     point = reference_point(duplicate.mechanics, reference_solution)
     inside = pushed((1.5, 1e-9), (0.5 - 5e-8, 1 - 1e-7))
 
@@ -349,7 +353,7 @@ def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
 def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     duplicate, monkeypatch
 ):
-    def back(s):  # which leads astray, while nothing is known for sure
+    def back(s):  # a wrong map, before any answer is certified
         return replace(s, x=s.x + 1) if s.iterations else s
 
     def doubtful(*args):
@@ -451,14 +455,15 @@ def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
     rows = {(r["solver"], r["tol"]): r for r in verdict["solvers"]}
     assert next(iter(rows)) == ("smalbe", 1e-4)
     assert rows["b", 1e-4]["primal_dual"] == pytest.approx(1e-3, rel=1e-3)
-    assert rows["c", 1e-4]["primal_dual"] is None  # dual forms only
+    assert rows["c", 1e-4]["primal_dual"] is None  # only dual forms
     assert rows["b", 1e-4]["from_ours"] == pytest.approx(1e-3, rel=1e-3)
     assert rows["b", 1e-6]["from_ours"] < 1e-8
     assert rows["smalbe", 1e-4]["from_ours"] is None  # alone
-    assert verdict["counts"]["pairs"] == 10 + 3  # of answers at one tolerance
+    # pairs of answers at the same tolerance
+    assert verdict["counts"]["pairs"] == 10 + 3
 
 
-@pytest.mark.slow  # the solve; those of HiGHS and of a candidate by hand are quick
+@pytest.mark.slow  # slow solve; HiGHS and a manual candidate are quick
 def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
     text = "obstacle/n=16/primal"
     case = built(text)
@@ -675,7 +680,7 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
 
 
 def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path):
-    """u″ = 2 over a length of 1 makes ‖u − u_h‖² = h²/3, but for the norm of û."""
+    """For u″ = 2 on a length of 1, ‖u − u_h‖² = h²/3; errors are relative to ‖û‖."""
     text = "obstacle/dim=1/n=12/primal"
     case = built(text)
     folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])

@@ -1,7 +1,8 @@
 """Error estimates of a mesh from finer meshes, compared with exact errors.
 
-The obstacle problems have exact solutions: the true error of u_h is a quadrature over
-its elements. The patch test's solution is in every finite element space.
+The obstacle problems have exact solutions, so the true error of u_h is computed by
+quadrature over the elements. The solution of the patch test is in every finite element
+space.
 """
 
 import json
@@ -41,7 +42,7 @@ from tests.support.gmsh_files import stacked_blocks
 
 
 def levels(*distances, bound=1e-9):
-    """Levels of norm 2 so far from each other."""
+    """Return levels of norm 2 with given distances between successive levels."""
     return [
         Level(case="box", unknowns=9, energy=-7.0, norm=2.0, bound=bound, distance=d)
         for d in (None, *distances)
@@ -49,7 +50,7 @@ def levels(*distances, bound=1e-9):
 
 
 def converging(error, rate, count):
-    """Levels of orthogonal errors ε², ε²/2^q, …: between them are their differences."""
+    """Return levels with orthogonal errors, whose squares are ε², ε²/2^q, …."""
     squares = error**2 * 2.0 ** (-rate * np.arange(count))
     return levels(*np.sqrt(-np.diff(squares)))
 
@@ -62,7 +63,7 @@ def meshes(folder, *names, budget=1e9):
 
 
 def true_error(dim, n, folder):
-    """‖u − u_h‖ by Gauss's rule on every cell, and ‖û‖ that certificates divide by."""
+    """Return ‖u − u_h‖ from Gauss quadrature on every cell, and ‖û‖."""
     problem = obstacle_problem(dim, n)
     case = PROBLEMS["obstacle"].build("primal", {"dim": dim, "n": n}, None)
     point = reference_point(case.mechanics, reference_solution, folder)
@@ -105,7 +106,7 @@ def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n)
     assert found.kind == "limit"
     assert found.rate == pytest.approx(2, abs=0.1)
     assert found.error == pytest.approx(error / norm, rel=0.03)
-    assert found.change < found.error  # the next mesh has an error, too
+    assert found.change < found.error  # the next mesh also has an error
 
 
 @pytest.mark.parametrize(
@@ -115,7 +116,7 @@ def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n)
 def test_energies_say_more_than_the_error_where_boundary_values_move(
     tmp_path, dim, least, most
 ):
-    """The string has points for a boundary; there, ‖u_h − u‖² ≤ 2(J_h − J)."""
+    """For dim 1, whose boundary consists of points, ‖u_h − u‖² ≤ 2(J_h − J) holds."""
     errors = [true_error(dim, n, tmp_path)[0] for n in (12, 24, 48)]
 
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(1, abs=0.1)
@@ -134,7 +135,9 @@ def test_energies_say_more_than_the_error_where_boundary_values_move(
     ],
 )  # fmt: skip
 def test_energies_of_mechanics_are_those_of_the_case(name):
-    """½ of the work of the pressure on the patch; what a dual form finds for others."""
+    """The energy of the reference point equals the energy of the solution
+    of each form.
+    """
     family = PROBLEMS[name]
     for form in family.forms:
         case = family.build(form, completed(family, {}), reference_solution)
@@ -204,7 +207,9 @@ def test_what_hardly_falls_is_not_extrapolated():
 
 
 def test_what_grows_is_not_said_to_fall():
-    """The second halving changes 2^1.45 = 2.73 times as much as the first."""
+    """The second halving changes the solution 2^1.45 = 2.73 times as much
+    as the first.
+    """
     found = estimate_error("box", levels(0.1, 0.1 * 2**1.45))
 
     assert (found.kind, found.error) == ("change", found.change)
@@ -296,7 +301,9 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
 
 
 def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
-    """The first one takes a twentieth of a second, the next eight times that."""
+    """The first mesh takes a twentieth of a second, the next one eight
+    times as long.
+    """
     obstacle = PROBLEMS["obstacle"]
 
     def build(*given):
@@ -313,7 +320,7 @@ def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
     )  # fmt: skip
 
     assert found.kind == "unknown"
-    assert "more time than was left" in found.note
+    assert "more than the remaining time" in found.note
     assert len(found.levels) <= 1
 
 
@@ -327,7 +334,7 @@ def test_less_time_takes_nothing_away_that_more_time_has_told(tmp_path):
 
 
 def test_what_was_told_of_other_parameters_or_meshes_does_not_stay(tmp_path):
-    """The default of a parameter that the name of the case omits has changed."""
+    """A stored estimate with another value of an omitted parameter is discarded."""
     name = "obstacle/dim=1/n=4/primal"
     meshes(tmp_path, name)
     data = json.loads((tmp_path / FILE).read_text())
@@ -381,7 +388,9 @@ def test_the_file_is_plain_data(tmp_path):
 
 
 def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path):
-    """The squared coarse error is the sum of the squares of change and fine error."""
+    """The squared coarse error is the sum of the squares of the change and the fine
+    error.
+    """
     name = (
         "contact-patch/lower={0}/upper={0}/ratio=0.1/friction=tresca/bound=1e5/primal"
     )
@@ -406,7 +415,9 @@ PUNCH = "bodies:suites/crossval/punch.toml"
 def test_the_error_of_a_mesh_from_gmsh_is_its_distance_to_a_far_finer_one(
     tmp_path, monkeypatch
 ):
-    """Four halvings stand for the limit: their own error is a tenth of the coarse."""
+    """Four halvings approximate the limit; their error is a tenth of the
+    coarse error.
+    """
     monkeypatch.chdir(ROOT)
     (found,) = meshes(tmp_path, f"{PUNCH}/dual")
     grids, points = [], []
@@ -451,7 +462,7 @@ def test_bodies_without_an_error_of_the_mesh_have_a_reason(
 
 @pytest.mark.parametrize(("sag", "is_arc"), [(0.0, False), (0.05, True)])
 def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is_arc):
-    """Two blocks; the middle of the upper one's lower side hangs down, or does not."""
+    """Two blocks; the lower side of the upper block is an arc or straight."""
     path = stacked_blocks(tmp_path, gap=2 * sag, sag=sag)
     (found,) = meshes(tmp_path, f"bodies:{path}/dual")
 
@@ -463,7 +474,7 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
 
 
 def test_hexahedra_are_interpolated_trilinearly_whatever_their_numbering():
-    """x + yz − xyz is trilinear on a box; nodes of the fine mesh are renumbered."""
+    """x + yz − xyz is trilinear on a box; the nodes of the fine mesh are renumbered."""
 
     def grid(divisions, order=slice(None)):
         mesh = box((0.0, 0.0, 0.0), (2.0, 1.0, 1.5), divisions)
@@ -487,7 +498,7 @@ def test_hexahedra_are_interpolated_trilinearly_whatever_their_numbering():
 
 
 def test_the_error_of_a_mesh_in_space_falls_with_its_cells(tmp_path):
-    """Singular at the clamped edges: more slowly than h."""
+    """Singularities at the clamped edges reduce the rate below that of h."""
     found = meshes(tmp_path, "cube-wall/n=1/dual-bounds", "cube-wall/n=2/dual-bounds")
     errors = [one.change for one in found]
 

@@ -1,4 +1,4 @@
-"""Discs over ranks: the operations of one process, and one owner each."""
+"""Distributed discs: same operations as in one process, and one owner of each disc."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,9 @@ def test_a_disc_on_two_ranks_is_refused():
 
 
 def test_no_split_of_a_disc_goes_unnoticed():
-    """Random owners of components: some rank refuses if and only if a disc is split."""
+    """For random owners of components, a rank refuses if and only if a disc
+    is split.
+    """
     rng, ranks = np.random.default_rng(0), single_process()
     seen = set()
     for _ in range(400):
@@ -45,7 +47,7 @@ def test_no_split_of_a_disc_goes_unnoticed():
 
 
 def test_operations_on_discs_of_ranks_are_those_of_one_process():
-    """Rank 2 has no discs, and still takes part in every sum."""
+    """Rank 2 has no discs but takes part in every sum."""
     rng, n = np.random.default_rng(1), 12
     whole = Discs([[0, 1], [2, 3], [6, 7]], [0.3, 2.0, 0.0])
     x, z = rng.standard_normal((2, n))

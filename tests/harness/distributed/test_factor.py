@@ -1,4 +1,4 @@
-"""Factors of differences that cancel, and rows of matrices that are dependent."""
+"""Distributed factors: cancelling differences, sums over ranks and dependent rows."""
 
 from contextlib import nullcontext
 from fractions import Fraction
@@ -23,7 +23,7 @@ from tests.support.threads import on_threads
 
 
 def rank(A):
-    """Gaussian elimination of integers in fractions."""
+    """Return the rank of an integer matrix from elimination in fractions."""
     rows, found = [[Fraction(int(v)) for v in row] for row in A], 0
     for column in range(A.shape[1]):
         pivot = next((r for r in rows if r[column]), None)
@@ -39,7 +39,7 @@ def rank(A):
 
 
 def parts(share, size=9):
-    """L₀, and M = (1 + share)L₀L₀ᵀ − L₀WWᵀL₀ᵀ for three orthonormal columns W."""
+    """Return L₀ and M = (1 + share)L₀L₀ᵀ − L₀WWᵀL₀ᵀ with orthonormal W (size, 3)."""
     rng = np.random.default_rng(3)
     L_0 = np.tril(rng.standard_normal((size, size))) + 2 * np.eye(size)
     W = np.linalg.qr(rng.standard_normal((size, 3)))[0]
@@ -49,7 +49,7 @@ def parts(share, size=9):
 
 @pytest.mark.parametrize("share", [0.5, 1e-3, 1e-8, 1e-14, 1e-18])
 def test_the_factor_of_a_difference_has_the_eigenvalues_that_are_known(share):
-    """1 + share of what is not taken away, `share` of what is, to the rounding of M."""
+    """The relative eigenvalues are `share` on the span of W, otherwise 1 + `share`."""
     L_0, M = parts(share)
     L = factor_above(np.asfortranarray(M), share, np.asfortranarray(L_0))
     L = np.tril(L)
@@ -64,7 +64,7 @@ def test_the_factor_of_a_difference_has_the_eigenvalues_that_are_known(share):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_eigenvalues_below_their_least_value_are_raised_to_it(seed):
-    """M with known λ relative to L₀L₀ᵀ, of which rounding has made some negative."""
+    """M has known eigenvalues λ relative to L₀L₀ᵀ, two of them negative by rounding."""
     rng, share = np.random.default_rng(seed), 1e-3
     L_0 = np.tril(rng.standard_normal((5, 5))) + 3 * np.eye(5)
     Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
@@ -84,7 +84,7 @@ def test_eigenvalues_below_their_least_value_are_raised_to_it(seed):
 
 @pytest.mark.parametrize("length", [0.1, 1.0, 10.0])
 def test_positive_pivots_below_their_least_value_are_raised_to_it(length):
-    """Diagonal matrices: λ of half the share is rounding, though Cholesky finds it."""
+    """A pivot of share/2 is positive, but below the lower bound."""
     share = 1e-3
     L_0 = length * np.eye(3)
     M = np.diag([1.0, share / 2, 2 * share]) * length**2
@@ -132,7 +132,7 @@ def test_without_rows_no_pivot_is_small():
 
 @pytest.mark.parametrize("size", [1, 2, 4, 5])
 def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(size):
-    """And a rank without independent rows is refused on all."""
+    """If one rank has only dependent rows, all ranks raise the error."""
     gathered, *others = on_threads(size, on_ranks.factors)
     assert others == [None] * (size - 1)
     for error, refused, shared in gathered:
@@ -142,7 +142,9 @@ def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(size):
 
 
 def laplacians(size, cells=4):
-    """Rows (k,) and A_p of each rank: a chain of springs held at its ends."""
+    """Return the rows (k,) and A_p of each rank, for a chain of springs
+    with fixed ends.
+    """
     nodes = np.arange(size * cells + 1)
     parts = []
     for p in range(size):
@@ -157,7 +159,7 @@ def laplacians(size, cells=4):
 
 @pytest.mark.parametrize("changing", [0, 1, 3])
 def test_the_factor_of_a_chain_of_springs_is_that_of_the_whole(changing):
-    """Parts between two shared nodes float: only their sum is definite."""
+    """The part between two shared nodes is singular; only the sum is definite."""
     size = 3
     n, parts = laplacians(size)
     whole = np.zeros((n, n))
@@ -196,13 +198,15 @@ def test_the_factor_of_a_chain_of_springs_is_that_of_the_whole(changing):
 
     least = on_threads(size, work)
     assert len(set(least)) == 1
-    # the determinant of the whole is the product of all pivots, squared
+    # the determinant of the whole matrix is the squared product of all pivots
     assert 0 < least[0] <= np.linalg.det(whole) ** (0.5 / n) + 1e-12
 
 
 @pytest.mark.parametrize("where", ["inner", "changing", "shared"])
 def test_dependent_rows_of_one_rank_are_refused_on_all(where):
-    """Wherever they are; ranks that went on alone would wait for ever."""
+    """All ranks raise the error, wherever the rows are; otherwise some would wait for
+    ever.
+    """
 
     def work(ranks):
         own = np.array([[0, 1, 2], [2, 3, 4]])[ranks.rank]
@@ -223,14 +227,16 @@ def test_dependent_rows_of_one_rank_are_refused_on_all(where):
     ("shared", "few"), [(0, True), (MAX_FILL, True), (MAX_FILL + 1, False)]
 )
 def test_few_rows_are_shared_where_their_dense_factor_is_the_lesser_work(shared, few):
-    """s² entries against MAX_FILL for each of s rows; no inner ones here."""
+    """Without inner rows, s² entries are compared with MAX_FILL·s."""
     at = on_threads(2, lambda ranks: touched_rows(np.arange(shared), ranks).few_shared)
     assert at == [few, few]
 
 
 @pytest.mark.parametrize(("inner", "few"), [(6, True), (5, False)])
 def test_inner_rows_of_all_ranks_make_shared_ones_few(inner, few, monkeypatch):
-    """With MAX_FILL = 8, s = 12:  s² = 144 ≤ 8 (12 + inner)  from six inner rows on."""
+    """For MAX_FILL = 8 and s = 12, s² = 144 ≤ 8 (12 + inner) requires six
+    inner rows.
+    """
     monkeypatch.setattr(factor, "MAX_FILL", 8)
 
     def work(ranks):
@@ -255,7 +261,9 @@ def test_rows_know_how_many_ranks_touch_them():
 
 
 def test_the_least_pivot_is_one_of_the_sum_and_not_of_a_part():
-    """A diagonal: inner entries 100, a shared one of 4 on each of three ranks."""
+    """Diagonal A: inner entries are 100, and each of three ranks adds 4 to a shared
+    entry.
+    """
 
     def work(ranks):
         at = touched_rows(np.array([0, 1 + ranks.rank]), ranks)
@@ -266,7 +274,7 @@ def test_the_least_pivot_is_one_of_the_sum_and_not_of_a_part():
 
 
 def test_a_rank_without_rows_takes_part_in_a_solve():
-    """Rank 0 holds A = diag(4, 9); rank 1 holds no rows."""
+    """Rank 0 has A = diag(4, 9); rank 1 has no rows."""
 
     def work(ranks):
         k = 0 if ranks.rank else 2

@@ -53,7 +53,7 @@ def test_other_formats_and_vectors_are_refused():
 
 @pytest.fixture
 def M():
-    """Seven rows, of which two are empty, on five columns, of which one is empty."""
+    """Return a matrix (7, 5) with two empty rows and one empty column."""
     dense = random_array((7, 5), density=0.6, rng=np.random.default_rng(SEED)).toarray()
     dense[[2, 6]], dense[:, 3] = 0, 0
     return dense
@@ -81,7 +81,8 @@ def test_rows_are_transposed_chosen_and_normalised(M):
 
 def test_outer_products_of_chosen_rows_are_summed(M):
     rows, weights = CompressedRows(csr_array(M)), np.array([1.0, 0, 1, 0, 0, 2, 1])
-    place = np.array([2, 0, 1, -1, 3], dtype=np.int32)  # the empty column has none
+    # the empty column has no new number
+    place = np.array([2, 0, 1, -1, 3], dtype=np.int32)
     found = rows.outer_products(weights, place, 4)
     order = np.array([1, 2, 0, 4])
 
@@ -99,7 +100,8 @@ def test_maps_are_composed_and_summed(M, columns):
     product = Composition(rows[0], rows[1])
     assert product.shape == (4, 5)
     assert product(x) == pytest.approx(A @ M @ x)
-    assert product(x) == pytest.approx(A @ M @ x)  # with the workspace of the first
+    # reuses the workspace of the first call
+    assert product(x) == pytest.approx(A @ M @ x)
     assert Composition(rows[2])(x[:3]) == pytest.approx(B @ x[:3])
     both = DirectSum(Identity(2), rows[1], rows[2])
     assert both.shape == (12, 10)
@@ -118,7 +120,7 @@ def grid(cells):
 
 @pytest.fixture(params=["array", "library"])
 def way(request, monkeypatch):
-    """Factorise small matrices in an array, or as large ones."""
+    """Factorise small matrices by compiled code, or by the library like large ones."""
     if request.param == "library":
         monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
 
@@ -143,7 +145,7 @@ def test_a_factor_with_a_border_solves(last):
     u = L.reduced(t)
     u[inner.size :] = np.linalg.solve(schur, u[inner.size :])
     assert L.extended(u) == pytest.approx(inverse @ t)
-    # the pivots lie between the ends of the spectrum
+    # the squared pivots are between the extreme eigenvalues
     least, largest = np.linalg.eigvalsh(dense)[[0, -1]]
     assert least <= L.least_pivot**2 <= largest
 
@@ -151,11 +153,13 @@ def test_a_factor_with_a_border_solves(last):
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("shift", [0.5, 1e-3, 1e-14])
 def test_changes_of_the_border_are_changes_of_the_matrix(shift):
-    """All of A on two rows of the border is removed: the shift is left there."""
+    """All of A on the two rows of the border is subtracted, so only the
+    shift remains.
+    """
     rng = np.random.default_rng(SEED)
     free, held = rng.standard_normal((6, 12)), np.zeros((6, 4))
     held[[1, 4]] = rng.standard_normal((2, 4))
-    free[4] = 0  # a row that held components alone have
+    free[4] = 0  # a row with entries only in `held`
     G, border = np.hstack([free, held]), np.array([4, 1])
     L = bordered_factor(csc_array(G @ G.T), border)
     columns = CompressedRows(csr_array(held.T))
@@ -190,7 +194,7 @@ def test_dependent_rows_have_no_factor(last):
 
 
 def test_a_row_with_many_entries_is_eliminated_late():
-    """The hub of a star is first: eliminated first, it would couple all others."""
+    """Early elimination of the hub of a star would couple all other rows."""
     A = csc_array(5 * eye_array(40)).tolil()
     A[0, 1:], A[1:, 0] = 0.1, 0.1
     L = BorderedFactor.of_array(A.toarray(), np.array([20]))

@@ -1,4 +1,4 @@
-"""Vectors over ranks that are threads, against the whole ones."""
+"""Distributed vectors on ranks that are threads, compared with whole vectors."""
 
 from types import SimpleNamespace
 
@@ -31,7 +31,7 @@ def test_reductions_are_those_of_the_whole_and_slices_alone_are_refused(size):
 
 @pytest.mark.parametrize("count", [1, 64, 65, 300])
 def test_a_total_is_the_sum_in_the_order_of_the_ranks(count):
-    """Few numbers in one gathering, many in one reduction: each is counted once."""
+    """Few numbers are gathered, many are reduced; each operation is counted once."""
 
     def work(ranks):
         part = np.arange(count) + 0.1 * 10.0**ranks.rank
@@ -43,7 +43,9 @@ def test_a_total_is_the_sum_in_the_order_of_the_ranks(count):
 
 
 def test_few_numbers_are_gathered_so_that_all_ranks_round_alike(monkeypatch):
-    """MPI may add in any order; the sum of what was gathered has one order."""
+    """MPI may sum in any order, whereas gathered numbers are summed in a
+    fixed order.
+    """
     assert vectors.MAX_ORDERED_SUM >= 1
     reduced = []
     ranks = Ranks(
@@ -60,7 +62,7 @@ def test_few_numbers_are_gathered_so_that_all_ranks_round_alike(monkeypatch):
 
 
 def test_neighbours_exchange_consecutive_parts_and_count_what_they_send():
-    """Rank p sends p + r numbers 100 p + 10 r + i to each other rank r."""
+    """Rank p sends p + r numbers, 100 p + 10 r + i, to every other rank r."""
 
     def work(ranks):
         p = ranks.rank
@@ -90,14 +92,14 @@ def test_ranks_without_neighbours_send_nothing_and_wait_for_nothing():
 
 @pytest.fixture
 def ticking(monkeypatch):
-    """A clock that a test sets."""
+    """Replace the clock by a clock that the test sets."""
     clock = SimpleNamespace(now=0.0)
     monkeypatch.setattr(vectors, "perf_counter", lambda: clock.now)
     return clock
 
 
 def test_parts_of_the_time_do_not_overlap(ticking):
-    """2 s and 1 s of products around 4 s of waiting."""
+    """A block of products takes 2 s before and 1 s after a nested wait of 4 s."""
     ranks = Ranks(SimpleNamespace(size=1, rank=0))
     assert set(ranks.seconds) == set(PARTS)
     assert set(ranks.seconds.values()) == {0.0}
@@ -180,7 +182,7 @@ def test_columns_over_ranks_multiply_as_the_whole_matrix():
 
 
 def test_components_are_functions_of_slices_and_keep_their_ranks():
-    """Also into a given array."""
+    """The result may also be written to an existing array."""
     x = np.arange(6.0)
 
     def work(ranks):

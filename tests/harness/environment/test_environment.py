@@ -1,4 +1,4 @@
-"""The environment contains what times depend on, and nothing about the user."""
+"""Environments contain values that affect times, but no data about the user."""
 
 import copy
 import json
@@ -126,7 +126,7 @@ def test_plugins_are_named_by_their_content(tmp_path):
     namesake.write_text("y = 3")
 
     assert plain["plugins"] == {"a.py": sha256(b"x = 1").hexdigest()[:12]}
-    assert both["plugins"] == plain["plugins"]  # nothing in it
+    assert both["plugins"] == plain["plugins"]  # it adds no plug-in
     assert changed_one["plugins"] != plain["plugins"]
     assert capture([file, namesake])["plugins"] != changed_one["plugins"]
     assert digest(changed_one) != digest(plain)
@@ -323,8 +323,8 @@ def test_a_perfect_clock_shows_no_noise_between_equal_arms():
 def test_a_steady_drift_hits_both_arms_alike():
     readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
     noise = noise_floor(30_000.0, clock=lambda: next(readings))
-    assert noise.one_pair > 0.003  # error of pairs that are all in one order
-    assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of that
+    assert noise.one_pair > 0.003  # error if all pairs had the same order
+    assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of this error
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 0.5])

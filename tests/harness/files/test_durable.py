@@ -1,7 +1,7 @@
-"""Files on disks that fill up, of writers that are cut off, in hands of others.
+"""Files on full disks, of killed writers, and changed by other programs.
 
-A full disk is that of `full`: no process can write beyond some byte of a file. The
-kernel answers as at the end of a disk: by a short write, then by an error.
+The fixture `full` imitates a full disk by a file size limit. As at the end of a disk,
+the kernel first writes fewer bytes than requested, then raises an error.
 """
 
 import errno
@@ -44,7 +44,7 @@ from tests.support import TOY_PROBLEM
 
 @contextmanager
 def full(size=0):
-    """No file can grow beyond `size` bytes."""
+    """Limit the size of all files to `size` bytes within the block."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -55,7 +55,7 @@ def full(size=0):
 
 @pytest.fixture
 def lines(tmp_path):
-    """Open the same file of lines; what it tells is in ``lines.told``."""
+    """Return a function that opens a file of lines; ``lines.told`` has its messages."""
 
     def lines():
         return Lines(tmp_path / "folder" / "lines", lines.told.append)
@@ -119,7 +119,7 @@ def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
     with lines() as file:
         file.append("a" * 50)
         with full(80), pytest.raises(OSError, match="File too large"):
-            file.append("b" * 50)  # 29 bytes of it fit
+            file.append("b" * 50)  # only 29 bytes fit
         assert lines.path.read_text() == "a" * 50 + "\n"
         file.append("c" * 50)
 
@@ -208,7 +208,7 @@ def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
 
 
 def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
-    said = "free some space, and the same command continues"
+    said = "free some space; the same command continues the run"
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         with pytest.raises(InputError) as e, report_full_disk(tmp_path / "none"):
             raise OSError(code, os.strerror(code))
@@ -274,7 +274,7 @@ def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_pa
 
 def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
     FolderLock(tmp_path).close()
-    (tmp_path / "suite.toml").write_text("")  # and no environment.json yet
+    (tmp_path / "suite.toml").write_text("")  # environment.json is missing
     refuse_foreign(tmp_path)
 
     (tmp_path / ".lock").write_text("somebody else's")
@@ -321,7 +321,7 @@ forms = ["dual"]
 
 
 def first_page(folder, _formats, *, factor=10.0, pool_forms=False):
-    """Write what the summary of a report says."""
+    """Write the sentences of the summary of a report."""
     (folder / "said").write_text(
         "\n".join(summary(Analysis(read_evidence(folder))).prose)
     )
@@ -330,7 +330,9 @@ def first_page(folder, _formats, *, factor=10.0, pool_forms=False):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line on the toy problem in an empty folder: code, out, err."""
+    """Run a command line on the toy problem in an empty folder; return
+    code, out, err.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "toy.toml").write_text(SUITE)
     plugin = load_plugin(TOY_PROBLEM)
@@ -396,7 +398,9 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
 def test_an_export_that_is_asked_to_end_while_it_writes_leaves_no_part(
     monkeypatch, tmp_path, suffix, before
 ):
-    """All bytes are written by then, under another name than that of the file."""
+    """The signal arrives when all bytes are written, but the file is not
+    yet renamed.
+    """
     path, sync, part = tmp_path / f"qp{suffix}", durable._sync, []
     if before is not None:
         path.write_bytes(before)

@@ -1,4 +1,4 @@
-"""Data files that somebody wrote to do harm: refused in one line, at little cost."""
+"""Malicious data files are refused with one line, with little time and memory."""
 
 import gzip
 import io
@@ -31,18 +31,18 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.damaged_files import MSH_41, QPS, fuzz, msh_22, tiny_qp
 
-ADDRESS_SPACE = 2**29  #: bytes that refusing may take at most
+ADDRESS_SPACE = 2**29  #: largest number of bytes that a refusal may need
 
 
 def build(path):
-    """Read a file as cases do."""
+    """Build the case of a file, as commands do."""
     family = PROBLEMS["file"]
     return family.build("qp", family.complete({"path": str(path)}), None)
 
 
 @pytest.fixture
 def cheaply():
-    """Limit the memory that this process may add to `ADDRESS_SPACE`."""
+    """Limit the address space that this process may add to `ADDRESS_SPACE`."""
     _, hard = before = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
@@ -66,11 +66,11 @@ def command(capsys):
     return run
 
 
-# code from data
+# data that would execute code
 
 
 def hostile(path, maker):
-    """Write a QP whose P says to be an operator that `maker` puts together."""
+    """Write a QP whose P is an operator with the maker `maker`."""
     arrays = ["/bin/touch", str(path.parent / "SENTINEL")]
     operators = {maker: lambda arrays: lambda x: x}
     P = SerialisableOperator(
@@ -111,7 +111,7 @@ def test_even_a_file_of_our_own_names_nothing_but_what_is_in_the_table(tmp_path,
 
 
 def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
-    """A request without a digest: the file may be anybody's."""
+    """A request without a digest may refer to a file of any origin."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
         "import os, sys; from mortarbench.harness.processes.worker import _SolverHost; "
@@ -127,7 +127,7 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     assert "P as an operator" in done.stderr.splitlines()[-1]
 
 
-# what is no regular file
+# files that are not regular
 
 
 @pytest.mark.parametrize(
@@ -159,11 +159,11 @@ def test_odd_names_are_refused_as_input(name):
         build(name)
 
 
-# more than it holds
+# files that declare more data than they contain
 
 
 def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
-    """Write an npz whose q has that many MiB of zeros."""
+    """Write an npz file whose vector q has the given MiB of zeros."""
     header = io.BytesIO()
     shape = {"descr": "<f8", "fortran_order": False, "shape": (mib * 2**17,)}
     np.lib.format.write_array_header_1_0(header, shape)
@@ -177,14 +177,14 @@ def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
 
 
 def mat_element(declared, content):
-    """Write the one variable of a version 5 file, compressed."""
+    """Write a version 5 file with one compressed variable."""
     text = b"MATLAB 5.0".ljust(124) + struct.pack("<H", 0x100) + b"IM"
     body = zlib.compress(struct.pack("<II", 14, declared) + content, 1)
     return text + struct.pack("<II", 15, len(body)) + body
 
 
 def parquet_of_one_value(path, count):
-    """Write lists of one number, again and again: bytes in the file."""
+    """Write a Parquet file of long lists of one value, which occupy few bytes."""
     table = pa.table({
         name: pa.array([np.zeros(count)], pa.list_(pa.float64()))
         for name in ("P", "q", "G", "h", "A", "b", "lb", "ub")
@@ -193,7 +193,7 @@ def parquet_of_one_value(path, count):
 
 
 def declared(name, values):
-    """Replace the part of a tiny QP's npz by other arrays; `None` leaves it out."""
+    """Return a writer of a tiny QP with replaced arrays; None omits an array."""
 
     def write(path):
         save_qp(path, tiny_qp(), {})
@@ -207,7 +207,7 @@ def declared(name, values):
 
 
 def header_only(text):
-    """Write an npz whose q has a header of that text, and eight bytes."""
+    """Write an npz file in which q has the given header and eight bytes of data."""
     head = text.encode().ljust(117) + b"\n"
     member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(8)
 
@@ -281,7 +281,7 @@ def test_an_archive_that_expands_is_refused_before_it_is_read(
 def test_a_gzip_file_that_expands_is_refused_while_it_is_counted(
     tmp_path, monkeypatch, cheaply, name
 ):
-    """A gigabyte of nothing, in several members, as one may write them one by one."""
+    """The file expands to a gigabyte of zeros in several gzip members."""
     member = gzip.compress(bytes(2**24))
     (tmp_path / name).write_bytes(member * 64)
     assert (tmp_path / name).stat().st_size < 2**21
@@ -339,7 +339,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("P is not symmetric", {"P_data": np.ones(7),
             "P_indices": np.array([0, 1, 2, 3, 4, 5, 0]),
             "P_indptr": np.array([0, 1, 2, 3, 4, 5, 7])}),
-        declared("P_data holds NaN or inf", {"P_data": np.full(3, np.nan)}),
+        declared("P_data contains NaN or inf", {"P_data": np.full(3, np.nan)}),
         declared("A is not a matrix", {"A_indices": np.array([N])}),
         declared("A is not a matrix", {"A_indices": np.array([-1])}),
         declared("A is not a matrix", {"A_shape": np.array([-1, 6])}),
@@ -348,11 +348,11 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("A is not a matrix", {"A_indptr": np.zeros((7, 2), dtype=int)}),
         declared("indptr decreases", {
             "A_indptr": np.array([0, 1, -2**31, -1, 1, 1, 1], dtype=np.int32)}),
-        declared("must hold integers", {"A_indices": np.array([0.5])}),
+        declared("must contain integers", {"A_indices": np.array([0.5])}),
         declared("q is of type", {"q": np.array(["1"] * 6)}),
         declared("q is of type", {"q": np.ones(6, dtype=complex)}),
-        declared("QP.q holds NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
-        declared("bounds hold NaN", {"lb": np.full(6, np.nan)}),
+        declared("QP.q contains NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
+        declared("bounds contain NaN", {"lb": np.full(6, np.nan)}),
         declared("QP.h has shape", {"h": np.ones((2, 1))}),
         declared("meta is not a string", {"meta": np.array([1, 2])}),
         declared("meta is not a JSON object", {"meta": text([])}),
@@ -386,7 +386,7 @@ TWO = {
 @pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
 @pytest.mark.parametrize("dense", [True, False])
 def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, dense):
-    """The example of the message: P[0, 1] and P[1, 0] differ by a half."""
+    """P[0, 1] and P[1, 0] differ by a half, as in the expected message."""
     path = tmp_path / f"a.{suffix}"
     P = UNSYMMETRIC if dense else csc_array(UNSYMMETRIC)
     qp = QP(**{k: no_rows(2) if k in "GA" else v for k, v in TWO.items()}, P=P)
@@ -407,7 +407,7 @@ def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, 
 
 
 def test_entries_in_any_order_are_added_up(tmp_path):
-    """2 = 1.5 + 0.5 on the diagonal, the last row first."""
+    """The diagonal entry is 2 = 1.5 + 0.5, and the last row comes first."""
     parts = {
         "P_data": np.array([1.0, 0.5, 1.5, 2.0]), "P_indices": np.array([1, 0, 0, 1]),
         "P_indptr": np.array([0, 3, 4]), "P_shape": np.array([2, 2]),
@@ -489,7 +489,7 @@ def test_the_limit_can_be_raised_and_is_checked(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=f"set {VARIABLE} to allow more"):
         build(tmp_path / "a.npz")
     monkeypatch.setenv(VARIABLE, "4")
-    with pytest.raises(InputError, match="missing"):  # all the other arrays
+    with pytest.raises(InputError, match="missing"):  # all other arrays are missing
         build(tmp_path / "a.npz")
     for odd in ("0", "-1", "many", "1e400"):
         monkeypatch.setenv(VARIABLE, odd)
@@ -585,7 +585,7 @@ def test_the_mesh_that_these_are_made_of_is_read(tmp_path):
     assert len(read_msh(tmp_path / "a.msh").cells) == 2
 
 
-# damaged at random
+# random damage
 
 KINDS = ("npz", "mat", "qps", "msh", "inp", "med", "parquet")
 
@@ -600,4 +600,4 @@ def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
 def test_of_a_thousand_damaged_files_none_raises_or_hangs(tmp_path, kind):
     survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
 
-    assert 0 < survived < 500  # or the damage is none, or all there is
+    assert 0 < survived < 500  # some files survive the damage, others do not

@@ -1,4 +1,4 @@
-"""Arrays that are mapped, operators that travel as arrays."""
+"""Mapped arrays, and operators that are stored as arrays."""
 
 import numpy as np
 import pytest
@@ -79,16 +79,16 @@ def operator_of(d):
 
 @pytest.fixture
 def operator_qp():
-    """A QP whose P is the operator diag(1, 2); BUILT counts how often it was made."""
+    """Return a QP with the operator diag(1, 2); BUILT records each build."""
     BUILT.clear()
     return operator_of(np.array([1.0, 2.0]))
 
 
 def test_an_operator_travels_as_arrays_and_is_the_same_operator(operator_qp, tmp_path):
     save_qp(tmp_path / "qp.npz", operator_qp, {}, serialised=True)
-    assert BUILT == []  # nothing is multiplied out to write it
+    assert BUILT == []  # the operator is not assembled for writing
     qp, _ = load_qp(tmp_path / "qp.npz", operators=MAKERS)
-    assert BUILT == []  # nor to read it
+    assert BUILT == []  # the operator is not built for reading
 
     np.testing.assert_array_equal(qp.P @ np.eye(2), np.diag([1.0, 2.0]))
     assert not qp.is_explicit

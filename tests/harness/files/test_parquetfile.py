@@ -1,4 +1,4 @@
-"""A QP in Parquet is the one that qpbenchmark's test sets load."""
+"""QPs in Parquet files have the format of qpbenchmark's test sets."""
 
 import subprocess
 import sys
@@ -28,10 +28,10 @@ def make_qp(P=P, **changes):
 
 
 def problem_of(row):
-    """Build a problem as the documentation of qpbenchmark's ParquetTestSet says.
+    """Build a problem like qpbenchmark's ParquetTestSet, following its documentation.
 
-    Every entry is an array, a string or None; P, G and A are reshaped to as many
-    columns as q has components.
+    Every entry is an array, a string or None. P, G and A are reshaped such that their
+    number of columns is the size of q.
     """
     n = row["q"].size
     arrays = {key: row[key] for key in COLUMNS if isinstance(row[key], np.ndarray)}
@@ -78,7 +78,9 @@ def test_matrices_come_back_sparse_or_dense_as_they_were(path):
 
 
 def test_a_problem_that_somebody_else_wrote_is_dense(path):
-    """A file of pandas has flattened matrices, None for absent ones and no metadata."""
+    """A file of pandas has flattened matrices, None for absent data, and no
+    metadata.
+    """
     row = {"P": P.ravel(), "q": np.ones(3), "G": None, "h": None, "name": "theirs"}
     row |= {"A": np.ones(3), "b": np.array([2.0]), "lb": None, "ub": np.ones(3)}
     pd.DataFrame({k: [v] for k, v in row.items()}).to_parquet(path, index=False)
@@ -114,7 +116,7 @@ def columns(**changes):
     [
         ({"P": [1.0, 2.0], "q": [1.0, 1.0]}, r"QP.P has shape \(1, 2\), expected \(2,"),
         ({"P": [1.0] * 3, "q": [1.0, 1.0]}, "P has 3 entries; expected rows of 2"),
-        ({"P": [np.nan]}, "P holds NaN or inf"),
+        ({"P": [np.nan]}, "P contains NaN or inf"),
         ({"P": ["one"]}, "P is not a list of numbers"),
         ({"q": None}, "P or q is null"),
         ({"b": [3.0]}, r"QP.A has shape \(0, 1\), expected \(1, 1\)"),
@@ -135,7 +137,7 @@ def test_what_is_no_problem_is_refused_in_one_line(path, changes, message):
 def test_a_set_of_several_problems_is_no_problem(path, rows):
     one = pa.table(columns())
     pq.write_table(pa.concat_tables([one] * rows) if rows else one.slice(0, 0), path)
-    with pytest.raises(InputError, match=f"holds {rows} problems; expected one row"):
+    with pytest.raises(InputError, match=f"contains {rows} problems; expected one row"):
         load_parquet(path)
 
 
@@ -150,7 +152,7 @@ def test_files_that_are_none_are_refused(path, tmp_path):
 
 
 def test_reading_starts_no_threads_that_could_outlive_python(path):
-    """Threads of arrow occasionally abort a process at its exit."""
+    """Threads of Arrow occasionally abort a process at its exit."""
     save_parquet(path, make_qp(), {})
     program = (
         "import os, pathlib, sys; import pyarrow.parquet; "

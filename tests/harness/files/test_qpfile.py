@@ -22,7 +22,7 @@ def make_qp(P, A=None):
 
 @pytest.fixture
 def saved(tmp_path):
-    """A good file, and a way to spoil one array of it."""
+    """Write a valid file; return it with a function that damages one of its arrays."""
     path = tmp_path / "qp.npz"
     save_qp(path, make_qp(csr_array(P)), {"name": "three"})
 
@@ -70,7 +70,7 @@ def test_the_file_is_what_the_interface_promises(saved):
 
         assert set(stored.files) == {"q", "h", "b", "lb", "ub", "meta"} | parts
         assert json.loads(str(stored["meta"]))["name"] == "three"
-        # by columns: (2, 1), (1, 3), and an empty one; both triangles
+        # columns (2, 1), (1, 3) and an empty one; both triangles
         assert stored["P_data"].tolist() == [2, 1, 1, 3]
         assert stored["P_indices"].tolist() == [0, 1, 0, 1]
         assert stored["P_indptr"].tolist() == [0, 2, 4, 4]
@@ -91,13 +91,13 @@ def test_a_file_name_is_taken_as_it_is(tmp_path):
         ({"meta": np.array("{")}, "Expecting property name"),
         ({"q": np.zeros(2)}, r"QP.P has shape \(3, 3\), expected \(2, 2\)"),
         ({"q": np.array(["a", "b", "c"])}, "q is of type <U1; expected numbers"),
-        ({"q": np.array([1.0, np.nan, 0.0])}, "QP.q holds NaN or inf"),
+        ({"q": np.array([1.0, np.nan, 0.0])}, "QP.q contains NaN or inf"),
         ({"lb": np.full(3, 2.0)}, "bounds cross"),
         ({"P_indices": np.array([0, 1, 0, 7])}, "P is not a matrix in CSC parts"),
-        ({"P_indices": np.array([0.0, 1, 0, 1])}, "must hold integers"),
+        ({"P_indices": np.array([0.0, 1, 0, 1])}, "must contain integers"),
         ({"P_indptr": np.array([0, 2])}, "P is not a matrix in CSC parts"),
         ({"P_shape": np.array([3])}, "P is not a matrix in CSC parts"),
-        ({"P_data": np.array([2.0, np.nan, 1, 3])}, "P_data holds NaN or inf"),
+        ({"P_data": np.array([2.0, np.nan, 1, 3])}, "P_data contains NaN or inf"),
     ],
 )
 def test_a_malformed_file_is_named_with_what_is_wrong(saved, changes, complaint):
@@ -126,11 +126,11 @@ def test_other_files_are_refused_and_never_unpickled(tmp_path):
         load_qp(tmp_path / "nowhere")
 
 
-# what somebody saves by numpy alone
+# files saved by NumPy
 
 
 def plain(**changes):
-    """Every kind of constraint, as arrays of numpy."""
+    """Return arrays with constraints of every type."""
     arrays = {
         "P": np.diag([2.0, 3.0]), "q": np.ones(2), "G": np.ones((1, 2)), "h": [4.0],
         "A": np.array([[1, -1]]), "b": [0], "lb": [-np.inf, 0], "ub": [1.0, np.inf],
@@ -170,14 +170,17 @@ def test_a_sparse_matrix_may_be_given_by_its_parts(tmp_path):
     [
         ({"P": None}, "P is missing"),
         ({"q": None}, "q is missing"),
-        ({"h": None}, "h is missing beside G"),
-        ({"A": None}, "A is missing beside b"),
+        ({"h": None}, "h is missing, but G is present"),
+        ({"A": None}, "A is missing, but b is present"),
         ({"Aeq": np.eye(2)}, "unknown array 'Aeq'; known: A, G, P, b, h, lb, q, ub"),
         ({"P": None, "P_data": np.ones(1)}, "P_indices, P_indptr, P_shape missing be"),
         ({"P": np.eye(3)}, "P has shape (3, 3); expected (2, 2)"),
         ({"P": np.ones(4)}, "P has shape (4,); expected two dimensions"),
         ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),
-        ({"G": np.array([[np.nan, 1.0]])}, "G holds NaN or inf; expected finite num"),
+        (
+            {"G": np.array([[np.nan, 1.0]])},
+            "G contains NaN or inf; expected finite num",
+        ),
         ({"h": np.array(["4"])}, "h is of type <U1; expected numbers"),
         ({"lb": [2.0, 0.0]}, "QP bounds cross"),
     ],

@@ -1,4 +1,4 @@
-"""Files hold discs and cones: the same QP is read again, and half a set is refused."""
+"""Discs and cones in files: round trips, and refusal of incomplete sets."""
 
 from dataclasses import replace
 
@@ -62,7 +62,7 @@ def test_sizes_count_the_blocks_of_every_kind():
 
 
 def test_digests_tell_sets_apart():
-    """Another radius, block, kind or order is another problem."""
+    """A different radius, block, class or order defines a different problem."""
     discs, cones = mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]), mb.Cones([[0, 5]], [0.5])
     one = qp_digest(qp_over(discs, cones))
     assert qp_digest(qp_over(cones, discs)) == one
@@ -106,8 +106,8 @@ def test_other_readers_of_parquet_find_the_sets_as_columns(tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("disc_radius", None, "disc_radius is missing beside disc_index"),
-        ("disc2_index", None, "disc2_index is missing beside disc2_radius"),
+        ("disc_radius", None, "disc_radius is missing, but disc_index is present"),
+        ("disc2_index", None, "disc2_index is missing, but disc2_radius is present"),
         ("disc4_index", [5], "disc4_index belongs to no set; expected disc_index"),
         ("disc1_index", [5], "disc1_index belongs to no set; expected disc_index"),
         ("disc_slope", [5], "disc_slope belongs to no set; expected disc_index"),
@@ -118,7 +118,7 @@ def test_other_readers_of_parquet_find_the_sets_as_columns(tmp_path):
         (
             "cone_index",
             [[0, 0.5]],
-            "Cones: index holds a number that is not an integer",
+            "Cones: index contains a number that is not an integer",
         ),
         ("cone_index", [[3, 7]], "variable 3 is in two sets"),
         ("cone_index", [["a", "b"]], "Cones: index = .*; expected an array of numbers"),

@@ -1,4 +1,4 @@
-"""Solvers that disturb a run by accident, and the verdicts of their neighbours."""
+"""Solvers that disturb a run by accident, and verdicts on other solvers of the run."""
 
 import fcntl
 import itertools
@@ -50,13 +50,13 @@ ACCIDENTS = load_plugin(PLUGIN)
 TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
-FOREIGN = "came, expected 'timed'"
+FOREIGN = "was received, expected 'timed'"
 SUSPECT = "results are cached between measurements"
 PARENTS_TIME = "the parent's time is recorded"
-#: expected verdict, and a pattern of the message
+#: expected verdict and pattern of the message, by solver
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
-    "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
+    "writesendlessly": (Verdict.FAILED, "4 MiB were received without an end of line"),
     "daemon": (Verdict.VERIFIED, "^$"),
     "executeddaemon": (Verdict.VERIFIED, "^$"),
     "forkbomb": (Verdict.VERIFIED, "^$"),
@@ -71,7 +71,7 @@ OUTCOMES = {
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
 }
-#: one of each kind; the others are slow tests
+#: one solver of each type; the others are slow tests
 QUICK = {
     "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
     "hoardsinadaemon", "closesall", "sharespages",
@@ -82,7 +82,7 @@ RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchesthe
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Mark the processes that this test starts, by a variable of their environment."""
+    """Mark the processes that this test starts with an environment variable."""
     name = secrets.token_hex(8)
     monkeypatch.setenv("WATCHED", name)
     return name
@@ -90,7 +90,7 @@ def watched(monkeypatch):
 
 @pytest.fixture(scope="module")
 def beside_a_witness(tmp_path_factory):
-    """Measure a solver beside a witness, a worker that looks for leftover processes."""
+    """Measure a solver together with a worker that searches for leftover processes."""
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
@@ -132,7 +132,7 @@ def processes_of(watched):
 
 
 class Bench:
-    """Measuring of solvers on a tiny QP, each by a worker of its own."""
+    """Measurements of solvers on a tiny QP, each in a separate worker."""
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}
@@ -406,7 +406,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     assert bench("honest").verdict is Verdict.VERIFIED
 
 
-#: reports on a measurement that ended early, and measures again
+#: program that reports a measurement that ended early, and measures again
 RUNS = f"""
 import sys
 from pathlib import Path

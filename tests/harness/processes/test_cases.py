@@ -15,7 +15,7 @@ def name(**params):
 
 @pytest.fixture
 def get(tmp_path):
-    """Return a function that looks up a case; its ``made`` lists those it built."""
+    """Return a function that looks up a case; its ``made`` lists the built cases."""
 
     def get(case, *, environment="here", content=b"content", slowly=0.0):
         def make(path):
@@ -47,7 +47,8 @@ def test_other_params_and_other_code_are_other_cases_of_maybe_equal_content(get)
 
 
 def test_one_of_many_concurrent_callers_builds(get):
-    with ThreadPoolExecutor(8) as pool:  # locks are between open files, not processes
+    # locks belong to open files, so threads suffice
+    with ThreadPoolExecutor(8) as pool:
         entries = list(pool.map(lambda _: get(name(n=1), slowly=0.1), range(8)))
 
     assert len({e.digest for e in entries}) == len(get.made) == 1

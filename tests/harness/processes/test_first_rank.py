@@ -1,4 +1,4 @@
-"""The first rank to end is named, whatever it prints and whatever the others do."""
+"""The message names the first rank that ended, whatever the ranks print."""
 
 import json
 import os
@@ -10,12 +10,14 @@ import pytest
 from tests.support import ROOT, SUPPORT
 from tests.support.dying_ranks import WAYS
 
-#: keeps CPUs busy until its standard input is closed
+#: program that keeps CPUs busy until its standard input is closed
 BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]: pass"
 
 
 def wrong_names(tmp_path, count, trials, seed):
-    """Return the trials that named another rank; the output of ranks is mixed in."""
+    """Return the trials in which another rank was named; the output of
+    ranks is mixed.
+    """
     command = [sys.executable, str(SUPPORT / "dying_ranks.py")]
     with (tmp_path / "out").open("w+b") as out:
         subprocess.run(

@@ -1,4 +1,4 @@
-"""Forked workers: isolated and killed like those that a command starts."""
+"""Forked workers are isolated and killed like workers started by a command."""
 
 import json
 import os
@@ -16,8 +16,9 @@ from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import soon
 
-#: asks forked workers, prints each result, and is then killed. It is a process of its
-#: own, since only a process with one thread forks safely
+#: program that sends requests to forked workers, prints each result, and is then
+#: killed. It runs in a separate process, since only a process with one thread forks
+#: safely
 PARENT = '''
 import atexit, json, os, signal, subprocess, sys, threading, time
 from contextlib import suppress
@@ -96,7 +97,7 @@ def beside_a_thread():
     finally:
         sleeps.set()
         thread.join()
-        for _ in range(2000):  # the kernel lists a joined thread a little longer
+        for _ in range(2000):  # the kernel lists a joined thread for a short time
             if is_safe():
                 break
             time.sleep(0.01)
@@ -143,7 +144,7 @@ def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
     assert len(opened) == 5
     assert all(target.startswith("pipe:") for target in opened[3:])
     assert first["cpus"] == [max(os.sched_getaffinity(0))]
-    assert first["leads"] == [True, True]  # sub-reaper and worker lead a session each
+    assert first["leads"] == [True, True]  # sub-reaper and worker are session leaders
     assert first["signals"] == ["SIG_DFL", "SIG_IGN"]  # as in a new interpreter
     assert ONE_THREAD.items() <= first["environ"].items()
     assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")

@@ -1,4 +1,4 @@
-"""Measurements in which one rank fails, stage by stage."""
+"""Measurements in which one rank fails, for each stage of a measurement."""
 
 import json
 import os
@@ -34,7 +34,7 @@ params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
 """
 MEASURING = ("emission", "prepare", "solve")
 EVALUATING = ("residuals", "certificate", "quantities")
-#: s; limit of each stage, long enough for the stages before the planted failure
+#: time limit of each stage in s, sufficient for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
 RAISED = "rank 1 of 2: ValueError: planted"
@@ -77,7 +77,7 @@ def processes_of(mark):
 
 
 def test_records_of_ranks_do_not_mix(monkeypatch):
-    """Each is one line, in one write of at most PIPE_BUF bytes, which is atomic."""
+    """Each record is one line, written atomically with at most PIPE_BUF bytes."""
     written = []
     monkeypatch.setattr(os, "write", lambda fd, data: written.append((fd, data)))
     monkeypatch.setenv(failures.RECORD, "7")
@@ -240,7 +240,7 @@ def is_rank(process):
 
 
 def names_stage(message, stage):
-    """Return True if the prefix of a message is that of the stage, or none."""
+    """Return True if a message has the prefix of the stage, or needs no prefix."""
     if stage == "emission":
         return message.startswith("emission: ")
     return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

@@ -1,4 +1,4 @@
-"""Solves on several MPI ranks: comparison with one process, and failing ranks."""
+"""Solves on several MPI ranks, compared with one process; failures of ranks."""
 
 import json
 import os
@@ -64,7 +64,7 @@ def test_operations_on_a_slice_alone_are_refused(rank_results):
 def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(rank_results):
     for error, refused, shared in rank_results["factors"]:
         assert error < 1e-12
-        assert refused  # on all ranks, though one alone has dependent rows
+        assert refused  # raised on all ranks, although only one has dependent rows
         assert shared == list(range(0, 24, 3))
 
 
@@ -93,7 +93,7 @@ def test_the_solution_on_ranks_is_that_of_one_process(rank_results, case):
 
 @pytest.fixture(scope="module")
 def answers():
-    """Solve twice on two ranks, and once on one."""
+    """Solve twice on two ranks and once on one rank."""
     case = mb.build(CASE)
     return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
 
@@ -110,11 +110,13 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
 
 
 def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
-    """On free components, some rows are smaller than the rounding of their sum."""
+    """On free components, some rows are smaller than the rounding errors of
+    their sum.
+    """
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
     assert answer.record.claimed in ("solved", "iteration_limit")
-    # No rank has the assembled K, so the bound holds for every rounding of it.
+    # No rank has the assembled K, so the bound holds for every rounding of K.
     assert answer.energy_bound <= 1e-3
 
 
@@ -217,7 +219,9 @@ def test_friction_on_metis_parts_has_the_same_displacement_on_ranks(tmp_path):
 
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
-    """Node-to-segment rows do not resist rolling, so equality rows are dependent."""
+    """Node-to-segment rows do not resist rolling, so the equality rows are
+    dependent.
+    """
     description = described(tmp_path)
     text = description.read_text().replace('"mortar"', '"nts"')
     held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
@@ -237,11 +241,11 @@ def test_records_contain_the_cost_of_each_rank(answers):
     assert set(seconds) == {"products", "exchange", "coarse", "waiting"}
     for mean, largest in [*seconds.values(), *counts.values()]:
         assert 0 < mean <= largest
-    # the parts do not overlap, so that no rank has spent more than all of it
+    # the categories do not overlap, so their sum is at most the total time of a rank
     assert sum(mean for mean, _ in seconds.values()) < first.record.solve_seconds
     products = first.record.counts["P_products"]
     applies = first.record.counts["preconditioner_applies"]
-    # to its one neighbour, and back; those of preparing are not counted
+    # messages to the only neighbour and back; messages of `prepare` are not counted
     assert 0 <= 2 * (products + applies) - counts["messages"][0] <= 2 * LANCZOS
     assert counts["bytes"][1] % 8 == 0
     read = Record.from_json(first.record.to_json())
@@ -332,13 +336,13 @@ def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path)
     assert found["smalbe copies=2"].verdict == "verified"
     alone, copies = found["smalbe"], found["smalbe copies=2"]
     assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
-    assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
+    assert copies.peak_mib > 1.5 * alone.peak_mib  # peak memory of both copies
 
 
 def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
     tmp_path, monkeypatch
 ):
-    """In suites and single solves; ranks use the original family."""
+    """Test suites and single solves; the ranks use the original family."""
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
         SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
@@ -401,8 +405,8 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-#: first of two load steps; one process emits it, so a rank that has its share is
-#: preparing or solving
+#: first of two load steps; a single process emits its QP, so a rank that has its share
+#: is preparing or solving
 LARGE = (
     SUITE.replace(
         "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"
@@ -467,7 +471,7 @@ def resident_mib(pid):
 
 
 def busy_rank(mark):
-    """Return [rank 1] once it has its share of the QP, [] before that."""
+    """Return [rank 1] when it has its share of the QP, and [] before."""
     return [
         pid
         for pid, command, environment in processes(mark)

@@ -77,7 +77,7 @@ def ignores_sigterm(process):
 
 @pytest.fixture
 def ask(tmp_path):
-    """Return a function that starts a worker and lets it solve the tiny QP."""
+    """Return a function that starts a worker and requests a solve of the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
     save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})
@@ -220,7 +220,7 @@ def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
         sys.executable,
         [sys.executable, "-P", "-c", ASKS, *map(json.dumps, arguments)],
     )
-    assert soon(lambda: len(descendants(parent)) == 2)  # the sub-reaper, the worker
+    assert soon(lambda: len(descendants(parent)) == 2)  # sub-reaper and worker
     worker = descendants(parent)[1]
     assert soon(lambda: ignores_sigterm(worker))
     os.kill(parent, signal.SIGKILL)
@@ -239,7 +239,7 @@ def test_every_process_is_killed_even_if_the_machine_stalls(monkeypatch):
             pass
         reaper.kill_descendants(shell.pid)
 
-        assert shell.wait(timeout=10) == 0  # it waits for both
+        assert shell.wait(timeout=10) == 0  # the shell waits for both processes
         assert not any(map(running, below))
     finally:
         for process in [shell.pid, *below]:

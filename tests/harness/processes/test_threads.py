@@ -21,7 +21,7 @@ from tests.support.waiting import soon
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
 CASE = "string/n=10/primal"
-#: solves in several threads, in a session of its own, and prints the results
+#: program that solves in several threads, in a separate session, and prints the results
 THREADS = """
 import gc, json, os, sys, tempfile
 from pathlib import Path
@@ -149,7 +149,7 @@ def test_closing_twice_does_not_close_another_file(worker, tmp_path):
 
 
 def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
-    """From the start of a worker to its end, including stops of other workers."""
+    """Test from the start of a worker to its end, including stops of other workers."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
     def refuse(*what):
@@ -167,7 +167,7 @@ def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
 
 
 def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
-    """Its number may have belonged to one of ours a moment before."""
+    """The process may have the reused ID of a process of a worker."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
@@ -183,7 +183,7 @@ def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
     first = worker.ask({}, **LIMITS).answer["pid"]
     os.kill(first, signal.SIGKILL)
     with suppress(ChildProcessError):
-        os.waitpid(worker._process.pid, 0)  # a handler of SIGCHLD would do that
+        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD would do
 
     second = worker.ask({}, **LIMITS)
     assert second.answer["pid"] != first
@@ -256,13 +256,13 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
          "--plugin", str(plugin)],
         env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
         stderr=subprocess.PIPE, text=True,
-        # a shell that runs the tests in the background makes them ignore Ctrl-C
+        # tests that run in the background of a shell ignore Ctrl-C
         preexec_fn=partial(signal.signal, number, signal.SIG_DFL),
     )  # fmt: skip
     assert soon((tmp_path / "started").exists)
     process = int((tmp_path / "started").read_text())
     solve.send_signal(number)
-    solve.send_signal(number)  # cleaning up is not interrupted
+    solve.send_signal(number)  # the second signal does not interrupt the cleanup
     said = solve.communicate()[1]
 
     assert solve.returncode == code
@@ -294,7 +294,7 @@ SOLVERS = {"hangs": Hangs()}
 
 
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
-    """Test with SIGHUP, which nohup ignores."""
+    """Test SIGHUP, which nohup ignores."""
     script = (
         "import os, signal; from mortarbench.harness.processes.termination import *\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
@@ -308,7 +308,7 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
 
 
 def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
-    """The signal arrives while its case is built."""
+    """The signal arrives while the case is built."""
     plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
     plugin.write_text(SLOW)
     out.mkdir()
@@ -346,8 +346,8 @@ PROBLEMS = {"slow": Slow()}
 """
 
 
-#: a worker that creates and fills a System V segment of 64 MiB, and writes its number,
-#: since other programs create segments at the same time
+#: worker that creates and fills a System V segment of 64 MiB, and writes the number of
+#: the segment, since other programs may create segments at the same time
 SEGMENT = SHOWS.replace(
     '    reply(event="start")\n',
     '    reply(event="start")\n'

@@ -1,4 +1,4 @@
-"""Times of dualising exclude first calls: the first dual case is built twice."""
+"""Times of dualising exclude effects of first calls, since a case is built twice."""
 
 import time
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from mortarbench.harness.processes.case_worker import CaseWorker
 
 @dataclass(frozen=True)
 class Slow(Family):
-    """Family whose first dual case takes longer, because of first calls."""
+    """Family whose first dual case takes longer because of first calls."""
 
     name: str = "slow"
     forms: tuple = ("primal", "dual")
@@ -77,5 +77,6 @@ def test_after_another_case_a_case_is_built_once_and_its_memory_is_reported(tmp_
     meta = worker.answer(request)["meta"]
 
     assert family.built == ["dual", "dual"]
-    assert meta["build_seconds"] >= 0.05  # of the case with n = 3, not of the first
+    # time of the case with n = 3, not of the first case
+    assert meta["build_seconds"] >= 0.05
     assert meta["build_peak_mib"] > 10

@@ -1,4 +1,4 @@
-"""Commands on result folders in which one file is replaced by something else."""
+"""Commands on result folders in which one file was replaced."""
 
 import os
 import shutil
@@ -19,7 +19,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support.bounded import bounded
 
-pytestmark = pytest.mark.together  # one result folder for all of them
+pytestmark = pytest.mark.together  # all tests use the same result folder
 
 SUITE = """
 name = "s"
@@ -37,7 +37,9 @@ SPARSE = 3 * 2**30  #: size of a sparse file, which occupies no disk space
 
 @pytest.fixture(scope="module")
 def folder_of_run(tmp_path_factory, svg_only):
-    """Create a folder with every kind of file, without one measurement of its suite."""
+    """Create a folder with files of every type, without one measurement of
+    its suite.
+    """
     folder = tmp_path_factory.mktemp("whole") / "run"
     suite = folder.with_name("s.toml")
     np.savez(folder.with_name("qp.npz"), P=np.eye(2), q=-np.ones(2), lb=np.zeros(2))
@@ -60,7 +62,7 @@ def folder_of_run(tmp_path_factory, svg_only):
 
 
 def kinds_of_files(folder):
-    """Return one path for each kind of file (folder and ending), and one report."""
+    """Return a path for each type of file (folder and ending), and one report."""
     paths = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
@@ -76,13 +78,15 @@ def sparse(path, _outside):
 
 
 def with_zeros(path, _outside):
-    """Append zeros to a file, whose first lines stay valid."""
+    """Append zeros to a file; its first lines stay valid."""
     with path.open("r+b") as file:
         file.truncate(SPARSE)
 
 
 def below_the_limit(path, _outside):
-    """Write a file below the limit of data files, but above that of a line."""
+    """Write a file below the limit of data files with a line above the
+    limit of lines.
+    """
     with path.open("r+b") as file:
         file.truncate(2**31 - 2**20)
 
@@ -131,7 +135,7 @@ KINDS = (
 
 @pytest.fixture
 def read_by_every_command(folder_of_run, tmp_path, capsys, monkeypatch, only_svg):
-    """Run every command that reads a folder, with resource limits; none may raise."""
+    """Run each command that reads a folder, with resource limits; none may raise."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     suite = tmp_path / "s.toml"
@@ -220,7 +224,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
 
 @pytest.fixture
 def folder_copy(folder_of_run, tmp_path):
-    """Copy a folder, and remove it by rm, because pytest's removal is recursive."""
+    """Copy a folder, and remove the copy by rm, since pytest's removal is recursive."""
     folder = tmp_path / "run"
     shutil.copytree(folder_of_run, folder)
     yield folder

@@ -1,4 +1,4 @@
-"""Files of QPs are copied into the result folder, which suffices to continue a run."""
+"""Files of QPs are copied to the result folder, from which a run can be continued."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from mortarbench.harness.plugin import SourceFile
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 
-pytestmark = pytest.mark.together  # one run for all of them
+pytestmark = pytest.mark.together  # all tests use the same run
 
 SUITE = """
 name = "s"
@@ -30,7 +30,9 @@ params = {{ path = {} }}
 
 
 def write_qp(path, bound):
-    """Write  min ½xᵀx − 3·1ᵀx, x ≤ bound < 3;  both components of x are the bound."""
+    """Write min ½xᵀx − 3·1ᵀx, x ≤ bound < 3; at the solution, both xᵢ equal
+    the bound.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, P=np.eye(2), q=-3 * np.ones(2), ub=np.full(2, bound))
 
@@ -189,7 +191,7 @@ def test_a_file_that_is_nowhere_is_named_with_its_digest(here, copy, cli):
         assert code == 2
         assert (
             f"qp.npz (sha256 {right}) is not available and has no copy in "
-            "run/files: put it at qps/qp.npz"
+            "run/files; put it at qps/qp.npz"
         ) in last
 
 
@@ -199,7 +201,7 @@ def test_a_file_that_is_put_back_is_taken(measured, here, copy):
 
     mb.run("run/suite.toml", out="run", repeats=2)
 
-    assert copy.exists()  # and is copied again
+    assert copy.exists()  # the file is copied again
 
 
 def test_a_damaged_copy_is_replaced_where_the_original_is_here(measured, here, copy):
@@ -227,13 +229,14 @@ def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch
 
     assert [p.name for p in (tmp_path / "run" / "files").iterdir()] == ["copies.json"]
     assert said == [
-        "large.npz (70 MiB) is larger than 64 MiB, and does not travel with the results"
+        "large.npz (70 MiB) is larger than 64 MiB, "
+        "and is not copied to the result folder"
     ]
     with pytest.raises(InputError) as refused:
         Copies(tmp_path / "run").locate(source)
     assert str(refused.value) == (
         f"large.npz (sha256 {source.sha256}) is not available and was too large to "
-        "travel with the results (70 MiB): put it at large.npz"
+        "be copied with the results (70 MiB); put it at large.npz"
     )
 
 
@@ -247,13 +250,13 @@ def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
         sources.append(SourceFile(path=f"{i}.mat", sha256=digest(path), suffix=".mat"))
     said = []
 
-    for _ in range(2):  # a second run copies nothing again
+    for _ in range(2):  # the second run copies no file
         keep_copies(tmp_path / "run", sources, said.append)
 
     kept = {p.name for p in (tmp_path / "run" / "files").glob("*.mat")}
     assert kept == {f"{s.sha256}.mat" for s in sources[:2]}
     assert len(said) == 2
-    assert said[0].startswith("2.mat (1 MiB) does not travel with the results")
+    assert said[0].startswith("2.mat (1 MiB) is not copied to the result folder")
 
 
 def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
@@ -270,7 +273,7 @@ def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
     )  # fmt: skip
     shutil.rmtree(tmp_path / "other")
 
-    for _ in range(2):  # a merge that is done again changes nothing
+    for _ in range(2):  # the second merge changes nothing
         mb.merge("one", "two", out="both")
 
     (kept,) = (tmp_path / "both" / "files").glob("*.npz")

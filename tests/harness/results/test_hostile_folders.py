@@ -42,7 +42,7 @@ def record(path, **changes):
 
 @pytest.fixture
 def sent(tmp_path):
-    """Write a result folder of some records."""
+    """Write a result folder with given records."""
 
     def write(*records):
         folder = tmp_path / "sent"
@@ -74,7 +74,9 @@ def command(capsys, monkeypatch, tmp_path):
 
 
 def everything(folder):
-    """Return names and content of all files in a folder, without following links."""
+    """Return the names and contents of all files in a folder, without
+    following links.
+    """
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
@@ -85,7 +87,7 @@ def one_line(err):
     return len([line for line in err.splitlines() if line.startswith("mortar")]) == 1
 
 
-# code
+# execution of code
 
 
 def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path):
@@ -112,7 +114,7 @@ def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path
     assert not (tmp_path / "SENTINEL").exists()
 
 
-# paths
+# paths that lead out of the folder
 
 
 @pytest.mark.parametrize(
@@ -162,7 +164,7 @@ def test_commands_on_records_whose_digests_lead_out_read_nothing_there(
         assert one_line(err)
 
 
-# links, pipes
+# links and pipes
 
 
 LINKS = (

@@ -140,7 +140,7 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
 
 
 def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
-    """Its residuals have other scales; they are kept, and so is the verdict."""
+    """Its residuals have other scales; residuals and verdict are kept."""
     row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
     for name in ("decided_by", "optimum_error"):
         del row[name]
@@ -157,7 +157,7 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
 
 
 def test_a_measurement_has_the_name_that_older_folders_give_it():
-    """Otherwise a continued run would repeat all measurements."""
+    """With another run_id, a continued run would repeat all measurements."""
     box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(
         assemble(as_family(box), {"n": 3}, "dual"),
@@ -169,7 +169,7 @@ def test_a_measurement_has_the_name_that_older_folders_give_it():
 
 
 def test_old_lines_are_written_as_they_were_read():
-    """Names, order and values of the fields are equal to the byte."""
+    """Names, order and values of the fields are identical."""
     (old,) = (Path(__file__).parents[2] / "data/results-2026-11/journal").iterdir()
     lines = old.read_text().splitlines()
 
@@ -210,9 +210,7 @@ def test_a_record_that_the_disk_takes_in_part_only_is_not_in_the_journal(tmp_pat
     file = tmp_path / "journal" / "here.jsonl"
     with Journal(tmp_path, "here") as journal:
         journal.append(record("a"))
-        limit = (
-            file.stat().st_size + 50
-        )  # bytes of the next line that there is room for
+        limit = file.stat().st_size + 50  # only 50 bytes of the next line fit
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
         try:
             with pytest.raises(OSError, match="File too large"):

@@ -17,7 +17,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
-#: one process makes the run that all tests replay
+#: all tests replay the same run, in one process
 pytestmark = pytest.mark.together
 
 PLUGIN = load_plugin(TOY_PROBLEM)
@@ -76,7 +76,7 @@ def cli(registries, capsys, monkeypatch, tmp_path):
 
 @pytest.fixture
 def stored(finished, tmp_path):
-    """Return the records of the run in folder `done`, by solver, depth and repeat."""
+    """Return the records of the run in folder `done` by solver, depth and repeat."""
     shutil.copytree(finished, tmp_path / "done")
     records = read_journal(tmp_path / "done")
     return {(r.solver, r.params["depth"], r.repeat): r for r in records}
@@ -108,7 +108,7 @@ def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
 
 
 def test_the_ratio_of_times_names_its_times(cli, stored):
-    """The median of the repeats, not the time of the stored repeat beside it."""
+    """The ratio uses the median of the repeats, not the time of the stored repeat."""
     then = stored["half", 1, 0]
     out = cli("replay", "done", then.run_id)[1]
     (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]
@@ -303,7 +303,8 @@ def test_equal_qps_have_one_digest_and_others_another(manufactured, tmp_path, sh
     digest = save_qp(file, qp, {"name": "whatever"})
     loaded, _ = load_qp(file)
 
-    assert save_qp(file, loaded, {}) == digest  # over the file that it is mapped from
+    # overwrites the file from which the QP is mapped
+    assert save_qp(file, loaded, {}) == digest
     assert (loaded.q == qp.q).all()
     for change in ({"q": 2 * qp.q}, {"P": 2 * qp.P}, {"ub": qp.ub + 1}):
         assert save_qp(file, replace(qp, **change), {}) != digest

@@ -44,14 +44,15 @@ forms = ["dual"]
 
 
 class Cluster:
-    """Dask scheduler with workers that can be killed."""
+    """Dask scheduler with workers that tests can kill."""
 
     def __init__(self, folder, forks, *options):
         self.folder = folder
         self._forks = forks
         self.starts = folder / "starts"
         self.starts.touch()
-        locks = folder / "locks"  # of CPUs: another cluster of tests has its own
+        # locks of CPUs; another test cluster has a separate folder
+        locks = folder / "locks"
         locks.mkdir(exist_ok=True)
         self._env = os.environ | {
             "STARTS": str(self.starts), "TMPDIR": str(locks),
@@ -100,7 +101,9 @@ def cluster(tmp_path, forks):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line on the toy problem in an empty folder: code, out, err."""
+    """Run a command line on the toy problem in an empty folder; return
+    code, out, err.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
@@ -122,7 +125,9 @@ def cli(capsys, monkeypatch, tmp_path):
 
 
 def measured(folder):
-    """Return the verdicts in a journal by run_id; assert that none is there twice."""
+    """Return the verdicts in a journal by run_id; assert that no run_id
+    occurs twice.
+    """
     records = read_journal(Path(folder))
     found = {r.run_id: r.verdict for r in records}
     assert len(found) == len(records)
@@ -130,7 +135,7 @@ def measured(folder):
 
 
 def partial_blocks(folder):
-    """Return the numbers of blocks that are only partly in a journal."""
+    """Return the numbers of blocks of which a journal has only some measurements."""
     with suppress(InputError):
         counts = Counter(r.block for r in read_journal(Path(folder)))
         return [number for number, count in counts.items() if count < SOLVERS]
@@ -138,7 +143,7 @@ def partial_blocks(folder):
 
 
 def node_of(solver):
-    """Return the Dask worker of a solver process, the parent of its sub-reaper."""
+    """Return the Dask worker of a solver process, which is its sub-reaper's parent."""
     reaper = parent(solver)
     return None if reaper is None else parent(reaper)
 
@@ -161,14 +166,14 @@ def meanwhile(action):
 
 @pytest.fixture
 def all_cpus():
-    """Allow all CPUs of the machine, instead of those of a worker of pytest."""
+    """Allow all CPUs of the machine instead of the CPUs of a pytest worker."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(os.cpu_count()))
     yield
     os.sched_setaffinity(0, before)
 
 
-@pytest.mark.usefixtures("all_cpus")  # each node takes one
+@pytest.mark.usefixtures("all_cpus")  # each node needs a CPU
 def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     cli, cluster, tmp_path
 ):
@@ -190,15 +195,15 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
     slow = [r for r in records if r.solver == "slow"]
 
     assert code == 0, err
-    assert len(cluster.started_solvers()) > len(slow)  # a lost one was made again
+    assert len(cluster.started_solvers()) > len(slow)  # a lost measurement was repeated
     assert measured("both") == measured("alone")
     assert victim.poll() == -signal.SIGKILL
     assert {r.node for r in records} == {os.uname().nodename}
-    assert len(cpus) == min(2, len(os.sched_getaffinity(0)))  # a CPU for each
+    assert len(cpus) == min(2, len(os.sched_getaffinity(0)))  # a CPU for each worker
     (there,) = {r.environment for r in records}
     stored = environment_of(tmp_path / "both", there)
     assert stored.pop("digest") == digest(stored) == there
-    for number in {r.block for r in records}:  # blocks are of one case
+    for number in {r.block for r in records}:  # each block has a single case
         assert len({r.case for r in records if r.block == number}) == 1
 
 
@@ -210,7 +215,7 @@ def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
 
     def kill():
         assert soon(lambda: cut or cut.extend(partial_blocks("d")))
-        victim.kill()  # the turns that it returned are in the journal
+        victim.kill()  # the turns that it has returned are in the journal
         cluster.join()
 
     with meanwhile(kill):
@@ -251,7 +256,7 @@ def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
 
 
 def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
-    """Not even with --fresh, which deletes the content of a folder."""
+    """Test also --fresh, which deletes the content of a folder."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
@@ -264,7 +269,7 @@ def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeyp
 
 @pytest.fixture
 def ctrl_c_enabled():
-    """Restore the effect of Ctrl-C, which is ignored in a shell's background jobs."""
+    """Restore the effect of Ctrl-C, which background jobs of a shell ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -321,7 +326,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
 
 
 def descendants(process):
-    """The processes that one has started, and those that these have started."""
+    """Return all descendants of a process."""
     tasks = Path(f"/proc/{process}/task").glob("*/children")
     children = [int(child) for task in tasks for child in task.read_text().split()]
     return [*children, *(d for child in children for d in descendants(child))]
@@ -329,7 +334,7 @@ def descendants(process):
 
 def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     worker = cluster.join()
-    assert soon(lambda: descendants(worker.pid))  # what forks, and outlives the run
+    assert soon(lambda: descendants(worker.pid))  # processes that would outlive the run
     before, idle = set(descendants(worker.pid)), []
 
     def look():
@@ -382,7 +387,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
 
 @pytest.fixture
 def one_cpu():
-    """Restrict processes started here to one CPU."""
+    """Restrict processes started by the test to one CPU."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(before)})
     yield
@@ -394,9 +399,9 @@ def one_cpu():
 def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_missed_yet(
     cli, cluster, tmp_path
 ):
-    """A scheduler learns of a dead client later, on a busy machine after the next run.
+    """A scheduler may detect a dead client only after the start of the next run.
 
-    A parent that stands still looks the same to it.
+    A stopped parent imitates this delay.
     """
     worker = cluster.join(serves=False)
     run = start("--out", "d", "--dask", cluster.address)
@@ -469,7 +474,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 
 @pytest.fixture
 def meet():
-    """Pass the environment of a node to `Nodes`; record its files and warnings."""
+    """Pass the environment of a node to `Nodes`; record stored files and warnings."""
     from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []
@@ -497,7 +502,7 @@ def test_another_environment_is_stored_and_warned_of_once(meet):
     assert len(said) == 1
     cpu = capture()["machine"]["cpu"]
     assert said[0].startswith(
-        "node07 measures under other conditions than this machine "
+        "node07 measures under different conditions from this machine "
         f"(processor: {cpu} here, Another there); "
     )
 
@@ -516,5 +521,5 @@ def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
     ],
 )
 def test_a_node_with_other_code_is_refused(meet, change):
-    with pytest.raises(InputError, match="node07 runs other code"):
+    with pytest.raises(InputError, match="node07 runs different code"):
         meet(change)

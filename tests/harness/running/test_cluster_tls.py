@@ -1,4 +1,4 @@
-"""Runs on a Dask scheduler with certificates, set by Dask's own configuration."""
+"""Runs on a Dask scheduler with certificates from Dask's own configuration."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ forms = ["dual"]
 
 
 def certificates(folder):
-    """Create an authority and a certificate; return keys of Dask's configuration."""
+    """Create an authority and a certificate; return entries of Dask's configuration."""
     names = {n: str(folder / n) for n in ("ca.key", "ca.crt", "our.key", "our.crt")}
 
     def openssl(*arguments):
@@ -55,7 +55,7 @@ def certificates(folder):
 
 
 def in_environment(credentials):
-    """Spell keys of Dask's configuration as environment variables."""
+    """Convert entries of Dask's configuration to environment variables."""
     return {
         "DASK_DISTRIBUTED__COMM__TLS__"
         + key.upper().replace(".", "__").replace("-", "_"): value

@@ -1,4 +1,4 @@
-"""Locks of CPUs are in a folder that all users may write; others cannot plant them."""
+"""Locks of CPUs in a shared folder, in which other users cannot create them."""
 
 import os
 import tempfile
@@ -10,14 +10,15 @@ from mortarbench.harness import InputError
 
 
 def claim_cpu(stack):
-    from mortarbench.harness.running.dask_worker import claim_cpu  # late: it takes long
+    # imported here because it loads slowly
+    from mortarbench.harness.running.dask_worker import claim_cpu
 
     return claim_cpu(stack)
 
 
 @pytest.fixture
 def shared(tmp_path, monkeypatch):
-    """Set a folder of temporary files that only this test uses."""
+    """Set a folder of temporary files that is used only by this test."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 
@@ -70,7 +71,7 @@ def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant
 def test_a_folder_of_locks_of_another_user_is_refused(shared, monkeypatch):
     us = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: us + 1)
-    ours(shared).mkdir(mode=0o700)  # which is ours, not that other user's
+    ours(shared).mkdir(mode=0o700)  # owned by us, not by the other user
 
     alone = "only this user can access"
     with ExitStack() as stack, pytest.raises(InputError, match=alone):

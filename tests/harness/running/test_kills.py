@@ -1,4 +1,4 @@
-"""Runs that are killed, or run out of disk space, at random instants, and continued."""
+"""Runs that are killed, or run out of disk space, at random times and continue."""
 
 import os
 import random
@@ -71,7 +71,7 @@ ASKED = {
 
 
 def start(suite, out):
-    """Start a run; its first child is the server that forks its processes."""
+    """Start a run whose first child is the server that forks its processes."""
     return subprocess.Popen(
         [sys.executable, "-P", "-c", RUNS, str(suite), str(out), INSTALL],
         stderr=subprocess.PIPE, text=True,
@@ -79,7 +79,7 @@ def start(suite, out):
 
 
 def end_of(run):
-    """Return the exit code of a run, and its last line."""
+    """Return the exit code of a run and its last line."""
     said = run.communicate()[1].splitlines()
     return run.returncode, said[-1] if said else ""
 
@@ -109,7 +109,7 @@ def kill_one(run, rng, out):
 
 
 def ask_to_end(run, rng, out):
-    """Send what Ctrl-C or a batch system sends."""
+    """Send the signal of Ctrl-C or of a batch system."""
     number = rng.choice(list(ASKED))
     run.send_signal(number)
     assert end_of(run)[0] in ASKED[number]
@@ -117,7 +117,7 @@ def ask_to_end(run, rng, out):
 
 def fill_by_limit(run, rng, out):
     """Set a file size limit of zero for all processes of the run."""
-    for process in family(run.pid):  # processes that they start inherit the limit
+    for process in family(run.pid):  # new child processes inherit the limit
         with suppress(ProcessLookupError, PermissionError):
             hard = resource.prlimit(process, resource.RLIMIT_FSIZE)[1]
             resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
@@ -125,7 +125,7 @@ def fill_by_limit(run, rng, out):
 
 
 def fill_by_files(run, rng, out):
-    """Fill the file system that the folder is on."""
+    """Fill the file system of the folder."""
     filler = out.parent / "filler"
     try:
         with suppress(OSError), filler.open("wb", buffering=0) as file:
@@ -137,15 +137,15 @@ def fill_by_files(run, rng, out):
 
 
 def assert_told(run):
-    """Assert that a run on a full disk ends with one line, or had nothing to write."""
+    """Assert that a run on a full disk ended with one line, or had nothing to write."""
     code, said = end_of(run)
     assert code in (0, 2), (code, said)
     if code == 2:
-        assert said.endswith("free some space, and the same command continues")
+        assert said.endswith("free some space; the same command continues the run")
 
 
 def disturb(suite, out, events, rng, longest):
-    """Apply all `events` to runs at random instants, then let one run finish."""
+    """Apply all `events` to runs at random times, then let one run finish."""
     run = start(suite, out)
     for event in events:
         with suppress(subprocess.TimeoutExpired):
@@ -154,11 +154,12 @@ def disturb(suite, out, events, rng, longest):
             event(run, rng, out)
         if run.poll() is None:
             continue
-        if not run.stderr.closed:  # it ended by itself
+        if not run.stderr.closed:  # the run ended by itself
             assert end_of(run) == (0, ANY)
         run = start(suite, out)
     assert end_of(run)[0] == 0
-    assert end_of(start(suite, out))[0] == 0  # what could not be built, again
+    # cases that could not be built are built again
+    assert end_of(start(suite, out))[0] == 0
 
 
 def check(tmp_path, events, seed, out=None, repeats=4):
@@ -182,7 +183,7 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     changed = [r for r in got if r.verdict != verdicts[r.run_id]]
     assert len(changed) <= 3 * events.count(
         kill_one
-    )  # those whose worker was killed: a sequence at most
+    )  # measurements of a killed worker: at most a sequence
     for record in changed:
         assert record.message.endswith("SIGKILL"), record
     assert not list(out.glob(".scratch/*"))
@@ -221,9 +222,9 @@ def test_a_run_that_is_asked_to_end_twenty_times_continues(tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """Create a folder with a file system ``disk`` of 8 MiB; return it with its filler.
+    """Create a folder on a file system of 8 MiB; return it with a function to fill it.
 
-    Users who may not mount one get a limit of file sizes instead.
+    For users who may not mount file systems, a file size limit is used instead.
     """
     disk = tmp_path / "disk"
     disk.mkdir()

@@ -1,4 +1,4 @@
-"""Intervals of ratios of times, compared with Student's tables."""
+"""Intervals of ratios of times, compared with tables of Student's t."""
 
 import doctest
 
@@ -21,7 +21,7 @@ def interval(middle, half):
 
 
 def test_the_interval_of_two_pairs_has_one_degree_of_freedom():
-    """Logarithms 0 and 2 of the ratios: mean 1, standard error 1."""
+    """The logarithms of the ratios are 0 and 2, with mean 1 and standard error 1."""
     ratio = paired_ratio({0: 1.0, 1: 5 * np.exp(2)}, {0: 1.0, 1: 5.0})
 
     assert logs(ratio) == interval(1, STUDENT[1])
@@ -30,7 +30,9 @@ def test_the_interval_of_two_pairs_has_one_degree_of_freedom():
 
 
 def test_welchs_interval_of_equally_scattered_samples_is_students():
-    """Logarithms 0, 2 and 10, 12: variances of the means 1 and 1, so 2 of freedom."""
+    """Logarithms 0, 2 and 10, 12: both means have variance 1, so there are
+    2 degrees.
+    """
     ratio = unpaired_ratio(np.exp([0.0, 2.0]), np.exp([10.0, 12.0]))
 
     assert logs(ratio) == interval(-10, STUDENT[2] * np.sqrt(2))
@@ -40,7 +42,7 @@ def test_welchs_interval_of_equally_scattered_samples_is_students():
 
 @pytest.mark.parametrize("scatter", [1e-3, 1.0, 10.0])
 def test_a_sample_without_scatter_leaves_the_freedom_of_the_other(scatter):
-    """Four values of variance s², whose mean has s²/4, and three equal ones."""
+    """Four values have variance s², and their mean s²/4; the other three are equal."""
     noisy = np.exp(scatter * np.sqrt(3) / 2 * np.array([-1, -1, 1, 1]))
     still = np.exp(np.full(3, 5.0))
 

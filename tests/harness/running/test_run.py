@@ -39,7 +39,7 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Watcher:
-    """Progress that records its calls, and may act after some records."""
+    """Progress that records its calls and may act after given records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None
@@ -86,7 +86,7 @@ def suite(*solvers, cases=({},), **changes):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite in worker processes, and return the watcher of its progress."""
+    """Run a suite in worker processes; return the watcher of its progress."""
 
     def measure(
         suite,
@@ -158,7 +158,7 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: of those that are waited for to the time limit, one is enough by default
+#: solvers that exhaust the time limit; only the slow test includes them
 WAITED_FOR = {"printsendlessly"}
 
 
@@ -186,7 +186,8 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
             assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
             said = got[solver].message
-            if not said.startswith("took "):  # a pause of a busy machine is noted, too
+            # a pause of a busy machine also causes a note
+            if not said.startswith("took "):
                 assert message in (None, said)
 
 
@@ -218,7 +219,8 @@ def test_a_record_contains_phases_and_the_place_of_measurement(measure, tmp_path
     records = read_journal(tmp_path)
 
     slow = next(r for r in records if r.solver == "sleeps")
-    # a measurement that waited for its CPU is not repeated; one of five did not wait
+    # a measurement that waited for its CPU is not repeated; at least one of five did
+    # not wait
     quick = max(
         (r for r in records if r.solver == "honest"), key=lambda r: r.inner_loops
     )
@@ -269,7 +271,7 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
 
 
 def test_steps_of_a_tightening_sequence_have_their_own_tolerance(measure, tmp_path):
-    """The tolerance is max(tol, θ·δ), at most 1e-2; here δ is 1e-3·h."""
+    """The tolerance is max(tol, min(θ·δ, 1e-2)); in this test, δ is 1e-3·h."""
     names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (500, 1.0, 1e-3)]
     solvers = ("tightens", "chains", "honest")
     asked = suite(
@@ -305,7 +307,7 @@ def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_pa
         assert [str(r.verdict) for r in steps] == 2 * ["verified"] + 2 * ["declined"]
         assert "there is no further problem" in steps[2].message
     measure(asked)
-    assert len(read_journal(tmp_path)) == 8  # nothing is left to be measured
+    assert len(read_journal(tmp_path)) == 8  # no measurement is missing
 
 
 def test_a_broken_sequence_names_the_step(measure, tmp_path):
@@ -452,7 +454,7 @@ def test_run_ids_are_distinct_for_distinct_cells_and_equal_for_equal_ones(
     (other,) = read_journal(tmp_path)
 
     assert len(first) == 2 * 2 * 2 * 3
-    assert other.run_id not in first  # other options, same label
+    assert other.run_id not in first  # different options, same label
 
 
 @pytest.mark.parametrize("cut", [1, 50, 3000])
@@ -500,7 +502,7 @@ def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
     [
         ("build", "ZeroDivisionError: no stiffness"),
         ("input", "tiny: fault=input is out of range"),
-        ("memory", "it needs more memory than there is"),
+        ("memory", "it needs more memory than is available"),
         ("exit", "SystemExit: 3"),
     ],
 )
@@ -549,11 +551,11 @@ def test_the_folder_contains_suite_and_environment(measure, tmp_path):
 def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path):
     measure(suite("honest"))
     (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "validation.json").write_text("{}")  # what was concluded from it
+    (tmp_path / "validation.json").write_text("{}")  # a result of `validate`
     (tmp_path / "references").mkdir()
 
     other = suite("zero", text='name = "other"\n')
-    with pytest.raises(InputError, match=r"holds another suite .* --fresh"):
+    with pytest.raises(InputError, match=r"contains another suite .* --fresh"):
         measure(other)
     with pytest.raises(InputError, match=r"another environment \(here, now there\)"):
         measure(suite("honest"), digest="there")
@@ -680,7 +682,7 @@ def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
 
 
 def once_each(folder, count):
-    """The records of a journal, of which no measurement is there twice."""
+    """Return the records of a journal; assert that no measurement occurs twice."""
     records = read_journal(folder)
     assert len({r.run_id for r in records}) == len(records) == count
     return records
@@ -750,17 +752,19 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
             said.add(str(e).partition("; ")[2])
         assert not [*tmp_path.rglob("*.tmp")]
 
-    assert said == {"free some space, and the same command continues"}
+    assert said == {"free some space; the same command continues the run"}
     records = once_each(tmp_path, 2)
     assert {r.verdict for r in records} == {Verdict.VERIFIED, Verdict.WRONG}
-    assert writes > 6  # suite and environment alone are four
+    assert writes > 6  # suite and environment need four writes
 
 
 @pytest.mark.parametrize("size", [600, 4000])
 def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
     measure, tmp_path, size
 ):
-    """A point needs more than 600 bytes, a case more than 4000; other files less."""
+    """A point needs more than 600 bytes and a case more than 4000; other files need
+    less.
+    """
     whole = suite("honest", "prints")
     if size == 600:
         measure(suite("zero"))
@@ -781,7 +785,7 @@ def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
 
 @pytest.fixture
 def faults(monkeypatch):
-    """Let measurements for which `prevented` returns True fail by a fault."""
+    """Cause a fault in measurements for which `prevented` returns True."""
 
     def faults(prevented):
         def measured(worker, qp, record, request, **limits):
@@ -861,12 +865,12 @@ def family(process):
 
 @pytest.fixture
 def own_interpreters(monkeypatch):
-    """Start processes by their commands: forks show no command in /proc."""
+    """Start processes by their commands, since forks show no command in /proc."""
     monkeypatch.setattr(supervisor, "subprocess", subprocess)
 
 
 def kill_worker(solver):
-    """Kill the worker of a solver, a process with its name as an argument."""
+    """Kill the worker of a solver, which has the solver's name as an argument."""
     for process in list(family(os.getpid()))[1:]:
         with suppress(OSError):
             words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")

@@ -1,4 +1,4 @@
-"""Stopping rule of the schedule, and intervals of ratios of times."""
+"""Schedule of blocks: stopping rule, order and resumption."""
 
 from dataclasses import replace
 
@@ -39,7 +39,9 @@ class Quiet:
 
 
 def schedule_of(**changes):
-    """Return a schedule of three repeats of one case by solvers a and b, or changed."""
+    """Return a schedule of one case, three repeats and solvers a and b,
+    with changes.
+    """
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
@@ -53,7 +55,7 @@ def schedule_of(**changes):
 
 
 def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Execute a suite with measured times of 1, 2 and 4 s, up to some noise."""
+    """Execute a suite with times of 1, 2 and 4 s and some noise."""
     rng = np.random.default_rng(seed)
     schedule = schedule_of(**changes)
     made = []
@@ -69,7 +71,7 @@ def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
 
 
 def test_the_order_of_a_block_is_reversed_in_the_next():
-    """No position in a block favours a solver; pairs of blocks have random orders."""
+    """Mean positions of solvers are equal; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
     blocks = list(schedule_of(solvers=solvers, repeats=6).blocks())
     orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
@@ -80,7 +82,7 @@ def test_the_order_of_a_block_is_reversed_in_the_next():
 
 
 def test_sequences_are_compared_by_their_total_time():
-    """Its steps are noisy, but their errors cancel in the sum."""
+    """The times of the steps are noisy, but their errors cancel in the sum."""
     rng = np.random.default_rng(161803)
     steps = cases_of(1, 2)
     schedule = schedule_of(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
@@ -104,7 +106,7 @@ def records_of(blocks):
 
 
 def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
-    """For every number of measurements before; block numbers stay distinct."""
+    """Test every number of earlier measurements; block numbers stay distinct."""
     suite = dict(
         tolerances=(1e-4, 1e-6), repeats=2,
         cases=cases_of(1, 2),
@@ -143,7 +145,7 @@ def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     failed = next(blocks)
 
     assert schedule.give_up(failed)
-    assert not schedule.give_up(failed)  # known by now
+    assert not schedule.give_up(failed)  # it was marked before
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
@@ -186,7 +188,7 @@ def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
 
 
 def test_records_without_a_time_spend_no_budget():
-    """A failing solver has no time; the others are distinguished after many blocks."""
+    """A failing solver has no time; other solvers need many blocks."""
     specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
     schedule = schedule_of(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
     rng = np.random.default_rng(271828)
@@ -223,7 +225,8 @@ def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0
     for _ in range(2000):
-        drift = np.exp(rng.standard_normal(8))  # of the machine: whole blocks
+        # drift of the machine, which affects whole blocks
+        drift = np.exp(rng.standard_normal(8))
         a, b = (drift * np.exp(0.1 * rng.standard_normal(8)) * s for s in (3.0, 1.0))
         r = paired_ratio(dict(enumerate(a)), dict(enumerate(b)))
         hits += r.low <= 3.0 <= r.high
@@ -239,7 +242,7 @@ def test_only_common_blocks_are_compared():
 
 
 def test_the_first_answer_that_is_not_verified_ends_a_growing_series():
-    """Solver a ends at n = 2, in its first repeat; b declines n = 1 and goes on."""
+    """Solver a ends at n = 2 in its first repeat; b declines n = 1 and continues."""
     small, middle, large = cases = cases_of(1, 2, 3)
     growing = {
         small.name: Growth("", small),

@@ -1,4 +1,4 @@
-"""A suite with a result folder may only ask for more measurements."""
+"""A suite with a result folder may only add measurements."""
 
 import pytest
 
@@ -14,7 +14,7 @@ SUITE = {
     "more",
     [
         {},
-        {"time_limit": 60.0, "memory_limit": 4096},  # what holds anyway
+        {"time_limit": 60.0, "memory_limit": 4096},  # equal to the defaults
         {"solvers": [*SUITE["solvers"], "c"]},
         {"solvers": SUITE["solvers"][::-1]},
         {"tolerances": [1e-4, 1e-6, 1e-8]},
@@ -50,7 +50,7 @@ def test_a_stopping_rule_may_become_stricter_and_not_laxer():
     ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
 
     assert incompatibility(ruled, ruled | {"precision": 0.05}) == ""
-    said = "precision was 0.1, now 0.2; it may only become finer"
+    said = "precision was 0.1, now 0.2; it may only be reduced"
     assert incompatibility(ruled, ruled | {"precision": 0.2}) == said
     assert incompatibility(ruled, SUITE).startswith("precision was 0.1, now not set")
     assert (

@@ -108,7 +108,9 @@ def labels(*texts, specs=SPECS):
 
 
 def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
-    """Values as a list or repeated; a solver without the option stays unchanged."""
+    """Values are a list or repeated options; a solver without the option is
+    unchanged.
+    """
     assert labels("max_iter=5,6", "scaling=false") == [
         "method max_iter=5 scaling=false", "method max_iter=6 scaling=false", "plain"
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Suites: content of their TOML, and messages on mistakes."""
+"""Suites: content of their TOML, and messages for mistakes."""
 
 import tomllib
 from dataclasses import dataclass
@@ -431,7 +431,7 @@ def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monke
 
 
 def folder_of_files(folder, monkeypatch, *, here=True):
-    """Write a suite beside some files, and change to its folder or another one."""
+    """Write a suite and some files, and change to its folder or to another folder."""
     (folder / "set" / "more.qps").mkdir(parents=True)
     (folder / "elsewhere").mkdir()
     for name in ("b.qps", "a.qps", "c[1].qps", "d.txt", "more.qps/e.qps"):
@@ -508,7 +508,7 @@ def test_a_sequence_may_run_along_zipped_keys():
 
 @pytest.mark.parametrize("name", BEYOND)
 def test_suites_beyond_the_paper_can_be_narrowed(name):
-    """Six is the smallest number of repeats whose median has a 95 % interval."""
+    """With fewer than six repeats, the median has no 95 % interval."""
     suite = shipped(name)
     narrowed = with_overrides(
         suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
@@ -608,7 +608,7 @@ def test_a_growing_series_knows_its_next_smaller_case_and_a_case_to_warm_up(load
 
     growth = suite.growing["well/n=8/kind=hard/dual"]
     assert growth.smaller == "well/n=4/kind=hard/dual"
-    assert growth.warm_up.name == "well/kind=hard/dual"  # n of the family's defaults
+    assert growth.warm_up.name == "well/kind=hard/dual"  # n has its default value
     assert suite.growing["well/n=2/primal"].smaller == ""
     assert set(suite.growing) == set(names(suite))
     assert not load(MINIMAL).growing

@@ -1,4 +1,4 @@
-"""Displacements without penetration: the nearest one, by hand."""
+"""Displacements without penetration, compared with nearest points computed by hand."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.support.supported_by_contact import disc_between_plates
 
 
 def moved(B, c, u, *, R=None, softness=None, closed=None):
-    """Move u inside  Bu ≤ c; R no motions, softness and closed ones and none."""
+    """Move u inside Bu ≤ c; default: no motions, unit softness, no closed rows."""
     B, c, u = (np.array(v, dtype=Real) for v in (B, c, u))
     m, n = B.shape
     exact = Exact(
@@ -23,7 +23,7 @@ def moved(B, c, u, *, R=None, softness=None, closed=None):
     R = np.zeros((n, 0)) if R is None else np.array(R, dtype=float)
     softness = np.ones(n) if softness is None else np.array(softness, dtype=float)
     closed = np.zeros(m, dtype=bool) if closed is None else np.array(closed)
-    with np.errstate(all="ignore"):  # as `certify` does
+    with np.errstate(all="ignore"):  # as in `certify`
         return feasible_at_rows(exact, R, softness, u, closed)
 
 
@@ -35,7 +35,7 @@ def test_what_penetrates_nothing_stays():
 
 
 def test_nodes_share_the_way_out_as_they_are_soft():
-    """u₁ + u₂ ≤ 1 from (1, 1): least Σδᵢ²/sᵢ with s = (1, 3) moves them by ¼ and ¾."""
+    """From (1, 1), u₁ + u₂ ≤ 1 and least Σδᵢ²/sᵢ with s = (1, 3) give δ = −(¼, ¾)."""
     found = moved([[1, 1]], [1], [1, 1], softness=[1, 3])
 
     assert found.u.astype(float) == pytest.approx([0.75, 0.25], rel=1e-9)
@@ -43,7 +43,9 @@ def test_nodes_share_the_way_out_as_they_are_soft():
 
 
 def test_rigid_motions_come_before_bending():
-    """Both rows are violated by 1: one motion of both nodes by −1 bends nothing."""
+    """Both rows are violated by 1, and a rigid motion by −1 satisfies them without
+    bending.
+    """
     found = moved(np.eye(2), [1, 1], [2, 2], R=[[1], [1]])
 
     assert found.u.astype(float) == pytest.approx([1, 1, -1], rel=1e-9)
@@ -57,7 +59,7 @@ def test_a_closed_row_is_closed_though_it_is_not_violated():
 
 
 def test_what_supports_hold_is_shrunk_until_it_fits():
-    """Nothing can move; 2 and 3 fit into 1 and 2 if halved."""
+    """No component can move, so (2, 3) is halved to satisfy the limits (1, 2)."""
     found = moved(np.eye(2), [1, 2], [2, 3], softness=[0, 0])
 
     assert found.theta == pytest.approx(1 / 2)
@@ -66,7 +68,7 @@ def test_what_supports_hold_is_shrunk_until_it_fits():
 
 
 def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypatch):
-    """Contact alone holds the disc; its nodes are displaced by about a millimetre."""
+    """Only contact supports the disc; the nodes move by about a millimetre."""
     mechanics = disc_between_plates().mechanics
     rng = np.random.default_rng(161803)
     u = 1e-3 * rng.standard_normal(mechanics.exact.f.size).astype(Real)

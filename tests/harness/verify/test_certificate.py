@@ -1,4 +1,4 @@
-"""The certificate: no error above its bound, for answers of every kind of badness."""
+"""Certificates: no error exceeds its bound, for many types of wrong answers."""
 
 from __future__ import annotations
 
@@ -42,25 +42,25 @@ CASES = (
     "hertz-sphere/n=1",
 )
 PERTURBATIONS = 10_000
-ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
+ROUNDED = 1 + 1e-12  #: the bound often equals the error up to rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A small problem with its solution to rounding."""
+    """A small problem, and its solution up to rounding."""
 
     mechanics: Mechanics
     exact: ReferencePoint
 
     def solution(self) -> Solution:
-        """The solution as a solver would return it, on the primal QP."""
+        """Return the solution of the primal QP in the form of a solver."""
         u, z = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         primal = self.mechanics.primal
         y = -primal.A @ (primal.P @ u + primal.q + primal.G.T @ z)
         return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
 
     def error(self, u: Extended) -> float:
-        """‖u − u*‖_K."""
+        """Return ‖u − u*‖_K."""
         return self.mechanics.norm(u - self.exact.u)
 
     @property
@@ -78,7 +78,7 @@ def known(name: str) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Return whether every error is within the bound stated by the certificate."""
+    """Return True if all errors are within the bounds of the certificate."""
     slack = problem.slack
     of_u, of_equilibrium = map(problem.error, (found.u, found.equilibrium))
     of_answer = problem.error(s.x.astype(Real))
@@ -92,14 +92,14 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
 
 
 def _noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Disturb all components by as much."""
+    """Add noise of the same size to all components."""
     x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
     z = s.z + size * s.z.max() * rng.standard_normal(s.z.size)
     return replace(s, x=x, z=z)
 
 
 def _wrong_active_set(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move multipliers from rows in contact to others."""
+    """Move multipliers from rows in contact to other rows."""
     z = s.z.copy()
     swapped = rng.random(z.size) < max(size, 1.5 / z.size)
     z[swapped] = rng.permutation(z)[swapped]
@@ -107,13 +107,13 @@ def _wrong_active_set(s: Solution, size: float, rng: np.random.Generator) -> Sol
 
 
 def _scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Scale point and multipliers by factors near 1, or not near at all."""
+    """Scale point and multipliers by factors that may be far from 1."""
     a, b = 1 + 3 * size * rng.standard_normal(2)
     return replace(s, x=a * s.x, z=b * s.z)
 
 
 def _truncated(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Set what is small to zero, and round the rest to as many digits."""
+    """Set small values to zero, and round the other values to a few digits."""
     x = np.where(np.abs(s.x) < size * np.abs(s.x).max(), 0, s.x)
     z = np.where(s.z < size * s.z.max(), 0, s.z)
     digits = rng.integers(1, 6)
@@ -122,7 +122,7 @@ def _truncated(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def _infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Push bodies into each other, move what is held, and let contact pull."""
+    """Add penetration, motion of supports and tensile contact forces."""
     x = s.x * (1 + 10 * size) + size * np.abs(s.x).max() * rng.random(s.x.size)
     return replace(s, x=x, z=s.z - size * s.z.max() * rng.random(s.z.size))
 
@@ -133,7 +133,7 @@ KINDS: tuple[Callable[[Solution, float, np.random.Generator], Solution], ...] = 
 
 
 def violations(name: str, count: int) -> list[str]:
-    """Disturb the solution at random; tell every time that a bound did not hold."""
+    """Disturb the solution at random; return a message for each violated bound."""
     problem, told = known(name), []
     rng = np.random.default_rng(sum(map(ord, name)))
     for i in range(count):
@@ -168,12 +168,12 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 
 
 def beyond(solver: Solver, qp: QP) -> bool:
-    """Return whether a dense active-set solver would take many minutes."""
+    """Return True if a dense active-set solver would take many minutes."""
     return solver in (SOLVERS["highs"], SOLVERS["daqp"]) and qp.P.shape[0] > 3000
 
 
 def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
-    """Bound over true error of the pairs that solvers return at 1e-3 to 1e-8."""
+    """Return bound/error of the pairs from answers of solvers at tol 1e-3 to 1e-8."""
     problem, found = known(name), []
     case = parse(f"{name}/{form}", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
@@ -188,7 +188,8 @@ def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
             c = certify(case.mechanics, s)
             assert holds(problem, s, c)
             true = np.hypot(problem.error(c.u), problem.error(c.equilibrium))
-            if true > 10 * problem.slack:  # below, the reference is no measure
+            # for smaller errors, the reference is too inaccurate
+            if true > 10 * problem.slack:
                 found.append(c.pair / true)
     return found
 
@@ -227,7 +228,7 @@ def test_so_are_those_of_the_fleet(name):
 @pytest.mark.parametrize(
     "name",
     [
-        "hertz-cylinder/dual",  # supports dominate the gradient's scale
+        "hertz-cylinder/dual",  # forces of supports dominate the scale of the gradient
         "hertz-cylinder/slave=lower/dual",
         "beam-ring/Nr=8/Nh=4/step=1/dual",
         "obstacle/n=10/dual-bounds",
@@ -255,7 +256,9 @@ def test_answers_beyond_all_numbers_have_no_certificate_or_an_honest_one(name, s
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_dwarfs_the_solution_is_not_measured_by_itself(name):
-    """An error of ten times the solution is not 90 % of the answer."""
+    """An error of ten times the solution is relative to the solution, not
+    the answer.
+    """
     problem = known(name)
     s = problem.solution()
     found = certify(problem.mechanics, replace(s, x=-10 * s.x, z=0 * s.z))

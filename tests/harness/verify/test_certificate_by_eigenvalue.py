@@ -1,7 +1,7 @@
-"""Errors over convex sets are below the bound by the least eigenvalue of P.
+"""Error bounds over convex sets from the least eigenvalue of P.
 
-The solutions are exact (integers times powers of two). P = MᵀM + I with integers M has
-no eigenvalue below one.
+The solutions are exact: integers times powers of two. P = MᵀM + I with an integer
+matrix M has no eigenvalue below one.
 """
 
 from dataclasses import replace
@@ -24,12 +24,14 @@ from tests.harness.verify.test_verdicts_over_discs_and_cones import (
     ExactProblem,
 )
 
-#: these keep the eigenvalues above one; rows are removed
+#: traps that keep the eigenvalues above one; rows are removed
 KEPT = [t for t in TRAPS if t not in ("singular", "weak", "touching", "units")]
 
 
 class WithoutRows:
-    """A QP over sets without rows, its solution, and the least eigenvalue of P."""
+    """A QP over sets without rows, its solution, and a bound of the
+    eigenvalues of P.
+    """
 
     def __init__(self, traps, seed, ill=False):
         planted = ExactProblem(traps, seed)
@@ -47,7 +49,7 @@ class WithoutRows:
         self.value = float(self.qp.objective(s.x))
 
     def error(self, x):
-        """‖x − x*‖_P relative to ‖x*‖_P, in extended precision."""
+        """Return ‖x − x*‖_P relative to ‖x*‖_P, in extended precision."""
         e, at = (
             v.astype(np.longdouble) for v in (x - self.solution.x, self.solution.x)
         )
@@ -56,10 +58,10 @@ class WithoutRows:
 
 
 def exceeded(seed, tries, each=100):
-    """Attack bounds by points of all kinds; return failures and the sharpness.
+    """Test bounds at points of all types; return failures, and ratios bound/error.
 
-    The sharpness, bound over error, is that of well-conditioned P: otherwise bounds may
-    be too large by the root of the condition number.
+    The ratios are returned only for well-conditioned P, since bounds may otherwise be
+    too large by the square root of the condition number.
     """
     rng = np.random.default_rng(seed)
     failures, ratios, count = [], [], 0
@@ -113,7 +115,7 @@ def test_the_bound_of_a_solution_is_rounding(trap):
 
 
 def test_an_interior_point_is_bounded_without_its_multipliers():
-    """min ½‖x‖² − 5x₁ over the unit disc, at (1 − δ, 0): the error is δ."""
+    """For min ½‖x‖² − 5x₁ over the unit disc, the error of (1 − δ, 0) is δ."""
     qp = mb.QP.from_arrays(np.eye(2), [-5, 0], sets=[mb.Discs([[0, 1]], [1])])
     for delta in (1e-3, 1e-6):
         x, none = np.array([1 - delta, 0]), np.zeros(0)
@@ -123,7 +125,7 @@ def test_an_interior_point_is_bounded_without_its_multipliers():
 
 
 class Scaled:
-    """x ↦ 2x, with a proven bound of its eigenvalues."""
+    """The map x ↦ 2x, with a proven bound of its eigenvalues."""
 
     least_eigenvalue = 1.5
 

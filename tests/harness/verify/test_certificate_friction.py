@@ -1,7 +1,7 @@
-"""The certificate with friction: no error above its bound, however rows are disturbed.
+"""Certificates with friction: no error exceeds its bound for disturbed answers.
 
-The disturbances are those of a solver that is wrong: noise, rows that stick where they
-should slip or are open, slips the other way, forces beyond the bound of friction.
+The disturbances imitate a wrong solver: noise, rows that stick instead of slipping or
+being open, slip in the opposite direction, and forces above the bound of friction.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import block_on_incline
 
 INCLINE = "a block that friction alone holds"
-#: a problem and its twin without friction
+#: problems with friction, each with the same problem without friction
 CASES = {
     "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7": (
         "beam-ring/Nr=3/Nh=2/steps=2"
@@ -61,19 +61,19 @@ IN_SPACE = (
     "greco/n=4/dim=3/feti=2",
 )
 PERTURBATIONS = 10_000
-ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
-NOISE = 1e-7  #: relative error from which on effectivities are measured
+ROUNDED = 1 + 1e-12  #: the bound often equals the error up to rounding
+NOISE = 1e-7  #: smallest relative error for which effectivities are measured
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A small problem with its solution to rounding."""
+    """A small problem, and its solution up to rounding."""
 
     mechanics: Mechanics
     exact: ReferencePoint
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.to_primal` would give it."""
+        """Return the solution in the form of `Mechanics.to_primal`."""
         mechanics, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + mechanics.rows.T @ lam)
@@ -82,7 +82,7 @@ class Known:
         return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
 
     def error(self, u: Extended) -> float:
-        """‖u − u*‖_K."""
+        """Return ‖u − u*‖_K."""
         return self.mechanics.norm(u - self.exact.u)
 
 
@@ -101,10 +101,10 @@ def known(name: str) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Return whether every error is within the bound stated by the certificate."""
+    """Return True if all errors are within the bounds of the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     of_u, of_equilibrium = problem.error(found.u), 0.0
-    if found.off.shape == found.u.shape:  # of subdomains, u_λ jumps
+    if found.off.shape == found.u.shape:  # with subdomains, u_λ has jumps
         of_equilibrium = problem.error(found.equilibrium)
     of_answer = problem.error(s.x.astype(Real))
     return bool(
@@ -117,7 +117,7 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
 
 
 def is_admissible(forces: AdmissibleForces, multipliers: Extended) -> bool:
-    """Return whether multipliers are in Λ, but for extended rounding of circles."""
+    """Return True if multipliers are in Λ, up to rounding of norms on circles."""
     size = np.sqrt((multipliers[forces.discs.index] ** 2).sum(axis=1))
     pressing = (multipliers[forces.contact] >= 0).all()
     rounding = 8 * np.finfo(Real).eps
@@ -125,10 +125,12 @@ def is_admissible(forces: AdmissibleForces, multipliers: Extended) -> bool:
 
 
 def _noise(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
-    """Disturb all components by as much; the forces of friction leave their bounds."""
+    """Add noise of the same size to all components; friction forces leave
+    their bounds.
+    """
     del m
     x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
-    # of rows, not of their number: the twin's are disturbed by the same numbers
+    # drawn per row, so that both problems are disturbed by the same numbers
     z = s.z + size * np.abs(s.z).max() * rng.standard_normal(s.z.size)
     return replace(s, x=x, z=z)
 
@@ -136,7 +138,7 @@ def _noise(s: Solution, size: float, rng: np.random.Generator, m: int) -> Soluti
 def _wrong_states(
     s: Solution, size: float, rng: np.random.Generator, m: int
 ) -> Solution:
-    """Exchange forces between rows of one kind: stick for slip, closed for open."""
+    """Exchange forces between rows of one type: stick and slip, closed and open."""
     z = s.z.copy()
     for rows in (slice(0, m), slice(m, None)):
         part = z[rows]
@@ -146,7 +148,7 @@ def _wrong_states(
 
 
 def _turned(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
-    """Turn some forces of friction round, and leave others out; disturb u slightly."""
+    """Reverse some friction forces, set others to zero, and disturb u slightly."""
     z = s.z.copy()
     z[m:] *= rng.choice([-1.0, 0.0, 1.0, 1.0, 1.0, 1.0], z.size - m)
     x = s.x + size * np.abs(s.x).max() * rng.standard_normal(s.x.size)
@@ -154,14 +156,14 @@ def _turned(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solut
 
 
 def _scaled(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
-    """Scale point and multipliers by factors near 1, or not near at all."""
+    """Scale point and multipliers by factors that may be far from 1."""
     del m
     a, b = 1 + 3 * size * rng.standard_normal(2)
     return replace(s, x=a * s.x, z=b * s.z)
 
 
 def _rounded(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:
-    """Set what is small to zero, and round the rest to as many digits."""
+    """Set small values to zero, and round the other values to a few digits."""
     del m
     x = np.where(np.abs(s.x) < size * np.abs(s.x).max(), 0, s.x)
     z = np.where(np.abs(s.z) < size * np.abs(s.z).max(), 0, s.z)
@@ -175,10 +177,10 @@ KINDS: tuple[Callable[..., Solution], ...] = (
 
 
 def attacked(name: str, count: int) -> tuple[list[str], list[float]]:
-    """Disturb the solution at random; tell every bound that did not hold.
+    """Disturb the solution at random; return messages on violated bounds, and ratios.
 
-    Also returns the bound over the true error of each pair, of subdomains that of each
-    answer, where that is no rounding.
+    The ratios are bound/error of each pair or, for subdomains, of each answer. Errors
+    at the level of rounding are excluded.
     """
     problem, told, effectivities = known(name), [], []
     s, m = problem.solution(), problem.mechanics.primal.h.size
@@ -199,7 +201,7 @@ def attacked(name: str, count: int) -> tuple[list[str], list[float]]:
 
 
 def sharp(cases: Sequence[str], count: int) -> None:
-    """Attack the cases, and their twins with the same numbers."""
+    """Test the cases, and equal cases without friction for comparison."""
     rough, smooth = [], []
     for name in cases:
         told, found = attacked(name, count)
@@ -308,7 +310,7 @@ def test_what_solvers_return_is_bounded_in_every_form(name):
 
 @pytest.mark.parametrize("far", [-1.0, 1.0])
 def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypatch):
-    """On an incline, where its friction sticks; not counting errors of the pair."""
+    """A block sticks on an incline; the errors of the pair are not included."""
     problem, seen = known(INCLINE), []
     mechanics, reach = problem.mechanics, certificate._reach
 
@@ -321,7 +323,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
     along = np.where(np.arange(s.x.size) % 2 == 0, far * np.abs(s.x).max(), 0)
     of_block = mechanics.kernel @ (mechanics.kernel.T @ along)
     certify(mechanics, replace(s, x=s.x + of_block.astype(np.float64)))
-    held, allowed = seen[0]  # by the pair that has slid as far
+    held, allowed = seen[0]  # of the first pair, in which the block has slid
     off = np.abs(held.T @ (mechanics.motions.constrained.T @ of_block))
 
     assert off.max() > 0
@@ -329,7 +331,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
 
 
 def test_work_of_friction_has_its_own_part():
-    """Missing work is charged if a force does not oppose the slip."""
+    """A zero force on a slipping row has missing work, which the bound includes."""
     problem = known("beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7")
     mechanics, s = problem.mechanics, problem.solution()
     slip = mechanics.friction.T @ s.x - mechanics.friction.start

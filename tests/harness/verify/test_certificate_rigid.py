@@ -1,4 +1,4 @@
-"""Certificates where contact alone holds bodies, or bodies move far as a whole."""
+"""Certificates for bodies that only contact supports, or that move rigidly."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ MAKERS: dict[str, Callable[[], Case]] = {
     "stiff disc": disc(E=(70e6, 70e14, 70e6)),
     "soft plate": disc(E=(70e3, 70e9, 70e12)),
 }  # fmt: skip
-#: its solution in rational arithmetic takes many seconds: a slow test
+#: slow test, since a solution in rational arithmetic takes many seconds
 LONG = "hertz-plane/n=3"
 NAMES = [n if n != LONG else pytest.param(n, marks=pytest.mark.slow) for n in MAKERS]
 
 
 @cache
 def known(name: str) -> tuple[Mechanics, Extended, Extended, float]:
-    """Give the problem, its solution u and λ, and the norm of u."""
+    """Return the problem, its solution u and λ, and the norm of u."""
     mechanics = MAKERS[name]().mechanics
     assert mechanics is not None
     point = reference_point(mechanics, reference_solution)
@@ -102,7 +102,7 @@ def _scaled(m, s, size, rng):
 
 
 def _moved_bodies(m, s, size, rng):
-    """Move every body rigidly, as far as supports leave them."""
+    """Move every body rigidly, as the supports allow."""
     R = m.inverse.kernel
     if not R.shape[1]:
         return _scaled(m, s, size, rng)
@@ -111,7 +111,7 @@ def _moved_bodies(m, s, size, rng):
 
 
 def _shifted_multipliers(m, s, size, rng):
-    """Move multipliers along the null space of Gᵀ, so that balance shows nothing."""
+    """Move multipliers in the null space of Gᵀ, which preserves equilibrium."""
     d = rng.standard_normal(s.z.size) * (s.z + 0.1 * s.z.max() * (rng.random() < 0.5))
     G = m.primal.G @ m.inverse.kernel
     if G.shape[1]:
@@ -127,7 +127,7 @@ def _swapped_rows(m, s, size, rng):
 
 
 def _softest_modes(m, s, size, rng):
-    """Disturb by what little force bends most."""
+    """Add a displacement in the softest modes."""
     v = m.apply_inverse(m.apply_inverse(rng.standard_normal(s.x.size).astype(Real)))
     return replace(s, x=s.x + (size * m.norm(s.x) / m.norm(v) * v).astype(np.float64))
 
@@ -139,7 +139,7 @@ KINDS = (
 
 
 def attack(name: str, count: int) -> tuple[list[str], list[float]]:
-    """Return messages on violated or missing bounds, and bounds over true errors."""
+    """Return messages on violated or missing bounds, and ratios of bound to error."""
     mechanics, u, lam, length = known(name)
     rng, told, sharp = np.random.default_rng(sum(map(ord, name))), [], []
     for i in range(count):
@@ -155,7 +155,7 @@ def attack(name: str, count: int) -> tuple[list[str], list[float]]:
             told.append(
                 f"{kind.__name__} {size:.0e}: {errors} > {found.bound * length}"
             )
-        if found.bound > 1e-7:  # below, rounding is what is bounded
+        if found.bound > 1e-7:  # smaller bounds consist of rounding
             sharp.append(found.bound * length / max(errors))
     return told, sharp
 
@@ -190,7 +190,9 @@ def test_the_stored_solution_is_certified_to_six_digits(name):
 @pytest.mark.parametrize("tilt", [0.0, 0.5])
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 def test_a_disc_between_plates_is_certified_to_six_digits(form, tilt, contact):
-    """Contact does not feel the disc slide, nor, with its own normals, roll."""
+    """Contact resists neither sliding nor, with node-to-segment rows, rolling of the
+    disc.
+    """
     case = disc_between_plates(
         8, form=form, tilt=tilt, contact=contact, disc_is_slave=contact == "nts"
     )
@@ -208,7 +210,7 @@ def test_a_disc_between_plates_is_certified_to_six_digits(form, tilt, contact):
 def test_a_free_plate_on_a_disc_rests_on_no_row_at_the_end_of_the_arc(
     contact, basis, solver
 ):
-    """Rows that press balance among themselves: none is needed that would be far."""
+    """Rows near the contact balance the load, so that distant rows have no force."""
     form = "dual" if solver == "smalbe" else "primal"
     case = disc_between_plates(9, form=form, contact=contact, basis=basis)
     s = SOLVERS[solver].prepare(case.qp, 1e-8)()
@@ -232,14 +234,15 @@ def test_a_load_that_contact_would_have_to_pull_is_another_cause():
     mechanics = disc_between_plates().mechanics
     lifted = replace(mechanics, primal=replace(mechanics.primal, q=-mechanics.primal.q))
     s = answer(0 * lifted.exact.f, np.ones_like(lifted.exact.c))
-    with pytest.raises(UncertifiableError, match="contact would have to pull"):
+    with pytest.raises(UncertifiableError, match="only tensile contact forces"):
         certify(lifted, s)
 
 
 def test_contact_feels_no_sliding_but_all_else():
-    """Two bodies, three motions each; along the plates both are free, however tilted.
+    """Each of two bodies has three rigid motions, of which only sliding is free.
 
-    The disc as master of pointwise rows is a polygon, which feels them all.
+    If the disc is the master of node-to-segment rows, it is a polygon, and its rows
+    resist all motions.
     """
     for tilt in (0.0, 0.5, 1.0):
         motions = disc_between_plates(tilt=tilt).mechanics.motions
@@ -266,7 +269,7 @@ def test_what_rigid_motions_do_to_a_stored_matrix_is_known_to_its_last_digits():
 
 
 def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
-    """|B_i v| ≤ φ_i‖v‖ for every v without rigid motion, and one v attains it."""
+    """|B_i v| ≤ φ_i‖v‖ for every v without rigid motion, with equality for one v."""
     mechanics = disc_between_plates().mechanics
     split = Undivided(mechanics)
     for i in (0, 3):
@@ -280,7 +283,7 @@ def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
 
 
 def test_the_charge_of_rounding_solves_its_inequality():
-    """One held motion: γ ≤ 2√s, s = 1 + charge, charge ≥ 2γρ + 4√s γσ + 2γ²κ."""
+    """One motion: γ ≤ 2√s with s = 1 + charge, and charge ≥ 2γρ + 4√s γσ + 2γ²κ."""
     reach = _Reach(np.zeros(1), np.full(1, 2.0), np.zeros(1))
 
     def charge(rho: float, sigma: float, kappa: float) -> float:
@@ -292,11 +295,11 @@ def test_the_charge_of_rounding_solves_its_inequality():
         gamma = 2 * np.sqrt(s)
         needed = 2 * gamma * rho + 4 * np.sqrt(s) * gamma * sigma + 2 * gamma**2 * kappa
         assert needed <= s - 1 <= 1.05 * needed
-    assert charge(0, 0, 1.0) == np.inf  # it is stronger than all that holds the motion
+    assert charge(0, 0, 1.0) == np.inf  # rounding outweighs the contact forces
 
 
 def test_a_gap_that_is_closed_from_the_start_lets_nothing_shrink():
-    """θu with θ < 1 is no way out where u = 0 penetrates, c < 0."""
+    """If u = 0 penetrates (c < 0), no θu with θ < 1 is used."""
     mechanics = named("obstacle/dim=1/n=16").mechanics
     primal = mechanics.primal
     blocked = replace(primal, h=np.full_like(primal.h, -1.0), G=0 * primal.G)
@@ -341,7 +344,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
 
 
 def test_balance_is_not_sought_beyond_what_rounding_allows():
-    """Sums of terms that cancel are known to the rounding of the terms only."""
+    """Sums with cancellation are accurate only up to the rounding of their terms."""
     G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
     lam = np.ones(2, dtype=Real)
     forces = AdmissibleForces(2, NO_FRICTION.discs(2))
@@ -355,7 +358,7 @@ def test_balance_is_not_sought_beyond_what_rounding_allows():
     [pytest.param("disc under rollers", marks=pytest.mark.slow), "stiff disc"],
 )
 def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
-    """Contact pushes, but not where the answer says: that is no reason for a null."""
+    """Contact forces on wrong rows do not prevent a certificate."""
     mechanics, u, lam, _ = known(name)
     rng = np.random.default_rng(sum(map(ord, name)))
     s = answer(u, lam)
@@ -364,7 +367,7 @@ def test_forces_on_the_wrong_rows_are_balanced_by_all(name):
 
 
 def pair(**fields: object) -> Certificate:
-    """A certificate whose numbers are given; all others are those of no error."""
+    """Return a certificate with given values; all other errors are zero."""
     none: dict[str, object] = dict.fromkeys(
         ("norm", "distance", "work", "sliding", "rounding", "claimed", "moved"), 0.0
     )
@@ -389,14 +392,14 @@ def test_the_pair_near_zero_is_evaluated_where_no_other_one_proves_anything():
 @pytest.mark.parametrize(
     ("name", "size", "reason"),
     [
-        ("soft disc", 1.0, "too far off"), (RATIOS[0], 1.0, "too far off"),
-        ("tilted disc", 1e6, "have to pull"),
+        ("soft disc", 1.0, "is too large"), (RATIOS[0], 1.0, "is too large"),
+        ("tilted disc", 1e6, "tensile contact"),
     ],
 )  # fmt: skip
 def test_an_answer_whose_own_pair_proves_nothing_has_a_sharp_bound(name, size, reason):
     mechanics, u, lam, length = known(name)
     far = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
-    with np.errstate(over="ignore"):  # as `certify` has it
+    with np.errstate(over="ignore"):  # as in `certify`
         tried = list(certificate._certificates(Undivided(mechanics), far))
     found = certify(mechanics, far)
     off, *others = errors_of(mechanics, u, far, found)
@@ -407,7 +410,7 @@ def test_an_answer_whose_own_pair_proves_nothing_has_a_sharp_bound(name, size, r
 
 
 def test_parts_of_a_bound_are_lengths_relative_to_the_least_solution():
-    """g = ½·3² + 5 + ½·7 = 13, of the answer 24, of a solution of 2 at least."""
+    """g = ½·3² + 5 + ½·7 = 13, the bound of the answer is 24, and ‖u*‖ ≥ 2."""
     found = pair(
         distance=3.0, work=5.0, rounding=7.0, sliding=2.0, claimed=24.0, moved=1.0,
         least=2.0, stretch=1.5, seminorm=True,
@@ -436,7 +439,7 @@ def test_a_single_number_that_is_none_leaves_nothing_to_certify(vector, value):
     mechanics, u, lam, _ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
     s = answer(u, lam)
     getattr(s, vector)[1] = value
-    with pytest.raises(UncertifiableError, match="the answer holds NaN or inf"):
+    with pytest.raises(UncertifiableError, match="the answer contains NaN or inf"):
         certify(mechanics, s)
 
 
@@ -454,7 +457,7 @@ def test_of_a_pair_that_proves_nothing_the_solution_may_be_zero(monkeypatch):
 @pytest.mark.parametrize("name", ["disc under rollers", "tilted disc"])
 @pytest.mark.parametrize("size", [1e-4, 1e-3])
 def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name, size):
-    """‖u*‖ ≥ ‖M‖ − √(g − ¼‖û − u_λ‖²) for the midpoint M of û and u_λ, from (3)."""
+    """By (3), ‖u*‖ ≥ ‖M‖ − √(g − ¼‖û − u_λ‖²) for the midpoint M of û and u_λ."""
     mechanics, u, lam, norm = known(name)
     disturbed = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
     found = certify(mechanics, disturbed)
@@ -465,7 +468,9 @@ def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name,
 
 
 def test_what_a_solve_leaves_undone_widens_the_ball_around_the_midpoint(monkeypatch):
-    """And the distance of u_λ; no body of this case moves rigidly."""
+    """The error of a solve also increases the distance of u_λ. No body
+    moves rigidly.
+    """
     mechanics, u, lam, norm = known("beam-ring/Nr=2/Nh=2/step=5")
     solved, left = certificate.neighbour, 1e-3 * norm
     monkeypatch.setattr(
@@ -495,7 +500,7 @@ def test_what_subdomains_do_not_feel_joins_the_error_of_the_answer(monkeypatch):
 
 
 def test_rounding_counts_as_far_as_the_answer_moves_rigidly(monkeypatch):
-    """Beside a pair that is where the solution is: γ = 0."""
+    """The pair is at the solution (γ = 0), and the answer is far from it."""
     mechanics = named("hertz-cylinder/n=2/m=2").mechanics
     point = reference_point(mechanics, reference_solution)
     R, far = mechanics.motions.constrained.toarray()[:, 0], 1e3 * np.abs(point.u).max()
@@ -528,15 +533,15 @@ def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
     ("name", "bound", "count"),
     [
         ("tilted disc", 1e-4, 3),
-        ("tilted disc", 1e-2, 2),  # not near: closed rows may be those of another one
-        ("tilted disc", 1e-8, 1),  # good enough
-        ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # which supports hold
+        ("tilted disc", 1e-2, 2),  # the error is too large for an exchange
+        ("tilted disc", 1e-8, 1),  # the bound is small enough
+        ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # supports fix all bodies
     ],
 )
 def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
     name, bound, count, monkeypatch
 ):
-    """Each pair proves a bound by its work alone."""
+    """Certificates are replaced by certificates whose only error is work."""
     mechanics, u, lam, _ = known(name)
     monkeypatch.setattr(certificate, "_proved", lambda *args: pair(work=bound**2 / 2))
     split = Undivided(mechanics)
@@ -545,7 +550,7 @@ def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
 
 @pytest.mark.parametrize("name", ["disc under rollers", "tilted disc", RATIOS[3]])
 def test_motions_either_way_are_bounded(name, monkeypatch):
-    """A motion and its opposite are one direction: which of them is named is chance."""
+    """Bounds do not depend on the sign of a rigid motion, which is arbitrary."""
     mechanics, u, lam, _ = known(name)
     reach, seen = certificate._reach, []
 

@@ -1,7 +1,7 @@
-"""Certificates beside exact solutions of the stored problem: no error above its bound.
+"""Certificates compared with exact solutions: no error exceeds its bound.
 
-Errors are those from the solution of the stored K, f, B and c in integers, in the
-energy norm of the stored K, and evaluated in integers, too.
+Solutions of the stored K, f, B and c are exact. Errors in the energy norm of the stored
+K are evaluated in integers.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ OTHERS = (
     "obstacle/n=8", "obstacle/n=8/feti=4", "membranes/S=2/n=3",
     "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
-#: linear ones, whose other solvers take very long; all but the first are soft in
-#: bending, or nearly move rigidly inside
+#: linear cases, for which other solvers take very long. All but the first are soft in
+#: bending or have nearly rigid internal motions
 PLATES = (
     "plate/Sx=12/Sy=1/n=2", "plate/Sx=40/Sy=1/n=1",
     "plate/Sx=20/Sy=1/n=1/width=20/height=0.05",
@@ -79,9 +79,10 @@ ON_RANKS = (
     "plate/Sx=12/Sy=1/n=2", "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
 DISTURBED = 10_000
-#: what arithmetic of doubles may take off a bound, which is a sum and a root of doubles
+#: factor for the rounding of bounds, which are evaluated in double precision
 ROUNDED = 1 + 1e-9
-#: errors between which effectivities are measured: below, bounds are those of rounding
+#: range of errors for which effectivities are measured; bounds of smaller errors
+#: consist of rounding
 SHARP = (1e-7, 0.1)
 
 
@@ -89,7 +90,7 @@ class Found(NamedTuple):
     """Certificates of answers to one problem."""
 
     faults: list[str]  #: errors that exceed their bounds
-    sharp: list[float]  #: bound over error
+    sharp: list[float]  #: ratios of bound to error
     bounds: list[float]
 
 
@@ -101,7 +102,7 @@ def known(name: str) -> tuple[Case, ExactSolution]:
 
 
 def certified(name: str, answers) -> Found:
-    """Certify answers, each with a label."""
+    """Certify labelled answers."""
     case, exact = known(name)
     found = Found([], [], [])
     for label, s in answers:
@@ -123,7 +124,7 @@ def disturbances(name: str, count: int):
 
 
 def solved(name: str, labels=tuple(SOLVERS)):
-    """Yield the answers of all these solvers that accept the problem."""
+    """Yield the answers of all given solvers that accept the problem."""
     case, _ = known(name)
     for label in labels:
         solver = SOLVERS[label]
@@ -133,7 +134,7 @@ def solved(name: str, labels=tuple(SOLVERS)):
             try:
                 s = solver.prepare(case.qp, tol)()
             except (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError):
-                continue  # a crash is no answer, and for other tests
+                continue  # crashes are tested elsewhere
             s = case.mechanics.to_primal(s)
             if np.isfinite(s.x).all() and np.isfinite(s.z).all():
                 yield f"{label} to {tol}", s
@@ -150,7 +151,7 @@ def test_no_error_exceeds_its_bound(name):
 
 @pytest.mark.parametrize("name", MOVED_FAR)
 def test_an_answer_that_moves_far_on_a_soft_body_is_not_better_than_it_is(name):
-    """Rounding of K, which a torn body has too, counts as much as it moves."""
+    """The rounding of K along the rigid part of the motion affects the error."""
     found = certified(name, solved(name, ("smalbe",)))
 
     assert found.faults == []
@@ -203,7 +204,9 @@ def test_no_error_exceeds_the_bound_of_two_ranks(count, names):
 
 @pytest.mark.parametrize("name", PLATES[1:3])
 def test_the_energy_of_a_displacement_of_zero_is_off_by_as_much_as_its_error(name):
-    """Zero is not soft, and the solution is: its energies in K and K_T differ most."""
+    """The energies in K and K_T differ most for soft displacements like the
+    solution.
+    """
     case, exact = known(name)
     s = exact.answer()
     zero, near = (certify(case.mechanics, replace(s, x=a * s.x)) for a in (0, 1))
@@ -217,7 +220,7 @@ def test_the_energy_of_a_displacement_of_zero_is_off_by_as_much_as_its_error(nam
 def test_an_answer_that_moves_bodies_with_their_supports_strains_the_stored_matrix(
     name,
 ):
-    """By what rounding leaves of its rigid motions, which no pair is near to."""
+    """The rigid motions have energy in the stored K because of rounding."""
     case, exact = known(f"{SMALL}/{name}")
     s, rng = exact.answer(), np.random.default_rng(0)
     moved = case.mechanics.rigid @ rng.standard_normal(case.mechanics.rigid.shape[1])
@@ -231,7 +234,7 @@ def test_an_answer_that_moves_bodies_with_their_supports_strains_the_stored_matr
 
 @pytest.mark.parametrize("name", ["contact-patch", "hertz-cylinder/n=3/m=2"])
 def test_the_solution_for_the_stored_matrix_is_the_reference(name):
-    """Though one body is softer by 1e-9, and moves as much further than it deforms."""
+    """One body is softer by 1e-9, so it moves far compared with its deformation."""
     case, exact = known(f"{name}/ratio=1e-9")
     point = reference_point(case.mechanics, reference_solution)
 

@@ -1,4 +1,4 @@
-"""A claim of infeasibility is verified if it is true, and only then."""
+"""Claims of infeasibility are verified if and only if they are true."""
 
 from dataclasses import replace
 from itertools import count
@@ -97,7 +97,9 @@ def _dense(qp):
 
 
 def test_rows_that_only_rounding_contradicts_are_not_called_infeasible():
-    """x₁ + x₂ = 0.3 and x₁ + x₂ = 0.1 + 0.2, which is another double."""
+    """The rows are x₁ + x₂ = 0.3 and x₁ + x₂ = 0.1 + 0.2, which are
+    different doubles.
+    """
     qp = qp_of(A=[[1, 1], [1, 1]], b=[0.3, 0.1 + 0.2])
     assert not is_feasible(qp)
     assert is_feasible(qp, relaxed=1e-12)
@@ -115,7 +117,7 @@ def test_planted_solutions_are_not_argued_away(shape):
 
 @pytest.mark.parametrize("z", [(1, 1 + 1e-9), (1e-30, 1e-30), (1e200, 1e200)])
 def test_the_ray_of_a_solver_is_mended_before_it_is_believed(z):
-    """On free variables (1, 1 + 1e-9) leaves c = ∓1e-9, and proves nothing as it is."""
+    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so it must be corrected."""
     assert margin(infeasible(), z=z) == 1
 
 
@@ -139,9 +141,10 @@ def test_units_of_rows_and_variables_change_no_margin():
 
 @pytest.mark.parametrize("n", [60, 150])
 def test_a_large_contradiction_of_reals_is_proven_by_an_enclosure(n):
-    """The last of n + 1 rows is a combination of the others, rounded.
+    """The last of n + 1 rows is a rounded combination of the other rows.
 
-    So it does not cancel them; a ray nearby does, since the others are independent.
+    The combination does not cancel exactly, but an exact ray is nearby, since the other
+    rows are independent.
     """
     rng = np.random.default_rng(n)
     G, t = rng.standard_normal((n, n)), rng.uniform(1, 2, n)
@@ -188,7 +191,7 @@ def test_other_claims_on_an_infeasible_qp_are_judged_as_before():
 
 
 def test_a_right_claim_counts_though_its_point_violates_rows_by_less_than_verified():
-    """x ≤ 1 and x ≥ 1 + 1e-9: x = 1 would be verified at 1e-8, were it claimed."""
+    """For x ≤ 1 and x ≥ 1 + 1e-9, x = 1 has residuals below the tolerance 1e-8."""
     qp = qp_of(G=[[1], [-1]], h=[1, -1 - 1e-9])
     point = Solution(
         status=Status.SOLVED, x=np.ones(1), y=np.zeros(0), z=np.array([0.0, 2.0]),
@@ -200,10 +203,10 @@ def test_a_right_claim_counts_though_its_point_violates_rows_by_less_than_verifi
 
 
 def search(seeds):
-    """Count the proofs; none may be of a feasible QP, none may be missing.
+    """Count the proofs; assert that none is false and none is missing.
 
-    Of QPs that are infeasible beyond rounding: with right-hand sides and bounds that
-    give way by 1e-11 of themselves.
+    A proof is required if the QP stays infeasible when right-hand sides and bounds are
+    relaxed by 1e-11 of their size.
     """
     proofs = 0
     for seed in seeds:

@@ -1,4 +1,4 @@
-"""Residuals: each KKT condition broken alone, and what must not change them."""
+"""KKT residuals: violation of single conditions, and invariances."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ from tests.support.threads import on_threads
 
 
 def one_variable(q=1.0, h=0.0):
-    """min ½x² + q·x  subject to  x ≤ h."""
+    """Return min ½x² + q·x subject to x ≤ h."""
     return QP(P=np.eye(1), q=np.array([q]), A=no_rows(1), b=np.zeros(0),
               G=np.eye(1), h=np.array([h]),
               lb=np.full(1, -np.inf), ub=np.full(1, np.inf))  # fmt: skip
@@ -43,7 +43,9 @@ def point(x, z=0.0, z_box=0.0):
 
 
 def test_a_wrong_sign_multiplier_fails_though_the_other_residuals_vanish():
-    """x = 0, z = −1 for min ½x² + x, x ≤ 0: feasible, stationary, no gap; x* = −1."""
+    """x = 0, z = −1 for min ½x² + x, x ≤ 0: feasible, stationary, no gap,
+    but x* = −1.
+    """
     r = kkt_residuals(one_variable(), point(0.0, z=-1.0))
 
     assert (r.primal, r.complementarity, r.gap) == (0, 0, 0)
@@ -59,7 +61,7 @@ def test_a_multiplier_on_an_absent_bound_fails():
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_box_multiplier_pushing_outwards_fails(sign):
-    """Active bound with the multiplier of the opposite side, kept stationary by q."""
+    """An active bound has the multiplier of the opposite bound, balanced by q."""
     qp = replace(
         one_variable(q=-sign), h=np.array([9.0]), lb=np.zeros(1), ub=np.ones(1)
     )
@@ -91,7 +93,7 @@ def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
     ids=["A x > b", "A x < b", "G x > h", "x < lb", "x > ub"],
 )
 def test_each_violated_constraint_is_measured_relative_to_its_terms(broken, expected):
-    """At x = (1, 1), violated by ¼."""
+    """Each constraint is violated by ¼ at x = (1, 1)."""
     free = dict(
         P=np.eye(2), q=-np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
         h=np.zeros(0), lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
@@ -121,10 +123,12 @@ def at(x, y=(), z_box=(0, 0)):
 @pytest.mark.parametrize(
     ("qp", "s"),
     [
-        # x₂ appears nowhere: its size must not excuse x₁ ≥ 1, or x₁ = 1, violated by 1
+        # x₂ occurs in no term: its size must not hide that x₁ ≥ 1 or x₁ = 1 is violated
+        # by 1
         (diagonal([1, 0], [0, 0], lb=[1, -np.inf]), at([0, 1e12])),
         (diagonal([1, 0], [0, 0], A=[[1, 0]], b=[1]), at([0, 1e12], [0])),
-        # y and z_box cancel: their size must not excuse x₂ = 0 where x₂* = 1
+        # y and z_box cancel: their size must not hide the error of x₂ = 0, since x₂* =
+        # 1
         (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[0], lb=[0, -np.inf]),
          at([0, 0], [1e12], [-1e12, 0])),
         (diagonal([0, 1], [0, -1], A=[[1, 0]], b=[1], lb=[1, -np.inf], ub=[1, np.inf]),
@@ -140,7 +144,7 @@ def test_no_part_of_an_answer_can_excuse_another(qp, s):
 
 @pytest.mark.parametrize("size", [1e-9, 1e-12, -1e-12])
 def test_rounding_errors_about_a_zero_solution_are_small(size):
-    """min ½x² + x, x ≥ 0 has x* = 0: all terms that could serve as a scale vanish."""
+    """min ½x² + x, x ≥ 0 has x* = 0, where all terms of the objective vanish."""
     qp = diagonal([1, 1], [1, 1], lb=0)
     s = at([size, abs(size)], z_box=[-1, -1])
 
@@ -171,7 +175,7 @@ def test_a_planted_solution_has_no_residual_and_a_moved_one_has(manufactured, se
 
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_units_of_objective_variables_and_rows_do_not_matter(manufactured, seed):
-    """Objective × 2²⁰, x in units of 2⁻⁷, rows × powers of two: the same residuals."""
+    """Residuals do not change with objective × 2²⁰, x in units of 2⁻⁷, scaled rows."""
     qp, s = manufactured("everything", seed=seed, dense=True)
     s = replace(s, x=s.x + 1e-3, y=s.y * 1.01, z=s.z - 1e-3, z_box=s.z_box * 0.99)
     o, u = 2.0**20, 2.0**-7
@@ -212,7 +216,8 @@ def test_the_trivial_solution_of_a_trivial_problem_is_verified():
     ("claimed", "worst", "expected"),
     [
         (Status.SOLVED, 9e-8, Verdict.VERIFIED),
-        (Status.ITERATION_LIMIT, 9e-8, Verdict.VERIFIED),  # it knew less than it had
+        # the point is better than the claim
+        (Status.ITERATION_LIMIT, 9e-8, Verdict.VERIFIED),
         (Status.SOLVED, 2e-7, Verdict.INACCURATE),
         (Status.SOLVED, 3e-4, Verdict.INACCURATE),  # half of the digits: √1e-7
         (Status.SOLVED, 4e-4, Verdict.WRONG),
@@ -250,7 +255,7 @@ def test_an_operator_is_judged_alike_in_all_units(manufactured, unit):
 
 
 def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufactured):
-    """Lengths come from Pᵢᵢ, which this one does not tell: they differ by a factor."""
+    """Lengths depend on Pᵢᵢ, so that they differ if the operator has no diagonal."""
     qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
     one = kkt_residuals(qp, moved)
@@ -294,7 +299,7 @@ def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
 
 
 def test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer():
-    """min ½x₁² − x₁ at its minimum; x₂ may be as long as it likes."""
+    """min ½x₁² − x₁ at its minimum; x₂ is arbitrary."""
 
     def product(x):
         return np.array([x[0], 2.0**-52 * x[0]])
@@ -323,14 +328,14 @@ def test_the_least_scale_of_energy_is_a_hundredth_of_what_a_variable_gains_alone
     qp, expected
 ):
     nowhere = at(0 * qp.q, z_box=0 * qp.q)
-    with np.errstate(invalid="ignore"):  # 0·∞, where there is no bound
+    with np.errstate(invalid="ignore"):  # 0·∞ for absent bounds
         found = energy_at(qp, nowhere)
 
     assert found == pytest.approx(expected / 100)
 
 
 class Diagonal:
-    """P of a QP whose vectors lie on ranks."""
+    """Diagonal P of a QP with distributed vectors."""
 
     def __init__(self, d):
         self.d, self.shape = d, (d.size, d.size)
@@ -343,7 +348,7 @@ class Diagonal:
 
 
 def test_a_rank_without_bounds_takes_part_in_the_residuals():
-    """The last of three ranks holds 3 of 9 variables, all without bounds."""
+    """The last of three ranks has 3 of 9 variables, all without bounds."""
     rng = np.random.default_rng(5)
     d, q, x, z = 1 + rng.random((4, 9))
     lb = np.where(np.arange(9) < 6, 0.5, -np.inf)

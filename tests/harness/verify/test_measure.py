@@ -1,4 +1,4 @@
-"""The clock in this process; what kills a process is in test_run.py."""
+"""Timing in this process; test_run.py tests solvers that kill their process."""
 
 import gc
 import subprocess
@@ -18,7 +18,7 @@ from tests.support import ADVERSARIES
 
 PLUGIN = load_plugin(ADVERSARIES)
 
-#: places in the file of these solvers, as messages name them
+#: line references to this file in messages
 AT = {
     code: f" ({ADVERSARIES.name}:{line})"
     for line, text in enumerate(ADVERSARIES.read_text().splitlines(), start=1)
@@ -104,7 +104,7 @@ SOLVERS = {"admm": Admm(), "faster": Faster()}
 def test_a_failure_ends_with_the_last_place_in_the_solver_s_own_file(
     qp, tmp_path, name
 ):
-    """Not in a helper's, nor in numpy's; no folder of a machine is in it."""
+    """The message names no helper, no NumPy file and no folder."""
     (tmp_path / "helper.py").write_text(HELPER)
     (tmp_path / "admm.py").write_text(ADMM)
     solver = load_plugin(tmp_path / "admm.py").solvers[name]
@@ -121,7 +121,7 @@ def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
     message = measure(load_plugin(path).solvers["admm"], qp, 1e-6).solution.message
 
     assert message.endswith(".py:6)")
-    assert len(message) < 2000  # of the protocol
+    assert len(message) < 2000  # limit of the protocol
 
 
 @pytest.mark.parametrize(
@@ -151,12 +151,12 @@ def test_both_phases_are_timed_and_add_up(qp):
     assert m.prepare_seconds > 0
     assert m.solve_seconds > 0
     assert m.total_seconds == pytest.approx(m.prepare_seconds + m.solve_seconds)
-    assert m.inner_loops == 1  # nobody has asked for a longer sample
+    assert m.inner_loops == 1  # no longer sample was requested
 
 
 @pytest.mark.parametrize("sample_seconds", [0.0, 0.009, 0.011, 0.1])
 def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_seconds):
-    """By a clock that only the solver moves: 1 ms to prepare, 4 ms to solve."""
+    """The clock advances only in the solver: 1 ms in `prepare`, 4 ms in the solve."""
     now = [0.0]
     honest = PLUGIN.solvers["honest"]
 
@@ -226,7 +226,7 @@ class UnspeakableError(Exception):
 
 
 class Unreadable:
-    """An array whose reading fails, by an exception that cannot be shown either."""
+    """Array that raises an exception without a readable text when it is read."""
 
     @property
     def shape(self):
@@ -319,12 +319,13 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
     monkeypatch.setattr(measuring, "perf_counter", lambda: next(clock))
     m = measure(Asks(), qp, 1e-6).cost
 
-    assert asked == [1]  # the clock had been read once
-    assert m.prepare_seconds == 2  # by a clock that ticks when it is read, or asked
+    assert asked == [1]  # the clock was read once before
+    # the clock advances at each reading and at each call of `declines`
+    assert m.prepare_seconds == 2
 
 
 class ReadsEntries:
-    """Takes its x from the entries of P."""
+    """Solver that computes x from the entries of P."""
 
     def declines(self, qp):
         return needs_matrices(qp)
@@ -339,7 +340,7 @@ class ReadsEntries:
 
 @pytest.fixture
 def by_products():
-    """½xᵀPx − Σx with P = diag(1, 2, 4), known by its products."""
+    """Return ½xᵀPx − Σx with P = diag(1, 2, 4) as an operator."""
     free = np.full(3, np.inf)
     makers = {"matrix": lambda arrays: lambda x: arrays["P"] @ x}
     arrays = {"P": np.diag([1.0, 2.0, 4.0])}
@@ -382,8 +383,8 @@ def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
     [
         (-1, "-1"),
         (2**53 + 1, "9007199254740993"),
-        (10**300, "a number far out of range"),
-        (-(10**300), "a number far out of range"),
+        (10**300, "a number far outside this range"),
+        (-(10**300), "a number far outside this range"),
     ],
 )
 def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, shown):
@@ -400,7 +401,9 @@ def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, sh
 
 
 def test_processes_of_runs_import_nothing_that_they_never_call():
-    """They start tens of times a run: statistics alone would double what that takes."""
+    """Processes start tens of times in a run, so imports such as statistics
+    are costly.
+    """
     needless = {
         "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.spatial",
         "matplotlib", "pandas", "pyarrow", "distributed", "rich",

@@ -1,4 +1,4 @@
-"""Multipliers of points that come without: planted KKT points, and points beside."""
+"""Computed multipliers, at planted KKT points and at other points."""
 
 import numpy as np
 import pytest
@@ -13,9 +13,9 @@ TOL = 1e-8
 def solved_qp(seed, *, definite=True):
     """Return a QP with redundant and degenerate rows, and its exact solution x.
 
-    Every kind of constraint: equality rows of which some are combinations of others,
-    active inequality rows with and without a multiplier, some written twice, bounds on
-    either side, fixed variables and free ones.
+    The QP has dependent equality rows, active inequality rows with and without a
+    multiplier, duplicated rows, bounds on either side, fixed variables and free
+    variables.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 30))
@@ -68,9 +68,9 @@ def test_signs_of_computed_multipliers_are_those_of_their_bounds():
 
 
 def test_a_point_beside_the_solution_has_no_multipliers():
-    """100·tol off in every component, on strictly convex QPs: more than 10·tol is left.
+    """With an error of 100·tol in every component, a residual above 10·tol remains.
 
-    No multipliers would do, so none are found.
+    P is strictly convex, so no multipliers have smaller residuals.
     """
     left = []
     for seed in range(200):
@@ -83,7 +83,7 @@ def test_a_point_beside_the_solution_has_no_multipliers():
 
 
 def test_a_nearly_active_row_bears_what_its_slack_permits():
-    """min ½x² − x with x ≤ ½, at x = ½ − δ: the multiplier ½ costs ½δ."""
+    """For min ½x² − x, x ≤ ½, at x = ½ − δ, the multiplier ½ has the cost ½δ."""
     delta = 1e-9
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
     s = with_multipliers(qp, np.array([0.5 - delta]))
@@ -93,7 +93,7 @@ def test_a_nearly_active_row_bears_what_its_slack_permits():
 
 
 def test_an_inactive_row_bears_nothing():
-    """The minimum of ½x² − x is 1; x = 0 is none, whatever the row x ≤ ½ could bear."""
+    """The minimum of ½x² − x is at 1, so x = 0 is refuted in spite of the row x ≤ ½."""
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
     s = with_multipliers(qp, np.array([0.0]))
 
@@ -109,7 +109,9 @@ def test_a_row_that_pulls_the_wrong_way_bears_nothing():
 
 
 def test_a_vertex_of_a_linear_program_with_more_rows_than_it_needs_is_proven():
-    """min −x₁ − x₂ over x ≤ 1, x₁ + x₂ ≤ 2, 2x₁ + x₂ ≤ 3: four rows meet at (1, 1)."""
+    """For min −x₁ − x₂ over x ≤ 1, x₁ + x₂ ≤ 2, 2x₁ + x₂ ≤ 3, four rows
+    meet at (1, 1).
+    """
     G = np.array([[1, 0], [0, 1], [1, 1], [2, 1]])
     qp = QP.from_arrays(np.zeros((2, 2)), [-1, -1], G, [1, 1, 2, 3], ub=1)
     x = np.ones(2)
@@ -120,7 +122,7 @@ def test_a_vertex_of_a_linear_program_with_more_rows_than_it_needs_is_proven():
 
 @pytest.mark.parametrize("power", [-6, 6])
 def test_units_of_rows_and_variables_change_nothing(power):
-    """Rows, variables and objective multiplied by powers of ten."""
+    """Rows, variables and objective are multiplied by powers of ten."""
     for seed in range(50):
         qp, x = solved_qp(seed)
         rng = np.random.default_rng(seed)
@@ -138,7 +140,7 @@ def test_units_of_rows_and_variables_change_nothing(power):
 
 
 def test_multipliers_that_are_given_stay():
-    """One of two equal rows keeps its multiplier; the other takes the remainder."""
+    """One of two equal rows has a given multiplier; the other gets the remainder."""
     qp = QP.from_arrays([[1.0]], [-3.0], G=[[1.0]], h=[1.0], ub=[1.0])
     one = np.array([1.0])
     s = with_multipliers(qp, one, z=np.array([0.5]))

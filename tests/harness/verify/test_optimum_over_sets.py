@@ -1,7 +1,7 @@
-"""Optima, references and multipliers over sets of any kind, against rational truth.
+"""Optima and multipliers over convex sets, compared with rational solutions.
 
-The planted solutions have components that are small integers times powers of two, on
-balls through Pythagorean pairs: f* and every error are known without rounding.
+Components of planted solutions are small integers times powers of two; on balls, they
+form Pythagorean pairs. Therefore f* and all errors are known without rounding.
 """
 
 from dataclasses import replace
@@ -21,12 +21,12 @@ from tests.support.balls import Balls
 
 INF = np.inf
 PAIRS = [(3, 4, 5), (5, 12, 13), (8, 15, 17), (-7, 24, 25), (4, -3, 5)]
-#: ways to deceive, each alone and all of them in pairs
+#: traps, which are tested singly and in pairs
 TRAPS = ("singular", "cancelled", "tiny ball", "wide ball", "weak", "units", "point")
 
 
 class ExactProblem:
-    """A QP over balls, bounds and rows, its solution and f*, all of them exact."""
+    """A QP over balls, bounds and rows, with its exact solution and f*."""
 
     def __init__(self, traps, seed):
         rng = np.random.default_rng(seed)
@@ -99,7 +99,7 @@ def test_planted_points_over_balls_are_solutions_to_the_last_digit(trap):
 
 
 class AttackOverSets(Attack):
-    """The same moves, with projections in place of bounds."""
+    """Attack with projections onto the sets instead of bounds."""
 
     def project(self, x):
         for one in self.qp.sets:
@@ -128,10 +128,10 @@ class AttackOverSets(Attack):
 
 
 def search(seed, tries, each=40):
-    """Attack QPs with up to two traps; list what was wrongly judged.
+    """Attack QPs with up to two traps; return wrong verdicts.
 
-    Where no optimum is proven, residuals decide, and allow a ball smaller than its
-    variables' shifts by others a violation relative to these.
+    If no optimum is proven, residuals decide the verdict. They permit a violation of a
+    ball relative to the shifts of its variables by other variables.
     """
     rng = np.random.default_rng(seed)
     wrong, refuted, verified, proven = [], [], 0, 0
@@ -209,7 +209,7 @@ def test_multipliers_of_a_solution_over_balls_prove_it(seed):
 
 @pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny ball")])
 def test_multipliers_over_balls_are_found_whatever_rows_they_share(trap):
-    """Solutions are rounded: they meet the radii up to rounding only."""
+    """Solutions are rounded, so they are on the spheres only up to rounding."""
     worst = []
     for seed in range(20):
         planted = ExactProblem({trap}, seed)

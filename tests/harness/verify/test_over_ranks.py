@@ -1,4 +1,4 @@
-"""Residuals and certificates by several ranks: what one process finds of the whole."""
+"""Residuals and certificates on several ranks, compared with one process."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from tests.support import ROOT, SUPPORT
 
 pytestmark = pytest.mark.together
 
-#: some discs slip and others stick
+#: case in which some discs slip and others stick
 SPACE = "greco/n=4/dim=3/depth=2/feti=2/dual"
 HELD = (
     "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual",
@@ -27,12 +27,13 @@ HELD = (
 )
 HELD_BY_CONTACT = "membranes/S=2/n=3/dual"
 ELIMINATED = "plate/Sx=1/Sy=4/n=2/supports=eliminated/dual"
-#: some rows at its crosspoints depend on others
+#: case with dependent rows at crosspoints
 REDUNDANT = "plate/Sx=3/Sy=3/n=2/pattern=column/jump=10/glue=redundant/dual"
 PATCH = "contact-patch/feti=3/dual"
 HERTZ = "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e6/dual"
 MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
-#: of a bound; K is the sum over subdomains on ranks, and the stored one elsewhere
+#: relative difference of bounds: ranks use the sum over subdomains, one process the
+#: stored K
 ROUNDING = 1e-4
 
 
@@ -76,7 +77,7 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        # ranks allow for what rounding makes of any assembled K, one knows its own
+        # ranks bound the rounding of any assembled K, one process evaluates its own K
         assert bounds["energy_bound"] == pytest.approx(
             one["bound"], rel=ROUNDING, abs=1e-10
         )
@@ -91,7 +92,8 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
-        # how far û keeps out of the other body is rounding, and counts below 1e-8
+        # û is moved out of the other body by rounding errors, which affect terms below
+        # 1e-8
         assert bounds["energy_bound"] == pytest.approx(
             one["bound"], rel=ROUNDING, abs=1e-11
         )
@@ -102,7 +104,7 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
 
 def test_what_supports_eliminate_is_certified_in_subdomains_that_float(found):
     for answer in found[ELIMINATED]:
-        # u_λ of the whole is the nearest there is, which one process finds
+        # one process finds the nearest u_λ of the whole body
         bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
 
         assert answer["same"]
@@ -119,7 +121,7 @@ def test_quantities_by_ranks_are_those_of_one_process(found, case):
 
         assert list(by_ranks) == list(by_one)
         for name, value in by_one.items():
-            # the gap of a node that touches is what rounding makes of a zero
+            # the gap of a node in contact is zero up to rounding
             least = 1e-15 if name.endswith("smallest_gap") else 1e-6
             assert by_ranks[name] == pytest.approx(value, rel=1e-9, abs=least), name
 
@@ -139,7 +141,7 @@ def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
 
 
 def test_an_exact_solution_is_recovered_across_subdomains(found):
-    """The patch test: uniaxial stress everywhere, though no rank has all of a body."""
+    """In the patch test, stress is uniaxial, and no rank has an entire body."""
     answer = found[PATCH][-2]["by_ranks"]["quantities"]
     # plane strain, ν = 0.3: σ_z = −0.3p, and σ_vM = √(1 − ν + ν²)·p
     exact = (1 - 0.3 + 0.3**2) ** 0.5 * 1e6
@@ -202,13 +204,13 @@ def test_a_load_that_nothing_balances_is_refused_in_the_words_of_one_process():
     assert pushed[0] == pushed[1]
     assert lifted[0] == lifted[1]
     assert "nothing balances the load of body upper along x" in pushed[0]
-    assert "contact would have to pull" in lifted[0]
+    assert "only tensile contact forces" in lifted[0]
 
 
 def quantities_of_both(answer):
-    """Numbers by ranks and by one process, but for the memory of blocks.
+    """Return the numbers from ranks and from one process, without the memory of blocks.
 
-    Each rank has blocks of its own of the kinds that it has.
+    The memory differs, since each rank stores separate blocks of its classes.
     """
     both = [flat(answer[one]["quantities"]) for one in ("by_ranks", "by_one")]
     for found in both:
@@ -217,7 +219,7 @@ def quantities_of_both(answer):
 
 
 def flat(quantities, prefix=""):
-    """Numbers by their places in nested tables and lists."""
+    """Return numbers by their paths in nested tables and lists."""
     match quantities:
         case dict():
             items = quantities.items()

@@ -11,9 +11,9 @@ from mortarbench.harness.verify.products import (
     times_rows,
 )
 
-BEYOND = np.longdouble(2) ** -60  #: what a double beside one cannot hold
+BEYOND = np.longdouble(2) ** -60  #: below the resolution of doubles near one
 LAPLACIAN = csc_array([[1.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]])
-ONES = np.full((4, 1), 0.5)  #: its kernel, orthonormal
+ONES = np.full((4, 1), 0.5)  #: orthonormal kernel of the matrix
 
 
 def projected(M, R, starts, v, left=0):

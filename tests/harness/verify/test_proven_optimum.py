@@ -1,4 +1,4 @@
-"""No wrong answer is verified, no right one refuted: by hand, then by search."""
+"""Verdicts by proven optima: no wrong answer is verified, no right answer refuted."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -36,7 +36,7 @@ INF = np.inf
 
 
 def qp_of(P, q, *, A=None, b=(), G=None, h=(), lb=-INF, ub=INF):
-    """Return a QP from nested lists; a list of numbers is a diagonal P."""
+    """Return a QP from nested lists; a flat list defines a diagonal P."""
     n, P = len(q), np.array(P, dtype=float)
     rows = [no_rows(n) if M is None else np.array(M, dtype=float) for M in (A, G)]
     lb, ub = (np.array(np.broadcast_to(v, n), dtype=float) for v in (lb, ub))
@@ -85,7 +85,7 @@ UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
         (LONG, at([0, 1e12, 1e12], [-1, 1])),
         (PAID, at([0, 1e12, 1e12], [0, -1])),
         (PAID, at([0.5, 1e12, 1e12], [-0.5, -0.5])),
-        (UNITS, at([1, 0])),  # below its bound by all that there is of it
+        (UNITS, at([1, 0])),  # below its bound by the entire bound
     ],
 )
 def test_a_wrong_point_is_refuted_by_its_residuals(qp, s):
@@ -111,9 +111,9 @@ TINY = 6e-13  #: ½x² + ½x² = 4e-25
         (qp_of([1, 1], [0, 0], A=[[1, -1]], b=[0]), at([TINY, TINY], [0])),
         (qp_of([1, 1], [0, 0], G=[[1, 1]], h=[5]), at([TINY, TINY], z=[0])),
         (qp_of([1, 1], [1e-17, -3e-17], lb=0, ub=3), at([TINY, TINY])),
-        # a gradient of 1e-9 with a noise of 1e-10, beside one of 1
+        # a gradient of 1e-9 with a noise of 1e-10, together with a gradient of 1
         (qp_of([1, 1], [-1, -1e-9]), at([1, 9e-10])),
-        # x₂ rests at its bound, whose multiplier of 1e-9 is missing
+        # x₂ is at its bound, whose multiplier of 1e-9 is missing
         (qp_of([1, 0], [-1, 1e-9], lb=[-INF, 75]), at([1, 75])),
         (qp_of([1, 0], [-1, -1e-9], ub=[INF, -75]), at([1, -75])),
         (qp_of([1, 0], [-1e-6, 1e-15], lb=[-INF, 0]), at([1e-6, 0])),
@@ -128,9 +128,9 @@ def test_without_cost_a_point_far_from_zero_is_still_wrong():
 
 
 def test_rows_tighten_the_widths_of_variables():
-    """x₁ + x₂ = 1, x ≥ 0: each at most 1.
+    """x₁ + x₂ = 1, x ≥ 0 implies xᵢ ≤ 1.
 
-    2x₁ − x₃ ≤ 4, x₁ ≥ −1, x₃ ≤ 6: x₁ ≤ 5, x₃ ≥ −6.
+    2x₁ − x₃ ≤ 4, x₁ ≥ −1, x₃ ≤ 6 implies x₁ ≤ 5, x₃ ≥ −6.
     """
     simplex = qp_of([1, 1], [0, 0], A=[[1, 1]], b=[1], lb=0)
     open_ended = qp_of(
@@ -142,11 +142,12 @@ def test_rows_tighten_the_widths_of_variables():
         assert ub - lb == pytest.approx(widths)
 
 
-#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 0 hold x at (0, 0): f* = 0
+#: the rows x₂ ≤ 0 and δx₁ + x₂ ≥ 0 imply x* = (0, 0), f* = 0
 DELTA = 2.0**-34
 NEARLY = qp_of([1, 1], [0.5, 0], G=[[0, 1], [-DELTA, -1]], h=[0, 0])
 BETWEEN = at([-0.5, DELTA / 4], z=[0, 0])  # violates both by δ/4; f = −0.125
-#: the same moved by (1.5, 0): the second row's right-hand side tells its size
+#: the same problem, shifted by (1.5, 0); the right-hand side of the second row defines
+#: its scale
 MOVED = qp_of([1, 1], [-1, 0], G=[[0, 1], [-DELTA, -1]], h=[0, -1.5 * DELTA])
 
 #: curvature 4ε along (1, −1), where the slope at (½, ½) is 2γ: f* = −½ − γ²/2ε = −1
@@ -158,7 +159,7 @@ SHORT = at([0.5, 0.5])  # f = −½
 
 
 def test_residuals_refute_no_point_between_nearly_parallel_rows():
-    """A reference that is only as good proves nothing: rational arithmetic does."""
+    """A reference with the same error proves nothing, unlike rational arithmetic."""
     assert kkt_residuals(NEARLY, BETWEEN).worst <= 1e-9
     optimum = proven_optimum(NEARLY, lambda _: BETWEEN)
 
@@ -169,18 +170,18 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
 
 @pytest.mark.parametrize("angle", [0.3, 1.0, 2.5])
 def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(angle):
-    """Curvature 1e-16 along a direction with a slope of 1e-8, turned and rounded."""
+    """P has curvature 1e-16 along a direction of slope 1e-8, rotated and rounded."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     P = turn @ np.diag([1, 1e-16]) @ turn.T
     qp = qp_of((P + P.T) / 2, turn @ [1, 1e-8])
     (a, b), (_, d) = ([Fraction(v) for v in row] for row in qp.P)
     p, q = map(Fraction, qp.q)
     value = -(d * p * p - 2 * b * p * q + a * q * q) / (a * d - b * b) / 2
-    assert a * d > b * b  # as stored: else it is unbounded
+    assert a * d > b * b  # in the stored numbers; otherwise, the QP is unbounded
     s = at(turn @ [-1, 0])
     error = decided(qp, s, kkt_residuals(qp, s), TOL, proves(reference_solution))
 
-    assert value < -0.6  # the point has -0.5
+    assert value < -0.6  # f = −0.5 at the point
     assert error is not None
     assert error > 1e-4
 
@@ -215,7 +216,7 @@ def new_record(**changes):
 def test_an_answer_is_judged_at_the_accuracy_that_is_not_its_tolerance(
     accuracy, expected
 ):
-    """min ½x² − x at x = 1.001: a residual of 1e-3."""
+    """For min ½x² − x, x = 1.001 has a residual of 1e-3."""
     s = at([1.001])
     measured = judged(new_record(accuracy=accuracy), qp_of([1], [-1]), s)
 
@@ -239,7 +240,7 @@ def test_where_the_reference_fails_residuals_stand():
     def fails(_):
         raise ArithmeticError
 
-    qp = qp_of(np.eye(MANY) + 1, [-1] * MANY)  # more than rational arithmetic takes
+    qp = qp_of(np.eye(MANY) + 1, [-1] * MANY)  # too large for rational arithmetic
     s = at([1 / (MANY + 1)] * MANY)
 
     assert decided(qp, s, kkt_residuals(qp, s), TOL, proves(fails)) is None
@@ -284,7 +285,8 @@ def test_a_point_that_is_no_optimum_has_no_exact_value():
     exact = exact_optimum(qp, right)
     assert exact is not None
     assert exact.value == Fraction(-3, 4)
-    assert exact_optimum(qp, wrong) is None  # the bound would pull
+    # the multiplier of the bound would have the wrong sign
+    assert exact_optimum(qp, wrong) is None
 
 
 BOUNDED = qp_of([1], [1], lb=0)  # x* = 0
@@ -296,8 +298,8 @@ BOUNDED = qp_of([1], [1], lb=0)  # x* = 0
         (BOUNDED, at([-1])),
         (qp_of([1], [-1], ub=0), at([1])),
         (qp_of([1], [-1], G=[[1]], h=[0]), at([1], z=[0])),
-        (qp_of([1], [1], G=[[1]], h=[0]), at([0], z=[1])),  # x* = −1: the row pulls
-        (qp_of([1], [-1], lb=0), at([0], z_box=[-1])),  # x* = 1: the bound pulls
+        (qp_of([1], [1], G=[[1]], h=[0]), at([0], z=[1])),  # x* = −1: wrong sign of z
+        (qp_of([1], [-1], lb=0), at([0], z_box=[-1])),  # x* = 1: wrong sign of z_box
         (qp_of([1, 1], [0, 0], A=[[1, 0], [1, 0]], b=[1, 2]), at([1, 0], [0, 0])),
     ],
     ids=["x < lb", "x > ub", "G x > h", "z < 0", "z_box > 0 at lb", "infeasible"],
@@ -321,12 +323,12 @@ def test_the_optimum_of_a_well_conditioned_qp_is_known_to_fourteen_digits():
     assert optimum.doubt <= 1e-14
 
 
-MANY = 45  #: variables, more than are solved for in rational arithmetic
+MANY = 45  #: number of variables, too large for rational arithmetic
 
 
 @pytest.mark.parametrize("unit", [2.0**-60, 1.0, 2.0**60])
 def test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy(unit):
-    """Two rows Σxⱼ = n/2 with multipliers of 5e11, which balance q to 1e-4 only."""
+    """Two rows Σxⱼ = n/2 with multipliers of 5e11 balance q only to 1e-4."""
     row = np.ones((2, MANY))
     qp = qp_of([unit] * MANY, [-unit] * MANY, A=row, b=[MANY / 2] * 2)
     off = 2.0**39 + 0.5 + 2.0**-13
@@ -341,7 +343,7 @@ def test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy(unit):
 
 
 def test_active_sets_that_recur_prove_nothing():
-    """The sets 111, 101, 110 of the rows follow each other for ever."""
+    """The active sets 111, 101, 110 of the rows form a cycle."""
     P = [[16, 1, -7, 6], [1, 8, 1, 0], [-7, 1, 6, -4], [6, 0, -4, 7]]
     G = [[3, -2, -3, 1], [-1, -3, 0, 2], [-3, 0, -2, 1]]
     qp = qp_of(P, [3, 3, 3, -2], G=G, h=[1, 1, 2], lb=-1)
@@ -354,7 +356,7 @@ def test_active_sets_that_recur_prove_nothing():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point(sign):
-    """x₁ + x₂ = 2, twice, and x₁ = x₂; of all multipliers the least ones count."""
+    """x₁ + x₂ = 2 (twice) and x₁ = x₂: the least multipliers are used."""
     A = np.zeros((3, MANY))
     A[:, :2] = sign * np.array([[1, 1], [1, 1], [1, -1]])
     q = np.zeros(MANY)
@@ -398,7 +400,9 @@ def vectors(n):
 
 
 def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
-    """Terms of 1e24 at a solution 1e10 along the free direction x₁ = −x₃, f* = 2⁻²⁰."""
+    """Terms are 1e24 at a solution 1e10 along the free direction x₁ = −x₃,
+    f* = 2⁻²⁰.
+    """
     planted = hard(frozenset({"cancelled", "duplicates", "redundant"}), 194299169)
     qp, s = planted.qp, planted.solution
     free = np.array([1.0, 0, -1, 0])
@@ -413,14 +417,14 @@ def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
     assert optimum.energy <= 1e4 * 2.0**-20
 
 
-#: (½, ½, ½), f* = 1.5; between its bounds each variable could gain 1e12
+#: x* = (½, ½, ½), f* = 1.5; within its bounds, each variable could gain 1e12
 WIDE = qp_of(
     [0] * 3, [1] * 3, G=[[-1, -1, 0], [0, -1, -1], [-1, 0, -1]], h=[-1] * 3,
     lb=-1e12, ub=1e12,
 )  # fmt: skip
-#: (0, 0, 1), f* = −½; without its bound each of the first two could gain 1e12
+#: x* = (0, 0, 1), f* = −½; without bounds, each of x₁, x₂ could gain 1e12
 PUSHED = qp_of([1] * 3, [1e6, 1e6, -1], lb=[0, 0, -INF])
-#: (−3, 3.5), f* = −1.2e10: the row is worth nothing beside the bound
+#: x* = (−3, 3.5), f* = −1.2e10; the multiplier of the row is negligible
 BESIDE = qp_of([0, 0], [4e9, 1], A=[[0, 1]], b=[3.5], lb=[-3, -INF])
 
 
@@ -452,7 +456,7 @@ def test_far_bounds_do_not_excuse_an_error_where_residuals_alone_decide():
 
 
 def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
-    """min ½x², x = 1, and a fixed variable of cost −½: f* = 0, terms ½."""
+    """min ½x², x = 1, with a fixed variable of cost −½: f* = 0, terms of ½."""
     qp = qp_of([1, 0], [0, -0.5], A=[[1, 0]], b=[1], lb=[-INF, 1], ub=[INF, 1])
     s = at([1 + 1e-9, 1], [-1 - 1e-9], z_box=[0, 0.5])
 
@@ -461,7 +465,7 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
     assert error == pytest.approx(1e-9, rel=3)
     further = at([1 + 4e-9, 1], [-1 - 4e-9], z_box=[0, 0.5])
     residuals = kkt_residuals(qp, further)
-    assert residuals.worst > 10 * TOL  # to the digits of f: they do not decide
+    assert residuals.worst > 10 * TOL  # relative to f, so residuals do not decide
     error = decided(qp, further, residuals, TOL, proves(reference_solution))
     assert error == pytest.approx(4e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
@@ -513,7 +517,7 @@ def test_planted_points_are_solutions_to_the_last_digit(kind):
 
 
 class Products:
-    """An operator P that tells products alone."""
+    """Operator P that provides only products."""
 
     def __init__(self, P):
         self.P, self.shape, self.dtype = P, P.shape, P.dtype
@@ -523,7 +527,7 @@ class Products:
 
 
 def with_idle(qp, rng, count):
-    """Append variables that cost nothing at zero: idle, or with curvature; bounded."""
+    """Append variables without cost, with or without curvature and bounds."""
     n = qp.q.size
     bends = np.ldexp(1.0, rng.integers(-30, 31, rng.choice([1, count])))
     P = np.pad(qp.P, (0, count))
@@ -536,13 +540,13 @@ def with_idle(qp, rng, count):
     )  # fmt: skip
 
 
-#: how a planted QP is handed in: further variables, and P as an operator
+#: variants of a planted QP: number of further variables, and P as an operator or not
 WAYS = {"as it is": (0, False), "400 idle": (400, False), "operator": (0, True),
         "operator, 400 idle": (400, True)}  # fmt: skip
 
 
 class Attack:
-    """Points of one planted QP that somebody may want to pass off as its solution."""
+    """Points of a planted QP that may be mistaken for its solution."""
 
     def __init__(self, planted, rng, way="as it is", *, is_unique=True):
         self.qp, self.s, self.value = planted.qp, planted.solution, planted.value
@@ -568,10 +572,10 @@ class Attack:
         return float(x @ (self.qp.P @ x) / 2 + self.qp.q @ x)
 
     def error(self, s):
-        """|f − f*|/|f*|; relative to the terms of f at the solution where f* is zero.
+        """Return |f − f*|/|f*|, or the error relative to the terms of f if f* is zero.
 
-        As zero counts what is below 1e-10 of them: rounding x moves f by 1e-6 of that.
-        The terms of qᵀx are its products, which may cancel, too.
+        f* counts as zero below 1e-10 of its terms, since rounding of x changes f by
+        1e-6 of this value. The terms of qᵀx are its products, which may cancel.
         """
         x = self.s.x
         terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q) @ abs(x)) or 1.0
@@ -579,9 +583,10 @@ class Attack:
         return abs(self.objective(s.x) - self.value) / size
 
     def violation(self, x, at):
-        """The worst row or bound, relative to its terms at sizes `at` of x, if any.
+        """Return the largest violation of a row or bound, relative to its terms at
+        `at`.
 
-        Where other solutions are longer, rounding at such a point is none.
+        If other solutions are longer, rounding at such a solution does not count.
         """
         qp, worst = self.qp, 0.0
         box = np.eye(x.size)
@@ -599,14 +604,16 @@ class Attack:
         return worst
 
     def is_wrong(self, s):
-        """By more than 100·tol of its terms at the planted solution."""
+        """Return True if the error exceeds 100·tol of the terms at the
+        planted solution.
+        """
         x, at = self.s.x, abs(self.s.x)
         terms = max(abs(x @ (self.qp.P @ x)), abs(self.qp.q) @ at)
         off = abs(self.objective(s.x) - self.value) / (terms or np.inf)
         return max(off, self.violation(s.x, at)) > 100 * TOL
 
     def rounded(self):
-        """The solution, its numbers off by one or two units in the last place."""
+        """Return the solution with errors of one or two units in the last place."""
 
         def off(v):
             return v * (1 + 2.0**-52 * self.rng.integers(-2, 3, v.size))
@@ -618,7 +625,9 @@ class Attack:
         )  # fmt: skip
 
     def points(self, count):
-        """Moves of all sizes, then steps uphill from those that passed as solutions."""
+        """Yield moves of all sizes, and further moves from points with
+        small residuals.
+        """
         best, worst = self.s, 0.0
         for k in range(count):
             start = best if k % 3 == 2 else self.s
@@ -645,7 +654,7 @@ class Attack:
             case 5:  # down the objective, through the rows
                 slope = (qp.P @ x + qp.q) * unit
                 x = x - size * unit * slope / (np.linalg.norm(slope) or 1)
-            case _:  # multipliers alone
+            case _:  # only the multipliers
                 return self.with_noise(s, size, 1 / 3)
         if rng.random() < 0.5:
             x = np.clip(x, qp.lb, qp.ub)
@@ -667,7 +676,9 @@ class Attack:
         return unit * step
 
     def fitted(self, s):
-        """Give the multipliers that balance the gradient best, on what is active."""
+        """Return the multipliers of active constraints that best balance
+        the gradient.
+        """
         qp, x = self.qp, s.x
         g = qp.P @ x + qp.q
         tight = qp.h - qp.G @ x <= 1e-9 * (abs(qp.h) + abs(qp.G) @ abs(x))
@@ -700,10 +711,10 @@ class Attack:
 
 
 def search(seed, tries, way, each=40):
-    """Attack QPs of up to three kinds each; give what was wrongly judged.
+    """Attack QPs with up to three traps; return wrong verdicts.
 
-    Where the optimum is proven, f* is right to three digits, even where its terms
-    cancel; with idle variables that is not always so.
+    If the optimum is proven, f* has three correct digits even if its terms cancel; with
+    idle variables, this is not always true.
     """
     rng = np.random.default_rng(seed)
     wrong, refuted, verified = [], [], 0
@@ -739,7 +750,7 @@ def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(w
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
-    """One of 7500 right points is refuted, a big-M problem (docs/verdicts.md)."""
+    """One of 7500 right points is refuted, for a big-M problem (docs/verdicts.md)."""
     wrong, refuted, verified = search(314159, 100_000 // len(WAYS), way)
 
     assert wrong == []
@@ -749,7 +760,7 @@ def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
 
 
 def idle_beside(*values, count=400):
-    """Lengthen vectors that begin with values by as many zeros."""
+    """Append `count` zeros to each list of values."""
     return [np.pad(np.array(v, dtype=float), (0, count)) for v in values]
 
 
@@ -761,7 +772,7 @@ def idle_beside(*values, count=400):
 def test_a_row_violated_wholly_is_not_excused_by_costs_beside_it(
     cost, bend, tol, count
 ):
-    """min Cx₁ + x₂ + ½s‖x‖², x₂ = 1, x₁ ≥ 0: x* = (0, 1)."""
+    """min Cx₁ + x₂ + ½s‖x‖², x₂ = 1, x₁ ≥ 0 has x* = (0, 1)."""
     q, row, pulls, right = idle_beside(
         [cost, 1], [0, 1], [-cost, 0], [0, 1], count=count
     )
@@ -778,7 +789,7 @@ def test_a_row_violated_wholly_is_not_excused_by_costs_beside_it(
 @pytest.mark.parametrize("count", [0, 400])
 @pytest.mark.parametrize("tol", [1e-8, 1e-4])
 def test_an_operator_that_tells_no_diagonal_excuses_no_force(tol, count):
-    """min ½x₂² + 3e5x₁ + x₂, x₁ = 0: x* = (0, −1)."""
+    """min ½x₂² + 3e5x₁ + x₂, x₁ = 0 has x* = (0, −1)."""
     q, row, bends, right = idle_beside([3e5, 1], [1, 0], [1, 1], [0, -1], count=count)
     qp = replace(qp_of(bends, q, A=[row], b=[0]), P=Products(np.diag(bends)))
 
@@ -788,7 +799,7 @@ def test_an_operator_that_tells_no_diagonal_excuses_no_force(tol, count):
 
 @pytest.mark.parametrize("count", [0, 400])
 def test_a_narrow_box_lends_no_length_to_a_row(count):
-    """A stiffness of 1e18 between bounds 2e-9 apart, and x₂ = 1 of stiffness 1."""
+    """x₁ has stiffness 1e18 and bounds 2e-9 apart; x₂ = 1 has stiffness 1."""
     bends, q, row, wrong = idle_beside(
         [1e18, 1], [-1e18, 0], [0, 1], [1, 0], count=count
     )
@@ -801,7 +812,7 @@ def test_a_narrow_box_lends_no_length_to_a_row(count):
 
 
 def judge_decided(qp, s, tol=TOL):
-    """Judge by residuals, or by the proven optimum where that decides."""
+    """Return the verdict by residuals, or by the proven optimum if it decides."""
     residuals = kkt_residuals(qp, s)
     error = decided(qp, s, residuals, tol, proves(reference_solution))
     return verdict(Status.SOLVED, residuals, tol, error=error)
@@ -810,7 +821,7 @@ def judge_decided(qp, s, tol=TOL):
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("count", [0, 400])
 def test_a_row_that_is_far_away_excuses_no_violation(sign, count):
-    """min ½x₁² − x₁, x₁ = x₂ ≤ ½, x₂ ≥ −1e12: x* = (½, ½)."""
+    """min ½x₁² − x₁, x₁ = x₂ ≤ ½, x₂ ≥ −1e12 has x* = (½, ½)."""
     bends, q, row, far, right, wrong, pulls = idle_beside(
         [1, 0], [-1, 0], [sign, -sign], [0, -1], [0.5, 0.5], [1, 0.5], [0, 0.5],
         count=count,
@@ -825,7 +836,7 @@ def test_a_row_that_is_far_away_excuses_no_violation(sign, count):
 @pytest.mark.parametrize("off", [1e-9, -1e-9])
 @pytest.mark.parametrize("rows", ["A", "-A", "G", "-G"])
 def test_a_chain_of_idle_variables_is_as_long_as_its_first_row(rows, off):
-    """min ½x₁² − x₁, x₁ − x₂ = 1, x₂ = x₃ = … = x₈: x* = (1, 0, …, 0), f* = −½."""
+    """min ½x₁² − x₁, x₁ − x₂ = 1, x₂ = … = x₈ has x* = (1, 0, …, 0), f* = −½."""
     sign, n, b = -1 if rows[0] == "-" else 1, 8, np.eye(7)[0]
     M = sign * (np.eye(n - 1, n) - np.eye(n - 1, n, 1))
     is_equal = rows[-1] == "A"
@@ -843,8 +854,8 @@ def test_a_chain_of_idle_variables_is_as_long_as_its_first_row(rows, off):
 
 
 def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
-    """x* = (512, −512), 256 lengths over which the energy changes by its whole."""
-    soft = 2.0**-18  # along (1, −1), where x is long
+    """x* = (512, −512) is 256 times the length over which the energy changes by E."""
+    soft = 2.0**-18  # curvature along (1, −1), in which x is long
     P = np.array([[1 + soft, 1 - soft], [1 - soft, 1 + soft]])
     x, off = np.array([512.0, -512.0]), 2.0**-17
     qp = qp_of(P, -(P @ x), A=[[1, 1]], b=[0])  # y* = 0
@@ -852,9 +863,9 @@ def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
 
     exact, near = ([Fraction(v) for v in point] for point in (x, s.x))
     error = objective(qp, near) - objective(qp, exact)
-    assert 0 < error <= Fraction(TOL) * 2  # of the terms, 4
-    assert sum(near) <= Fraction(2 * TOL) * 1024  # of its own terms
-    assert sum(near) > Fraction(10 * TOL) * 4 * 10  # of ten lengths
+    assert 0 < error <= Fraction(TOL) * 2  # relative to the terms, 4
+    assert sum(near) <= Fraction(2 * TOL) * 1024  # relative to its terms
+    assert sum(near) > Fraction(10 * TOL) * 4 * 10  # relative to ten lengths
     assert judge(qp, s) is Verdict.VERIFIED
     assert judge(qp, at(x + 100 * off, [-200 * off])) is not Verdict.VERIFIED
 
@@ -868,7 +879,7 @@ def objective(qp, x):
 
 @pytest.mark.parametrize("cost", [1e6, 1e9, 1e12])
 def test_costs_on_bounds_do_not_excuse_an_objective_that_vanishes(cost):
-    """x* = (0, 0, 0, 1, 1), f* = 0, of terms 1 and ½; the costs could gain C² each."""
+    """x* = (0, 0, 0, 1, 1), f* = 0 with terms 1 and ½; the costs have energies C²."""
     qp = qp_of(
         [1, 1, 1, 1, 0], [cost] * 3 + [-1, 0.5],
         lb=[0, 0, 0, -INF, 1], ub=[INF] * 4 + [1],
@@ -886,7 +897,7 @@ def test_costs_on_bounds_do_not_excuse_an_objective_that_vanishes(cost):
 
 
 def test_a_tiny_cost_beside_others_is_no_unit_of_a_solution_that_vanishes():
-    """min ½‖x‖² + x₁ + x₂ + 1e-9·x₃, x ≥ 0: x* = 0."""
+    """min ½‖x‖² + x₁ + x₂ + 1e-9·x₃, x ≥ 0 has x* = 0."""
     qp = qp_of([1] * 3, [1, 1, 1e-9], lb=0)
     pulls = [-1, -1, -1e-9]
 
@@ -900,7 +911,7 @@ def test_a_tiny_cost_beside_others_is_no_unit_of_a_solution_that_vanishes():
 def test_a_point_at_rounding_of_zero_is_right_where_all_data_are_of_order_one(
     n, with_row
 ):
-    """min Σxⱼ, x ≥ 0 or Σxⱼ ≥ 0 as well: x* = 0; sizes of 1e-11 are no error."""
+    """min Σxⱼ, x ≥ 0, possibly with Σxⱼ ≥ 0, has x* = 0; 1e-11 is not an error."""
     G, h = ([-np.ones(n)], [0]) if with_row else (None, ())
     qp = qp_of([0] * n, [1] * n, G=G, h=h, lb=0)
     s = at([1e-11] * n, z=[0.5] * with_row, z_box=[-0.5 if with_row else -1.0] * n)

@@ -1,7 +1,7 @@
-"""The certificate from subdomains: no error above its bound, no factor of the whole.
+"""Certificates from subdomains: no error exceeds its bound, no whole factorisation.
 
-Bodies are cut into boxes. The truth is the reference solution of the whole, known to
-rounding.
+Bodies are cut into boxes. Errors are relative to the reference solution of the whole
+problem, which is accurate up to rounding.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
     "beam-ring/Nr=2/Nh=3/step=6/contact=mortar/basis=standard",
     "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7",
-    "contact-patch/ratio=0.1",  # contact alone holds the upper block
+    "contact-patch/ratio=0.1",  # only contact supports the upper block
     "contact-patch/ratio=0.1/friction=coulomb/mu=0.2",
     "hertz-cylinder/n=3/m=2",
 )
 PERTURBATIONS = 6000
-ROUNDED = 1 + 1e-9  #: local solves are those of doubles
-NOISE = 1e-7  #: relative error from which on effectivities are measured
+ROUNDED = 1 + 1e-9  #: local solves are in double precision
+NOISE = 1e-7  #: smallest relative error for which effectivities are measured
 
 
 def bodies_of(name: str) -> Bodies:
@@ -63,7 +63,7 @@ def bodies_of(name: str) -> Bodies:
 
 
 def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
-    """Label cells by boxes around their centres, body by body."""
+    """Label the cells of each body by the boxes that contain their centres."""
     centres = bodies.mesh.points[bodies.mesh.cells].mean(axis=1)
     label = np.zeros(len(centres), dtype=np.int64)
     for b in range(len(bodies.names)):
@@ -76,14 +76,14 @@ def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A small torn problem with its solution to rounding."""
+    """A small problem with subdomains, and its solution up to rounding."""
 
     mechanics: Mechanics
     exact: ReferencePoint
     own: LocalBodies
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.to_primal` would give it."""
+        """Return the solution in the form of `Mechanics.to_primal`."""
         m, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + m.rows.T @ lam)
@@ -93,14 +93,14 @@ class Known:
         return Solution(status=Status.SOLVED, x=u, y=y, z=z, z_box=0 * u)
 
     def pair_error(self, c: Certificate) -> float:
-        """√(‖û − u*‖² + ‖u_λ − Tu*‖²), the second one of torn displacements."""
+        """Return √(‖û − u*‖² + ‖u_λ − Tu*‖²); u_λ is a displacement of subdomains."""
         parts = self.own.parts
         jump = parts.spread.astype(Real) @ (c.u - self.exact.u) - c.off
         torn = float(np.sqrt(jump @ parts.product(jump)))
         return float(np.hypot(self.error(c.u), torn))
 
     def error(self, u: Extended) -> float:
-        """‖u − u*‖_K."""
+        """Return ‖u − u*‖_K."""
         return self.mechanics.whole.norm(u - self.exact.u)
 
 
@@ -126,7 +126,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Return whether every error is within the bound stated by the certificate."""
+    """Return True if all errors are within the bounds of the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     worst = max(problem.error(found.u), problem.error(s.x.astype(Real)))
     within = min(found.error, found.bound * problem.exact.norm)
@@ -142,7 +142,9 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
 
 
 def violations(name: str, count: int) -> tuple[list[str], list[float]]:
-    """Disturb the solution at random; tell when a bound did not hold, and how sharp."""
+    """Disturb the solution at random; return messages on violated bounds,
+    and ratios.
+    """
     problem, told, sharp = known(name), list[str](), list[float]()
     rng = np.random.default_rng(sum(map(ord, name)))
     for i in range(count):
@@ -197,7 +199,7 @@ def test_bounds_are_about_those_of_the_whole(name: str) -> None:
     assert np.median(found) <= 2.5
 
 
-#: answers as accurate as doubles are, where K and TᵀK_T T differ by as much
+#: answers accurate to rounding, for which the difference of K and TᵀK_T T matters
 ACCURATE = ("plate/Sy=2", "plate/Sx=8/Sy=1/n=4", "plate/Sx=8/Sy=2/n=2")
 MORE_ACCURATE = (
     "plate", "plate/Sx=2/Sy=2/n=8", "plate/Sx=4/Sy=4/n=2", "plate/Sx=12/Sy=1/n=2",
@@ -208,7 +210,7 @@ MORE_ACCURATE = (
 
 
 def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
-    """Solve to such tolerances; the largest error over its bound, of each answer."""
+    """Solve at given tolerances; return the largest error/bound of each answer."""
     case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
     assert case.mechanics is not None
     whole, ratios = case.mechanics.whole, list[float]()
@@ -269,7 +271,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     together = split.averaged(split.spread(u) + 100 * apart)
     left = without_rigid_motion(
         split, together - u
-    )  # contact alone holds a body of the patch
+    )  # only contact supports a body of the patch
 
     assert np.abs(left).max() < 1e-9
 

@@ -1,4 +1,4 @@
-"""From what a solver returned to a record, by our own evaluation."""
+"""Records of answers: verdict, quantities and error bounds."""
 
 import json
 import re
@@ -168,7 +168,7 @@ def test_without_mechanics_there_is_no_bound_and_nothing_to_note():
 def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
     monkeypatch, is_bounded
 ):
-    """By a clock that is 2 s later at its second look."""
+    """The clock advances by 2 s at its second reading."""
 
     def certify(mechanics, point):
         if is_bounded:
@@ -194,7 +194,7 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
 
 
 class SerialComm:
-    """A communicator of one process."""
+    """Communicator of a single process."""
 
     size, rank = 1, 0
 
@@ -210,7 +210,7 @@ class SerialComm:
 
 
 def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
-    """Evaluate a point of the QP above, with the bound ¼ in place of the row."""
+    """Evaluate a point of `QP_`, with the bound ¼ instead of the row."""
     ranks = Ranks(SerialComm())
 
     def slices(v):
@@ -238,7 +238,7 @@ def test_ranks_find_the_objective_and_no_residual_of_a_solution():
     assert values.pop("objective") == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
     assert max(values.values()) <= 1e-15
     assert found.pop("notes") == []
-    assert set(found.values()) == {None}  # nothing else was to be had
+    assert set(found.values()) == {None}  # no value is available
 
 
 def test_ranks_say_nothing_of_a_point_that_is_not_finite():

@@ -1,7 +1,7 @@
-"""Verdicts over discs and cones, attacked by points that are no solutions.
+"""Verdicts over discs and cones, tested with points that are not solutions.
 
-The planted solutions are exact: components are integers times powers of two, on discs
-and cones through Pythagorean pairs, so that f* and every error are known in fractions.
+Components of planted solutions are integers times powers of two; on discs and cones,
+they form Pythagorean pairs. Therefore f* and all errors are known in fractions.
 """
 
 import json
@@ -31,19 +31,19 @@ from tests.harness.verify.test_optimum_over_sets import (
 )
 
 INF = np.inf
-#: ways to deceive, each alone and all of them in pairs
+#: traps, which are tested singly and in pairs
 TRAPS = (
     "tiny", "wide", "point", "flat", "steep", "no friction", "apex", "degenerate",
     "touching", "singular", "cancelled", "weak", "units",
 )  # fmt: skip
-SMALL, LARGE = 2.0**-27, 2.0**27  #: about 1e∓8, beside discs of size one
+SMALL, LARGE = 2.0**-27, 2.0**27  #: about 1e∓8, together with discs of size one
 FLAT, STEEP = 2.0**-16, 2.0**16  #: slopes, with which all sums are exact
 
 
 class ExactProblem:
-    """A QP over discs, cones, bounds and rows, its solution and f*, all of them exact.
+    """A QP over discs, cones, bounds and rows, with its exact solution and f*.
 
-    "touching": a row x₁ − x₂ = c on two discs leaves them one common point.
+    With the trap "touching", a row x₁ − x₂ = c leaves a single point of two discs.
     """
 
     def __init__(self, traps, seed):
@@ -100,7 +100,7 @@ class ExactProblem:
         return np.array([a, b], dtype=float), float(c)
 
     def disc(self, block, traps):
-        """Plant a solution on or in a disc; return its radius."""
+        """Plant a solution on or inside a disc; return its radius."""
         at, radius = self.pair()
         unit = SMALL if "tiny" in traps else LARGE if "wide" in traps else 1.0
         if "point" in traps:  # any force is normal
@@ -114,7 +114,7 @@ class ExactProblem:
         return unit * radius
 
     def cone(self, block, traps):
-        """Plant a solution on or in a cone; return its slope."""
+        """Plant a solution on or inside a cone; return its slope."""
         at, size = self.pair()
         normal, tangents = block[0], block[1:]
         slope = 2.0 ** int(self.rng.integers(-2, 2))
@@ -178,12 +178,14 @@ def test_planted_points_are_solutions_to_the_last_digit(trap):
 
 
 class AttackOnBlocks(AttackOverSets):
-    """Moves on discs and cones: along their boundaries, and balanced multipliers."""
+    """Attack with moves along boundaries of discs and cones, and balanced
+    multipliers.
+    """
 
     def violation(self, x, at):
-        """The worst row, bound or disc, relative to its own terms at the solution.
+        """Return the largest violation of a row, bound or disc, relative to its terms.
 
-        Rows, bounds and cones through the origin have no length of their own.
+        Rows, bounds and cones through the origin do not define a length.
         """
         qp, own = self.qp, np.maximum(own_sizes(self.qp, self.s.x) / 10, at)
         limits = [
@@ -224,7 +226,7 @@ class AttackOnBlocks(AttackOverSets):
         return s
 
     def turned(self, v, angle):
-        """Turn the tangents of one block."""
+        """Rotate the tangential components of one block."""
         one = self.qp.sets[1 + self.rng.integers(len(self.qp.sets) - 1)]
         block = one.index[self.rng.integers(len(one.index))][-2:]
         c, s = np.cos(angle), np.sin(angle)
@@ -234,7 +236,7 @@ class AttackOnBlocks(AttackOverSets):
 
 
 def search(seed, tries, each=200, traps=None):
-    """Attack QPs with up to two traps; list what was wrongly judged."""
+    """Attack QPs with up to two traps; return wrong verdicts."""
     rng = np.random.default_rng(seed)
     wrong, refuted, verified, proven = [], [], 0, 0
     with np.errstate(all="ignore"):
@@ -283,7 +285,7 @@ def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
 
 @pytest.mark.slow
 def test_residuals_alone_deceive_no_verdict_without_traps():
-    """For QPs that are not solved once more; f is right to ten times the residuals."""
+    """Without a reference solve, the error of f is at most ten times the residuals."""
     rng, verified = np.random.default_rng(161803), 0
     for _ in range(200):
         planted = ExactProblem(set(), int(rng.integers(2**30)))
@@ -297,7 +299,7 @@ def test_residuals_alone_deceive_no_verdict_without_traps():
 
 @pytest.mark.parametrize("trap", ["", "tiny", "units"])
 def test_multipliers_of_the_wrong_sign_or_direction_are_refuted(trap):
-    """Once as they are, and once balanced by another q, so that they are stationary."""
+    """Test them unchanged, and with another q for which the point is stationary."""
     count = 0
     for seed in range(20):
         planted = ExactProblem({trap}, seed)
@@ -328,13 +330,13 @@ def _reverse(z, one, block):
 
 
 def _turn(z, one, block):
-    """Turn the tangents by 0.1."""
+    """Rotate the tangential components by 0.1."""
     c, s = np.cos(0.1), np.sin(0.1)
     return np.append(z[:-2], np.array([[c, -s], [s, c]]) @ z[-2:])
 
 
 def _shorten_normal(z, one, block):
-    """Leave the polar cone."""
+    """Shorten the normal component, so that the vector leaves the polar cone."""
     if isinstance(one, Discs):
         return z
     slope = one.slope[(one.index == block).all(axis=1)]
@@ -381,7 +383,7 @@ def test_distances_to_normal_cones_are_euclidean():
         (apex, [4, 3, 0], 5),
         (apex, [1, 0, 0], 1),
     ]:
-        # beside a longer block, which is the scale of the apex
+        # together with a longer block, which is the scale of the apex
         both = Cones([[0, 1, 2], [3, 4, 5]], [0.75, 1])
         x, z = np.append(x, [9, 0, 0]), np.append(np.array(z, float), [0, 0, 0])
         assert both.normal_distances(x, z, 1e-9)[0] == pytest.approx(distance)
@@ -425,7 +427,7 @@ def test_verify_and_solve_report_the_further_measures(tmp_path, capsys):
 
 
 def test_multipliers_are_computed_at_the_apex_of_all_cones():
-    """Neither x nor a force has a length there; q acts on the row alone."""
+    """At the apex, neither x nor a force defines a length; q acts only on the row."""
     qp = mb.QP.from_arrays(
         np.eye(4), [0, 0, 0, -1], A=[[1, 0, 0, 1]], b=1, sets=[Cones([[0, 1, 2]], [1])]
     )
@@ -436,7 +438,7 @@ def test_multipliers_are_computed_at_the_apex_of_all_cones():
 
 @pytest.mark.parametrize("trap", ["", "steep", "point", "apex"])
 def test_equivalent_formulations_have_the_same_residuals(trap):
-    """Units, order and the signs of tangents change, exactly, by powers of two."""
+    """Units, order and signs of tangents change exactly, by powers of two."""
     for seed in range(2):
         planted = ExactProblem({trap}, seed)
         qp, s = planted.qp, planted.solution

@@ -400,7 +400,7 @@ def test_the_older_names_of_p_and_q_are_known(written):
         ({"P": csc_matrix(np.eye(3))}, "P has shape (3, 3), expected (4, 4)"),
         ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
         ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
-        ({"q": np.full(4, np.nan)}, "q holds NaN"),
+        ({"q": np.full(4, np.nan)}, "q contains NaN"),
         ({"q": "text"}, "q is not a matrix of numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
         ({"m": 7}, "m is not 5"),
@@ -642,7 +642,7 @@ def test_a_run_does_not_go_on_with_a_file_that_has_changed(written, command, tmp
 
     assert code == 2
     assert re.fullmatch(
-        r"mortarbench: out holds file:a\.qps with sha256 = \w{12}, now \w{12}; "
+        r"mortarbench: out contains file:a\.qps with sha256 = \w{12}, now \w{12}; "
         r"choose another --out or use --fresh\n",
         err.splitlines(keepends=True)[-1],
     )
