@@ -72,7 +72,7 @@ def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
 def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the cases solved by every solver that solved at least half of all cases.
 
-    If other solvers counted, one that solves almost nothing would leave no common case.
+    A solver that solved only a few cases would leave almost no common cases.
 
     Returns
     -------
@@ -178,7 +178,7 @@ class Ranking:
 
 
 def ranking_of(group: ComparisonGroup) -> Ranking:
-    """Rank the solvers of a group, resampling its cases."""
+    """Rank the solvers of a group, with draws over resampled cases."""
     logs, shift = _logs(group, USUAL)
     draws = np.exp(resampling.weights(group.cases) @ logs) - shift
     return Ranking(group=group, draws=draws)

@@ -28,7 +28,7 @@ RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
 
-#: Verdicts, worst first; an outcome of several repeats has the worst of their verdicts.
+#: Verdicts, worst first. The verdict of an outcome is the worst verdict of its repeats.
 SEVERITY = (
     Verdict.WRONG,
     Verdict.INACCURATE,
@@ -121,7 +121,7 @@ class Outcome:
 
     @property
     def run_ids(self) -> tuple[str, ...]:
-        """Identifiers of the measurements behind this outcome."""
+        """Identifiers of the measurements of this outcome."""
         return tuple(r.run_id for r in self.records)
 
     def largest(self, name: str) -> float | None:
@@ -386,7 +386,7 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
 
     One environment stays without a mark.
 
-    first : digest of the environment without a mark, if it repeats a measurement
+    first : digest of the environment that stays without a mark, if it is one of them
     """
     cells: dict[tuple[Any, ...], dict[str, None]] = {}
     for r in records:

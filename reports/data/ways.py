@@ -48,7 +48,7 @@ def compare_ways(evidence: Evidence) -> Ways:
     """Compare the ways to solve the same problems, including dualisation.
 
     A problem is included if it was measured in several forms, or if its only form has a
-    time of dualisation; for other problems this equals the comparison of solvers.
+    time of dualisation. For other problems, a way is the same as a solver.
     """
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
@@ -105,7 +105,7 @@ def compare_ways(evidence: Evidence) -> Ways:
 
 
 def _has_all_times(r: Record) -> bool:
-    """Return whether a record includes the time of dualisation, or needs none.
+    """Return whether a record contains the time of dualisation or has no dualisation.
 
     Journals of older versions and cases built by ranks lack this time.
     """

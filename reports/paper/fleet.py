@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """True if the problem was tried but not verified; then no time is shown."""
+        """True if the solver tried the problem and its answer is not verified."""
         return self.tried and not self.outcome.verified
 
 

@@ -1,7 +1,7 @@
 """Opening of the report: the fastest solver of each form, its lead, and the failures.
 
-A suite of one solver opens with the growth of its iterations, with condition numbers
-and speed-up on ranks.
+If the suite has only one solver, the report opens with the growth of the solver's
+iterations, with condition numbers, and with the speed-up on ranks.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
     yield from TEXT.parts("claim_counts")
     yield Table.of(
-        "Claims beside verdicts.",
+        "Claims of the solvers and our verdicts.",
         a.evidence.solvers,
         (
             ("solver", Cell.name),

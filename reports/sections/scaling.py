@@ -176,7 +176,7 @@ def _trend(fit: Growth | None) -> Cell:
 
 
 def per_decade(fit: Growth) -> str:
-    """Print the change per decade and its interval: "+4 % [-1, +9]"."""
+    """Format the change per decade and its interval: "+4 % [-1, +9]"."""
     change, low, high = (f"{min(100 * v, 9999):+.0f}" for v in fit.per_decade)
     return f"{change} % [{low}, {high}]"
 

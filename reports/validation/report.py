@@ -224,7 +224,7 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Tabulate the answers of each solver that stand out, with the worst of them."""
+    """Tabulate the number of answers of each solver that stand out, and the worst."""
     grouped: dict[str, list[Data]] = {}
     for d in data["remarks"]:
         grouped.setdefault(d["solver"], []).append(d)

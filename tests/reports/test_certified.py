@@ -342,7 +342,12 @@ def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
 @pytest.mark.parametrize(
     ("kind", "error", "note", "told"),
     [
-        ("change", 0.1, "a point load", "change to the next mesh only: a point load"),
+        (
+            "change",
+            0.1,
+            "a point load",
+            "only the change to the next mesh is known: a point load",
+        ),
         ("limit", 0.0, "", "relative to the limit of fine meshes"),
         ("rounding", 1e-8, "", "the mesh represents the solution exactly"),
         ("unknown", None, "too large", "too large"),
