@@ -393,7 +393,7 @@ def timings(experiment: Experiment) -> Table:
             "ours, the paper's method",
             "ours, condensed",
             "ratio",
-        ),  # fmt: skip
+        ),
         rows=tuple(lines),
     )
 

@@ -499,7 +499,8 @@ def test_a_canary_that_moved_says_that_the_machine_did(changed):
     assert rows["canary"][2].value == pytest.approx(1.1, rel=0.01)
     assert rows["canary"][3].text == rows["all"][3].text == "slower"
     assert any(
-        line.startswith("All solvers changed alike") for line in verdict_lines(c)
+        line.startswith("The times of all solvers changed alike")
+        for line in verdict_lines(c)
     )
     assert all(side(relative_ratio(c, s)) == 0 for s in SOLVERS)
 

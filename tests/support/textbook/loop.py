@@ -30,7 +30,7 @@ from tests.support.textbook.outer_loop import (
 )
 from tests.support.textbook.projected import Projected
 
-KEPT = 200  #: directions of CG on a face
+KEPT = 200  #: maximum number of CG directions stored on a face
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def _face(
 def face_preconditioner(
     problem: Projected, qp: QP, kind: Preconditioner
 ) -> Callable[[float], Precondition | None]:
-    """Return a function from ρ to the preconditioner that `mprgp` takes."""
+    """Return a function that maps ρ to the preconditioner of `mprgp`."""
     if kind == "none":
         return lambda rho: None
     if kind == "model":
