@@ -128,7 +128,7 @@ class Ranking:
 
     @cached_property
     def first(self) -> Array:
-        """(solvers,) share of the resamples in which a solver has the smallest mean."""
+        """(solvers,) share of the resamples in which each solver has the least mean."""
         return resampling.firsts(np.log(self.draws))
 
     @cached_property

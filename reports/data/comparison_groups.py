@@ -66,7 +66,7 @@ Answers = Mapping[GroupKey, Mapping[str, Row]]  #: outcomes by group and case
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonGroup:
-    """Cases of one form at one accuracy, and the solvers measured on each of them.
+    """Cases of one form at one accuracy, and the solvers measured on every case.
 
     Copies and null arms (a solver repeated under a second label) are left out. Times
     are medians of prepare + solve over the repeats. If several tolerances were swept,

@@ -123,7 +123,7 @@ def memory(o: Outcome) -> Interval | None:
 
     Building and solving take place in successive processes, so the larger of their
     peaks counts. On several ranks, the ranks build the case themselves, and the peak is
-    that of all ranks together.
+    the joint memory of all ranks.
     """
     peaks = [
         max(r.build_peak_mib or 0.0, r.peak_mib)
@@ -221,7 +221,7 @@ def _position(route: Route) -> tuple[Any, ...]:
 
 
 def _mesh(o: Outcome) -> tuple[Any, ...]:
-    """Return family and parameters of a case without those of its decomposition."""
+    """Return the family and the parameters except the keys of the decomposition."""
     params = {k: v for k, v in o.first.params.items() if k not in DECOMPOSITION}
     return o.first.family, *sorted(params.items())
 

@@ -386,7 +386,7 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
 
     One environment stays without a mark.
 
-    first : digest of the environment that stays without a mark, if it is one of them
+    first : digest of the environment without a mark, if it repeats a measurement
     """
     cells: dict[tuple[Any, ...], dict[str, None]] = {}
     for r in records:

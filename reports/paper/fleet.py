@@ -230,8 +230,8 @@ def totals_table(evidence: Evidence) -> Table:
     return Table(
         caption=f"Total times at n = {n}, prepare and solve. The dualisation of one "
         "load step, including the factorisation, is measured once for all "
-        "solvers, so the intervals in the last column are those of the "
-        "solver alone.",
+        "solvers, so the intervals in the last column contain only the "
+        "scatter of the solver times.",
         columns=("", "primal", "dual", "dualising", "dual with dualising"),
         rows=tuple(rows),
     )

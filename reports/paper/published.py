@@ -23,7 +23,7 @@ TABLE_1 = {
 }
 TOTALS = (13082, 12600, 26164)  #: nodes, elements, dofs
 DOFS = TOTALS[2]
-#: m_E + m_I of this problem, computed here; the paper does not state them
+#: m_E + m_I of this problem, computed here because the paper does not state the numbers
 ROWS = 186 + 181
 SEGMENTS = {"master": 240, "slave": 180}
 FIGURE_2_NODES = 313

@@ -320,7 +320,7 @@ def largest(experiment: Experiment) -> list[Row]:
 
 
 def of_table_1(rows: Sequence[Row]) -> bool:
-    """Return whether the size equals that of the published times."""
+    """Return whether the rows have the size for which the paper states times."""
     return (rows[0]["Nr"], rows[0]["Nh"]) == (30, 15)
 
 

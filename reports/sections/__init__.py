@@ -59,7 +59,7 @@ class Analysis:
 
     @cached_property
     def ways(self) -> Ways:
-        """Comparison of ways (see `reports.data.ways`), over all forms."""
+        """Comparison of combinations of form and solver, see `reports.data.ways`."""
         return compare_ways(self.evidence)
 
     @cached_property

@@ -233,8 +233,8 @@ def _remarks(data: Data) -> Iterator[Part]:
             s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
         }
         yield Table.of(
-            "Answers within their claims, but far less accurate than those of other "
-            "solvers.",
+            "Answers within their claims, but far less accurate than the answers of "
+            "other solvers.",
             grouped,
             (
                 ("solver", Cell.label),

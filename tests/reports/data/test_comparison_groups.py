@@ -320,7 +320,7 @@ def test_the_rank_of_a_solver_with_false_claims_depends_on_the_convention(
     assert cells["liar"]["all"].text == "1–3"
     assert cells["liar"]["reading"].text == "depends on the convention"
     assert (
-        "reverse the order of 2 pairs, 2 of them significantly different"
+        "reverse the order of 2 pairs, of which 2 differ significantly"
         in found.points[0]
     )
 
