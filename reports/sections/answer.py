@@ -184,10 +184,11 @@ def _statement(
     for f in found:
         evidence |= {"accuracy"} if f.key.sweep else set()
         evidence |= {"means", "ranking"} if f.over_cases else {"times", "ratios"}
+    counted = "case" if len(found) == 1 else "answer"
     remarks = (
         *_faster_elsewhere(found[0]),
-        TEXT("failed", failed, "case" if len(found) == 1 else "answer"),
-        TEXT("declined", declined),
+        TEXT("failed", failed, counted),
+        TEXT("declined", declined, counted),
         *_reservations(found),
         f"{len(found) - len(selected)} more tolerances are in the sections below."
         if len(selected) < len(found)

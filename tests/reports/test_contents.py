@@ -266,7 +266,7 @@ def test_without_points_there_is_no_table_of_residuals(measured, page):
     assert "no residuals" in found.prose[0]
 
 
-def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, page):
+def test_a_residual_above_a_tenth_is_marked_at_any_tolerance(measured, page):
     found = section(page([measured(tol=0.05, dual=0.2, gap=0.05)]), "errors")
     (row,) = rows(found.tables[0])
     assert (row["dual"].kind, row["gap"].kind) == ("over", "")

@@ -255,7 +255,7 @@ def test_the_difference_of_energies_is_relative_to_the_larger(measured, evidence
     assert spread.relative == 0.25
 
 
-def test_repeats_of_one_answer_do_not_confirm_each_other(measured, evidence):
+def test_repeats_of_one_answer_are_not_compared_as_energies(measured, evidence):
     (spread,) = spreads(evidence([measured("a", repeat=i) for i in range(3)]).flat)
     assert len(spread.answers) == 1
     assert spread.relative is None
@@ -525,7 +525,7 @@ def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_pa
     assert [len(p.figure.panels) for p in pictures] == [1, 1]
 
 
-def test_csv_holds_full_precision_and_every_time_with_its_interval(measured, tmp_path):
+def test_csv_contains_full_precision_and_intervals_of_times(measured, tmp_path):
     times = [0.1 + 0.2, 0.7, 0.1]
     write(tmp_path, timed(measured, "a", times))
     paths = write_report(tmp_path, ["csv"])

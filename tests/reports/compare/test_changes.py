@@ -469,7 +469,7 @@ def test_all_formats_are_written_with_reproducible_bytes(folders):
     np.testing.assert_allclose(one.ratio, two.ratio, rtol=1e-12)
 
 
-def test_verdicts_are_those_at_the_factor(folders):
+def test_verdicts_are_recomputed_at_the_factor(folders):
     before = [record(repeat=i, dual=5e-7) for i in range(3)]
     after = [record(repeat=i, dual=5e-6) for i in range(3)]
     a, b = folders(HERE, HERE, before, after)

@@ -533,7 +533,7 @@ def test_without_counts_there_is_no_section_on_steps(record, evidence):
 # ---- claims
 
 
-def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
+def test_claims_and_verdicts_are_counted_in_one_table(record, evidence):
     ends = [
         dict(),
         dict(verdict=Verdict.WRONG),

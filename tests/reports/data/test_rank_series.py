@@ -129,7 +129,7 @@ def test_records_without_message_counts_have_no_model():
         {"solve_seconds": None},
     ],
 )
-def test_records_with_other_entries_have_no_model_either(change):
+def test_records_with_invalid_entries_have_no_model(change):
     records = [r.replace(**change) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
     assert series.model is None

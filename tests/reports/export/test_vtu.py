@@ -155,7 +155,7 @@ SIDE = ContactSide(
 )  # fmt: skip
 
 
-def test_each_contact_is_a_table_beside_the_grid(tmp_path):
+def test_each_contact_has_a_csv_table(tmp_path):
     written = write_vtu(replace(FIELDS, contacts=(SIDE,)), tmp_path / "a.vtu")
     table = pd.read_csv(tmp_path / "a-disc-on-a-b-2.csv")
 
@@ -241,7 +241,7 @@ def test_contact_takes_precedence_over_sliding_without_contact(tmp_path):
     assert both["in_contact"][SIDE.nodes].tolist() == [0, 1, 1]
 
 
-def test_friction_on_open_nodes_is_no_contact(tmp_path):
+def test_friction_on_open_nodes_does_not_count_as_contact(tmp_path):
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8))
     case = family.build("dual-bounds", params, reference_solution)
@@ -295,7 +295,7 @@ def test_solve_refuses_unsupported_cases_and_formats(solve, manufactured, tmp_pa
     assert err.endswith("a.vtk: unknown format '.vtk'; expected .vtu or .pvd\n")
 
 
-def test_a_series_names_its_files_and_times_next_to_it(tmp_path):
+def test_a_series_lists_its_files_and_times(tmp_path):
     path = tmp_path / "a & b.pvd"
     written = write_series([(0.5, FIELDS), (1.0, FIELDS)], path)
     sets = ElementTree.parse(path).getroot().findall("Collection/DataSet")

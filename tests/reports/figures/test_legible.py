@@ -94,7 +94,7 @@ def test_a_logarithmic_axis_spans_a_decade_at_least_and_all_points(values):
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_a_legend_within_a_panel_hides_no_curve(log):
+def test_a_legend_within_a_panel_does_not_hide_curves(log):
     """The highest point of each curve is on the left, like the legend."""
     series = [Series(x=(1, 2, 3), y=(10.0**k, 3, 2), look=look(k)) for k in range(1, 5)]
     keys = tuple(Key(label=f"curve {k}", look=look(k)) for k in range(1, 5))

@@ -118,7 +118,7 @@ def test_horizontal_error_bars_are_horizontal():
     np.testing.assert_allclose(segments.get_segments(), [[(0.5, 5), (3, 5)]])
 
 
-def test_axes_hold_all_points_and_the_ends_of_their_error_bars_with_a_margin():
+def test_axes_contain_all_points_and_error_bars_with_a_margin():
     """The margin is 5 % of a logarithmic axis that spans a decade or more.
 
     For points from 0.5 to 4, the axis spans one decade with the points in its middle.
@@ -268,7 +268,7 @@ def test_a_long_line_keeps_its_ends_and_its_extremes_on_the_page_and_all_in_file
     assert len(drawn(line).lines[0].get_xdata()) == 50_000
 
 
-def test_a_line_whose_points_have_runs_of_their_own_keeps_all_of_them():
+def test_a_line_with_runs_per_point_keeps_all_points():
     n = MOST + 100
     runs = tuple((f"r{i}",) for i in range(n))
     line = Series(x=tuple(range(n)), y=(1.0,) * n, look=look(0), runs=runs)

@@ -197,7 +197,8 @@ def test_faster_solvers_that_are_not_always_verified_are_named(record, opened):
     assert statement.claims[0].startswith("sure was the fastest over 8 cases")
     faster = statement.remarks[0]
     assert faster.startswith(
-        "Faster, but not verified on every case, at tol 1e-6: almost (7 of 8 cases"
+        "Faster, but not verified on every case, at tol 1e-6: almost (verified on 7 of "
+        "8 cases"
     )
     value, low, high = re.search(r"(\S+) \[(\S+), (\S+)\] times", faster).groups()
     assert 0.4 < float(low) <= float(value) <= float(high) < 0.6
@@ -440,7 +441,7 @@ def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_plain_sentences_are_those_of_the_report(record, tmp_path):
+def test_plain_sentences_equal_the_sentences_of_the_report(record, tmp_path):
     with Journal(tmp_path, "test") as journal:
         for r in one_case(record, fast=1.0, slow=2.0):
             journal.append(r)

@@ -62,7 +62,7 @@ def test_the_first_figure_shows_iterations_from_zero_on(record, page):
     assert {run for runs in series.runs for run in runs} == {r.run_id for r in records}
 
 
-def test_condition_numbers_have_a_range_of_their_own(record, page):
+def test_condition_numbers_have_separate_ranges(record, page):
     records = [
         r.replace(quantities={**r.quantities, "kappa": 3.0 + k, "kappa_lumped": 2.0})
         for k, r in enumerate(sized(record, [9, 9, 9, 9]))

@@ -96,7 +96,7 @@ def test_the_band_contains_the_true_speed_up():
     assert held >= 85  # 95 % of a hundred
 
 
-def test_one_run_each_has_no_band():
+def test_single_runs_have_no_band():
     found = cost_model({1: [2.0], 2: [1.2]}, {}, [SENT]).speed_up(8)
     assert found.low == found.value == found.high
     assert found.samples == 1
@@ -113,6 +113,6 @@ def test_the_largest_number_of_ranks_at_half_efficiency():
 
 
 @pytest.mark.parametrize("ranks", [(1,), (2, 4), ()])
-def test_it_takes_one_rank_and_several(ranks):
+def test_a_model_needs_times_on_one_and_several_ranks(ranks):
     with pytest.raises(ValueError, match="one rank and on several"):
         cost_model({N: [1.0] for N in ranks}, {}, [SENT])

@@ -300,7 +300,7 @@ def test_a_data_profile_by_hand():
     assert found.share.value.tolist() == [0, 0.25, 0.5, 0.5]
 
 
-def test_a_failure_is_never_counted_as_solved_whatever_the_factor():
+def test_a_failure_never_counts_as_solved():
     """With a finite charge of 1000 s, it would count from τ = 1000/0.1 on."""
     times = np.array([[0.1, INF]] * 4 + [[0.1, 0.1]])
     ratios = performance_ratios(times)
@@ -390,7 +390,7 @@ def test_the_restricted_mean_covers_the_truth_under_early_censoring():
 
 
 @pytest.mark.parametrize("cases", [6, 9, 30])
-def test_the_interval_of_flipped_signs_covers_whatever_the_tails(cases):
+def test_the_sign_flip_interval_covers_for_heavy_tails(cases):
     rng = np.random.default_rng(29)
     names = [str(i) for i in range(cases)]
     drawn = 3 + rng.standard_cauchy((400, cases))
