@@ -114,7 +114,10 @@ def regressions(c: Comparison) -> Regressions:
 
 
 def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
-    """Describe the solvers that lack a verified answer in `folders` of the folders."""
+    """Describe the solvers without a verified answer, in one folder or in both.
+
+    folders : number of folders without a verified answer, 1 or 2
+    """
     found = []
     for solver in c.solvers:
         pairs = [p for p in c.of(solver) if not p.after.first.role]

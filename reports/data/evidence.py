@@ -185,7 +185,7 @@ class Outcome:
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results of the first repeat that stored any; empty if none did."""
+        """Physical results of the first repeat that has results; empty if none has."""
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:

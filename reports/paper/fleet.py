@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     size: int
     outcome: Outcome
-    dofs: bool  #: True for sizes of the primal problem, False for the dual
+    dofs: bool  #: True if the size is n (primal), False if the size is m (dual)
 
     @property
     def time(self) -> Interval | None:

@@ -1,7 +1,8 @@
 """Figures of histories: selection of cases, curves and markers.
 
-The first run below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
-(0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
+In the history `KNOWN`, the free and the chopped gradient are (3, 4), (2.4, 0.7),
+(0.3, 0.4) and (0, 0), so that the relative projected gradient is (5, 2.5, 0.5, 0)/5.
+The two outer iterations end after 4 and 7 products.
 """
 
 import shutil

@@ -172,7 +172,7 @@ def exact_solution(mechanics: Mechanics) -> ExactSolution:
 def _given(
     mechanics: Mechanics, states: States, pinned: Any
 ) -> tuple[Integers, Integers]:
-    """Solve with equality on the closed rows."""
+    """Solve for u and λ with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
     lower, upper = hull(exact.forces.sets, exact.c.size)

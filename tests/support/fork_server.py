@@ -1,11 +1,12 @@
 """Server that starts the processes of runs as forks with libraries loaded.
 
 A new interpreter needs half a second of CPU time for imports, more than the work of
-most tests. A forked process replaces it. Like any process, it has its own memory,
-signals and exit code, and the requested files, environment and limits. Its parent is
-the sub-reaper of `harness.processes.reaper`, whose parent is the requesting process.
-/proc shows its command line and environment, see proc(5). Only the start of the
-interpreter is left out. Tests of this start launch processes in the ordinary way.
+most tests. The server therefore forks a process instead. Like any process, the fork has
+its own memory, signals and exit code, and the requested files, environment and limits.
+Its parent is the sub-reaper of `harness.processes.reaper`, whose parent is the
+requesting process. /proc shows the command line and environment of the fork, see
+proc(5). Only the start of an interpreter is left out; tests of this start launch
+processes in the ordinary way.
 
 If the module is run as a program with a socket and modules to import, it is the server.
 """

@@ -41,7 +41,7 @@ METHODS = (("nts", "dual"), ("mortar", "dual"), ("mortar", "standard"))
 
 
 def generated_case(seed: int) -> Case:
-    """Draw the problem of a seed; seeds cycle through tower, pillars and disc."""
+    """Draw the problem of a seed: successive seeds give a tower, pillars and a disc."""
     rng = np.random.default_rng(seed)
     contact, basis = METHODS[rng.integers(3)]
     make = (_tower, _pillars, _disc)[seed % 3]
