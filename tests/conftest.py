@@ -29,13 +29,13 @@ settings.load_profile("untimed")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Use two workers per CPU, up to eight: tests wait a third of their time."""
+    """Use two workers per CPU, up to eight, since tests wait a third of their time."""
     cpus = len(os.sched_getaffinity(0))
     return max(cpus, min(2 * cpus, 8))
 
 
 class OneProcessPerModule(LoadScopeScheduling):
-    """Scheduler that runs modules marked `together` in one process, others anywhere."""
+    """Scheduler that runs all tests of a module marked `together` in one process."""
 
     def _split_scope(self, nodeid: str) -> str:
         module = nodeid.partition("::")[0]
@@ -62,18 +62,18 @@ def shares(module: str) -> bool:
 def pytest_xdist_make_scheduler(
     config: pytest.Config, log: Producer
 ) -> OneProcessPerModule:
-    """Group tests by modules; groups by marks would change the names of tests."""
+    """Group tests by modules; xdist's group marks would change the names of tests."""
     return OneProcessPerModule(config, log)
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Share the CPUs among pytest-xdist's workers.
 
-    The harness binds what it measures to the last CPU that it may use; without this,
-    all workers would measure on the same one.
+    The harness binds measured processes to the last CPU that it may use. Without
+    separate CPUs, all workers would measure on the same CPU.
     """
     os.environ.update(ONE_THREAD)  # as the command line does
-    os.environ["MPIR_CVAR_ENABLE_HEAVY_YIELD"] = "1"  # ranks of MPICH wait asleep
+    os.environ["MPIR_CVAR_ENABLE_HEAVY_YIELD"] = "1"  # ranks of MPICH sleep in waits
     worker = getattr(config, "workerinput", None)
     if worker is not None:
         cpus = sorted(os.sched_getaffinity(0))
@@ -93,10 +93,11 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
 
 
 def import_share(config: pytest.Config) -> None:
-    """Import a worker's share of the test modules before it imports the others.
+    """Import a worker's share of the test modules before the worker imports the rest.
 
-    pytest rewrites their asserts and caches the result; rewriting takes ten times as
-    long as loading from the cache. In a fresh checkout, each worker would rewrite all.
+    pytest rewrites the asserts of a module and caches the result; rewriting takes ten
+    times as long as loading from the cache. Otherwise, in a fresh checkout, each worker
+    would rewrite all modules.
     """
     worker = getattr(config, "workerinput", None)
     if worker is None or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
@@ -109,14 +110,14 @@ def import_share(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude tests and libraries from the collections before every measurement."""
+    """Exclude tests and libraries from garbage collections before measurements."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)  # tests create little garbage
 
 
 def pytest_unconfigure() -> None:
-    """Undo `gc.freeze`: some libraries check their objects at the end of a process."""
+    """Undo `gc.freeze`, since some libraries check their objects at process end."""
     gc.unfreeze()
 
 
@@ -149,8 +150,8 @@ def manufactured() -> Callable[..., tuple[QP, Solution]]:
 def svg_only():
     """Return a context manager in which reports write figures as SVG only.
 
-    Pages show these. All formats are tested in `reports/test_convergence.py` and
-    `reports/figures/test_pictures.py`.
+    Pages contain the SVG figures. All formats are tested in
+    `reports/test_convergence.py` and `reports/figures/test_pictures.py`.
     """
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""The house: what lies in one place only, how large rooms are, and what names say."""
+"""Structure of the code: unique implementations, sizes of packages, and names."""
 
 import ast
 import re
@@ -19,7 +19,7 @@ PACKAGES = ("harness", "problems", "solvers", "reports", "mortarbench")
 
 @cache
 def modules(*packages):
-    """All modules of the five packages, or of others, by their path, parsed."""
+    """Return (path, syntax tree) of all modules of `packages`, default: all five."""
     return [
         (str(path.relative_to(ROOT)), ast.parse(path.read_text("utf-8")))
         for package in packages or PACKAGES
@@ -29,7 +29,7 @@ def modules(*packages):
 
 @cache
 def users():
-    """Modules that use a thing, by its dotted name: import it, or look it up."""
+    """Return the modules that import or look up a name, by the dotted name."""
     found = defaultdict(dict)
     for path, tree in modules():
         for node in ast.walk(tree):
@@ -50,7 +50,7 @@ def users():
 @pytest.mark.parametrize(
     ("name", "homes"),
     [
-        # the hash that a page's content security policy asks for is no digest of ours
+        # html_page.py computes the script hash of the content security policy
         ("hashlib", ["harness/digest.py", "reports/render/html_page.py"]),
         ("os.replace", ["harness/files/durable.py"]),
         ("os.rename", []),
@@ -63,27 +63,27 @@ def test_one_thing_is_done_in_one_place(name, homes):
     assert users().get(name, []) == homes
 
 
-#: rooms that are collections of equals: one module each for an adapter, …
+#: packages that contain many similar modules → contents of a module
 COLLECTIONS = {
     "solvers/adapters": "a library each",
     "problems/families": "a family each",
 }
 
 
-def test_a_room_holds_at_most_fourteen_modules():
+def test_a_package_contains_at_most_fourteen_modules():
     sizes = Counter(str(Path(path).parent) for path, _ in modules())
 
     assert {r: n for r, n in sizes.items() if n > 14 and r not in COLLECTIONS} == {}
     assert sizes.keys() >= {"harness", "harness/verify", "solvers/smalbe"}
 
 
-#: names of the past that say nothing to a reader from outside, as words of a name
+#: obscure words that names must not contain
 RIDDLES = (
     "station", "serving", "workbench", "mistaken", "halving", "planted", "capsule",
     "recipe", "contests", "ladders", "tally", "courses", "worth", "sheets", "wording",
     "wells", "liars", "descents", "crowd",
 )  # fmt: skip
-#: as the whole name of a module or class: what they hold has a better one
+#: vague words that must not be the whole name of a module or class
 UNSAID = (
     "remote", "node", "generator", "block", "carry_out", "grids", "truth", "agreement",
     "exchange", "rebuilt", "judge", "blank", "conventions", "standing", "matched",
@@ -98,7 +98,7 @@ def words(name):
 
 
 def names():
-    """Modules, classes and public functions of the packages and of the tests."""
+    """Yield path, type and name of modules, classes and public functions."""
     for path, tree in [*modules(), *modules("tests")]:
         yield path, "module", Path(path).stem
         for node in ast.walk(tree):
@@ -129,9 +129,9 @@ def test_names_are_words_of_the_field():
 
 
 def test_the_harness_names_no_solver_and_no_unit_of_physics():
-    """Not in its code: what a solver is called, and in what one measures, is data.
+    """Names of solvers and units are data and do not occur in the code of harness.
 
-    The three systems of units of `equivalence` are what is varied there.
+    The exception is `equivalence`, which compares three systems of units.
     """
     prefixes = {re.split("[-:]", name)[0] for name in SOLVERS}
     solvers = {*prefixes, *(p.lower() for p in LIBRARIES)} - {"py-mkl-pardiso"}

@@ -1,4 +1,4 @@
-"""Effects of `make setup` on a system: announced, confirmed, in any folder."""
+"""`make setup` announces and confirms installations, and works in any folder."""
 
 import os
 import pty
@@ -13,7 +13,7 @@ import pytest
 
 from tests.support import ROOT
 
-#: stand for programs of the system; each writes its command into the file `calls`
+#: replacements of system programs; each appends its command to the file `calls`
 STUBS = {
     "dpkg-query": "exit 1",
     "apt-get": 'echo "apt-get $*" >> "$CALLS"; exit 1',
@@ -21,7 +21,7 @@ STUBS = {
     '[ "$1" != -n ] || shift; exec "$@"',
     "id": "echo 1000",
 }
-#: stands for the Python of the environment: says what pip is told
+#: replacement of the environment's Python, which records the constraints given to pip
 PYTHON = """#!/bin/sh
 case "$*" in
     *install*) printf '%s\\n' "$PIP_CONSTRAINT" "$PIP_BUILD_CONSTRAINT" > "$CALLS" ;;
@@ -32,7 +32,7 @@ esac
 
 @pytest.fixture
 def folder(tmp_path):
-    """A checkout in a path with a space, on a system that lacks all packages."""
+    """Return a checkout in a path with a space, on a system without the packages."""
     folder = tmp_path / "a b"
     (folder / "tools").mkdir(parents=True)
     shutil.copy(ROOT / "tools" / "setup.sh", folder / "tools")
@@ -48,7 +48,10 @@ def program(path, text):
 
 
 def setup(folder, answer=None, **env):
-    """Run it, on a terminal if there is an answer: code, what it said and called."""
+    """Run setup.sh; return its exit code, output and calls of system programs.
+
+    answer : text typed on a terminal; None for a run without a terminal
+    """
     calls, bin_ = folder.parent / "calls", folder.parent / "bin"
     env = {"PATH": f"{bin_}:{os.environ['PATH']}", "CALLS": str(calls), **env}
     command = [folder / "tools" / "setup.sh", sys.executable]
@@ -71,10 +74,10 @@ def setup(folder, answer=None, **env):
 
 
 def chunk(terminal):
-    """Read what is left of a terminal's output; nothing once all of it is read."""
+    """Read the next output of a terminal; return b"" at the end."""
     try:
         return os.read(terminal, 2**16)
-    except OSError:  # Linux says so where the other end is closed
+    except OSError:  # raised by Linux if the other end is closed
         return b""
 
 
@@ -95,20 +98,20 @@ def test_on_a_terminal_a_yes_installs(folder):
     assert "apt-get install -y --no-install-recommends libsuitesparse-dev" in calls
 
 
-def test_without_a_terminal_sudo_may_ask_for_nothing(folder):
+def test_without_a_terminal_sudo_must_not_ask_for_a_password(folder):
     code, said, calls = setup(folder, REFUSED="1")
     assert code == 1
     assert "run: sudo apt-get install" in said
     assert calls == "sudo -n true\n"
 
 
-def test_without_a_terminal_what_will_be_installed_is_said_first(folder):
+def test_without_a_terminal_the_packages_are_announced_before_installation(folder):
     _, said, calls = setup(folder)
     assert said.startswith("setup: missing system packages: libsuitesparse-dev")
     assert "apt-get install -y" in calls
 
 
-def test_pip_is_given_constraints_that_no_space_splits(folder):
+def test_constraints_given_to_pip_contain_no_space(folder):
     program(folder.parent / "bin" / "dpkg-query", "#!/bin/sh\necho ' installed'\n")
     program(folder / ".venv/bin/python", PYTHON.format(python=sys.executable))
     (folder / "constraints.txt").touch()
@@ -116,7 +119,9 @@ def test_pip_is_given_constraints_that_no_space_splits(folder):
     code, said, calls = setup(folder)
 
     assert code == 0, said
-    for told in calls.splitlines():
-        assert not set(told) & set(" \t")
-        assert Path(unquote(urlparse(told).path)).samefile(folder / "constraints.txt")
+    for constraint in calls.splitlines():
+        assert not set(constraint) & set(" \t")
+        assert Path(unquote(urlparse(constraint).path)).samefile(
+            folder / "constraints.txt"
+        )
     assert len(calls.splitlines()) == 2

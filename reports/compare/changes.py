@@ -24,7 +24,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
-_NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
+_NEGLIGIBLE = 1e-12  #: differences of energies (of order 1) below it count as rounding
 
 #: case (for a QP from a file, its digest), tolerance, and solver with its mode
 Key = tuple[str, float, str]
@@ -65,8 +65,8 @@ class Pair:
     @cached_property
     def ratio(self) -> Ratio | None:
         """Time after / time before, with Welch's interval; None below two repeats."""
-        # Not a bootstrap: with three to ten repeats, resampling reports a spurious
-        # change three to five times as often as the nominal one in twenty.
+        # A bootstrap over three to ten repeats would report a spurious change three to
+        # five times as often as at the nominal rate of one in twenty.
         if self.log is None:
             return None
         return unpaired_ratio(_seconds(self.after), _seconds(self.before))
@@ -137,7 +137,7 @@ class Comparison:
     pairs: tuple[Pair, ...]
     only_before: tuple[Outcome, ...]
     only_after: tuple[Outcome, ...]
-    folders: int = 1  #: number of folders compared with the first, this one included
+    folders: int = 1  #: number of folders compared with `before`, including `after`
 
     @property
     def worse(self) -> tuple[Pair, ...]:
@@ -163,7 +163,7 @@ class Comparison:
 def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
     """Pair the cells of two folders, in the order of the later one.
 
-    folders : number of folders compared with `before`, `after` included
+    folders : number of folders compared with `before`, including `after`
     """
     a, b = ({_key(o): o for o in e.flat} for e in (before, after))
     machines = hardware(before) | hardware(after)
@@ -187,7 +187,7 @@ def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
 
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
-    """Average the ratios of times over cells (see `mean_of`); None without times."""
+    """Return the mean ratio of times over cells (see `mean_of`); None without times."""
     return _over_cells((p, p.log) for p in pairs)
 
 

@@ -102,14 +102,17 @@ def dates(c: Comparison) -> str:
 
 
 def change_word(interval: Ratio | Mean) -> str:
-    """Return a change in words; "no change seen" if one would have been visible."""
+    """Return a change in words: one of `WORDS`.
+
+    "No change seen" means that a change by the factor `ALIKE` would be visible.
+    """
     if way := side(interval):
         return "slower" if way > 0 else "faster"
     return "no change seen" if resolved(interval) else "not resolved"
 
 
 def named(c: Comparison) -> list[str]:
-    """List what became worse: verdicts, answers, then times, the largest first."""
+    """List changes for the worse: verdicts, answers, then times, slowest first."""
     slower = [(p.ratio.low, p) for p in c.timed if p.ratio and p.change > 0]
     slower.sort(key=lambda each: each[0], reverse=True)
     worse = [("worse", p) for p in c.worse]
@@ -121,12 +124,12 @@ def named(c: Comparison) -> list[str]:
 
 
 def cell_name(pair: Pair) -> str:
-    """Name solver, case and tolerance."""
+    """Return solver, case and tolerance of a cell as text."""
     return TEXT("cell", pair.after)
 
 
 def ratio_text(ratio: Ratio | Mean) -> str:
-    """Print a ratio, with its interval if known."""
+    """Format a ratio, with its interval if known."""
     if ratio.low == 0:
         return f"{ratio.value:.3f} [too few cells]"
     return fixed(ratio)

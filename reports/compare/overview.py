@@ -30,8 +30,8 @@ def overview(found: Sequence[Comparison]) -> Page:
         title=f"{clean(found[-1].after.name)}: {', '.join(names)} against {first}",
         dateline=dateline(found[-1].after),
         sections=tuple(s for s in sections if s is not None),
-        footer="The changes in each folder since the first are on a separate page, in "
-        "report/against-….",
+        footer="For each folder, the changes since the first folder are on a separate "
+        "page in report/against-….",
     )
 
 

@@ -6,8 +6,8 @@ entirely above 1: the interval of the ratio after / before, and the interval of 
 ratio relative to the other solvers in the same blocks, which cancels a common slowdown.
 Both intervals are unpaired between the folders, which are different sessions.
 
-- Solver: mean of the logarithms over its cases, at least three, with Student's interval
-  over them. Their scatter includes the differences between runs on one case.
+- Solver: mean of the logarithms over its cases (at least three), with Student's
+  interval. The scatter over cases includes the differences between runs on one case.
 - Single cell: its standard error is the larger of Welch's error over the repeats and
   the scatter of the cells about the means of their solvers (1.4826 times the median
   distance, which is the standard deviation of a normal law). At least `CELLS` cells are
@@ -114,7 +114,10 @@ def regressions(c: Comparison) -> Regressions:
 
 
 def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
-    """Describe the solvers that lack a verified answer in `folders` of the folders."""
+    """Describe the solvers without a verified answer, in one folder or in both.
+
+    folders : number of folders without a verified answer, 1 or 2
+    """
     found = []
     for solver in c.solvers:
         pairs = [p for p in c.of(solver) if not p.after.first.role]

@@ -77,7 +77,7 @@ def write_comparisons(
     Returns
     -------
     the comparisons, their conclusions in a few lines of text, and paths of the files,
-    beginning with those of the page on all folders
+    of which the files of the page on all folders come first
 
     Raises
     ------

@@ -72,7 +72,7 @@ def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
 def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return the cases solved by every solver that solved at least half of all cases.
 
-    If other solvers counted, one that solves almost nothing would leave no common case.
+    A solver that solved only a few cases would leave almost no common cases.
 
     Returns
     -------
@@ -128,7 +128,7 @@ class Ranking:
 
     @cached_property
     def first(self) -> Array:
-        """(solvers,) share of the resamples in which a solver has the smallest mean."""
+        """(solvers,) share of the resamples in which each solver has the least mean."""
         return resampling.firsts(np.log(self.draws))
 
     @cached_property
@@ -178,7 +178,7 @@ class Ranking:
 
 
 def ranking_of(group: ComparisonGroup) -> Ranking:
-    """Rank the solvers of a group, resampling its cases."""
+    """Rank the solvers of a group, with draws over resampled cases."""
     logs, shift = _logs(group, USUAL)
     draws = np.exp(resampling.weights(group.cases) @ logs) - shift
     return Ranking(group=group, draws=draws)

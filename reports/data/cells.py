@@ -16,7 +16,7 @@ BY_OPTIMUM = "⋆"
 
 
 def source(*outcomes: Outcome) -> str:
-    """Return hover text with the run_ids behind a cell; `named` extracts them again."""
+    """Return hover text with the run_ids of outcomes, which `named` can extract."""
     return sources(r for o in outcomes for r in o.records)
 
 

@@ -66,11 +66,11 @@ Answers = Mapping[GroupKey, Mapping[str, Row]]  #: outcomes by group and case
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonGroup:
-    """Cases of one form at one accuracy, and the solvers measured on each of them.
+    """Cases of one form at one accuracy, and the solvers measured on every case.
 
     Copies and null arms (a solver repeated under a second label) are left out. Times
     are medians of prepare + solve over the repeats. If several tolerances were swept,
-    the time is that of the fastest verified (or claimed) answer.
+    the time of the fastest verified (or claimed) answer is used.
     """
 
     key: GroupKey
@@ -195,7 +195,7 @@ def all_groups(
     """Group the measurements by form, mode and accuracy.
 
     Forms are separate, since the primal and the dual QP of one problem are different
-    problems for a solver. Cold solves and sequences are separate too.
+    problems for a solver. Cold solves and sequences are also separate.
 
     pool_forms : put all forms into one group, in which each QP remains a separate case
     """
@@ -243,9 +243,9 @@ def _answers(cells: Cells) -> dict[str, Row]:
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Select one of a solver's answers to a case at several tolerances.
+    """Return one of a solver's answers to a case at several tolerances.
 
-    This is the fastest verified answer; if no answer is verified, it is the one at the
+    Return the fastest verified answer or, if no answer is verified, the answer at the
     tightest tolerance.
     """
     timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
@@ -261,7 +261,7 @@ def time_of(outcome: Outcome) -> float | None:
 
 
 def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
-    """Mark pairs of solvers that have no common block on at least one case."""
+    """Mark pairs of solvers that lack a common block on at least one case."""
     n = len(group.solvers)
     apart, faster = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):

@@ -1,9 +1,9 @@
 """Crossover of routes: time and memory from the mesh to a verified answer, by size.
 
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
-fastest of the solvers that were measured on it; the primal form with multigrid is a
-separate route. Cases of a growing series are built anew for each repeat; hence the
-time includes all work between the mesh and the recovered displacements:
+fastest of the measured solvers. The primal form with multigrid is a separate route.
+Cases of a growing series are built anew for each repeat; hence the time includes all
+work between the mesh and the recovered displacements:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
 """
@@ -24,7 +24,7 @@ from mortarbench.reports.statistics.intervals import Interval, median_interval
 MULTIGRID = "pdas-amg"  #: solver that forms a separate route
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
-#: kinds of routes in a complete map
+#: values of `Route.kind` in a complete map
 KINDS = ("primal", "primal, multigrid", "dual", "dual-bounds", "TFETI", "hybrid TFETI")
 PRIMAL = KINDS[:2]
 
@@ -123,7 +123,7 @@ def memory(o: Outcome) -> Interval | None:
 
     Building and solving take place in successive processes, so the larger of their
     peaks counts. On several ranks, the ranks build the case themselves, and the peak is
-    that of all ranks together.
+    the joint memory of all ranks.
     """
     peaks = [
         max(r.build_peak_mib or 0.0, r.peak_mib)
@@ -221,7 +221,7 @@ def _position(route: Route) -> tuple[Any, ...]:
 
 
 def _mesh(o: Outcome) -> tuple[Any, ...]:
-    """Return family and parameters of a case without those of its decomposition."""
+    """Return the family and the parameters except the keys of the decomposition."""
     params = {k: v for k, v in o.first.params.items() if k not in DECOMPOSITION}
     return o.first.family, *sorted(params.items())
 

@@ -28,7 +28,7 @@ RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
 
-#: Verdicts, worst first; an outcome of several repeats has the worst of their verdicts.
+#: Verdicts, worst first. The verdict of an outcome is the worst verdict of its repeats.
 SEVERITY = (
     Verdict.WRONG,
     Verdict.INACCURATE,
@@ -121,7 +121,7 @@ class Outcome:
 
     @property
     def run_ids(self) -> tuple[str, ...]:
-        """Identifiers of the measurements behind this outcome."""
+        """Identifiers of the measurements of this outcome."""
         return tuple(r.run_id for r in self.records)
 
     def largest(self, name: str) -> float | None:
@@ -185,7 +185,7 @@ class Outcome:
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results of the first repeat that stored any; empty if none did."""
+        """Physical results of the first repeat that has results; empty if none has."""
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:

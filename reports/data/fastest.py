@@ -72,7 +72,8 @@ class Competitor:
     #: ratios within blocks, by case
     by_case: Mapping[str, Ratio] = field(default_factory=dict)
     form: str = ""  #: form of the QPs; empty unless forms are compared
-    apart: bool = False  #: True if on some case it shares no block with the first
+    #: True if on some case the solver has no block in common with the first solver
+    apart: bool = False
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -138,7 +139,7 @@ class Unverified(NamedTuple):
     solver: str
     verdict: Verdict
     answers: tuple[Outcome, ...]
-    of: int  #: number of all answers of the solver, declined ones included
+    of: int  #: number of all answers of the solver, including declined ones
 
 
 def fastest_solvers(

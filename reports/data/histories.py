@@ -18,7 +18,7 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 
 MOST = 4  #: maximum number of cases that are drawn
 
-#: the selection rule of `chosen` in words
+#: description of the selection rule of `chosen`, printed in reports
 RULE = (
     "For each family and form, the largest case with a stored history is drawn, at "
     "its last load step and tightest tolerance, with all solvers that stored a "
@@ -57,7 +57,7 @@ class SolverRun:
         """(rows,) norm of the projected gradient relative to its first positive value.
 
         The norm is √(‖φ‖² + ‖β‖²), with the free gradient φ and the chopped gradient β.
-        None if they are not recorded or always zero.
+        None if the gradients are not recorded or always zero.
         """
         phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:

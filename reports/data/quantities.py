@@ -77,7 +77,7 @@ def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
     for name, value in outcome.quantities.items():
         if (name in SIZES) is sizes:
             scalars |= _flat((str(name),), value)
-    # a table has room for one scalar of each contact pair
+    # tables show one scalar of each contact pair, to limit their width
     return {
         path: leaf
         for path, leaf in scalars.items()
@@ -138,7 +138,7 @@ def quantity(
 
 
 def _rounded(leaf: Leaf, digits: int) -> str:
-    """Format a number; a component has the decimals of the largest in its vector."""
+    """Format a number with the decimals of the largest component of its vector."""
     if not leaf.value or not math.isfinite(leaf.value):
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))
@@ -160,7 +160,11 @@ class Spread(NamedTuple):
 
     @property
     def digits(self) -> int:
-        """Digits of the printed energy; the tolerance limits those of a lone answer."""
+        """Number of digits of the printed energy.
+
+        The number follows from the difference of the answers; for a single answer, it
+        follows from the tolerance.
+        """
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 

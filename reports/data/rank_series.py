@@ -56,7 +56,7 @@ class _Scaling:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StrongSeries(_Scaling):
-    """Verified answers of one solver to one case on one rank and on several."""
+    """Verified answers of one solver to one case on one rank and on several ranks."""
 
     case: str
     tol: float
@@ -87,7 +87,7 @@ class StrongSeries(_Scaling):
         return _ratio(self.answers[1], self.copies.get(ranks), phase, ranks)
 
     def against_copies(self, ranks: int, phase: str) -> Interval | None:
-        """Return the speed-up relative to that of copies, t(copies)/(N·t(N))."""
+        """Return speed-up of ranks / joint speed-up of copies, t(copies)/(N·t(N))."""
         return _ratio(self.copies.get(ranks), self.answers[ranks], phase, 1 / ranks)
 
     @cached_property
@@ -224,7 +224,7 @@ def _ratio(
 ) -> Interval | None:
     """Return factor·t(a)/t(b); the interval of single runs has zero width.
 
-    paired : True if times of a and b with the same block were measured in succession
+    paired : True if the times of a and b in a block were measured in succession
     """
     if a is None or b is None:
         return None

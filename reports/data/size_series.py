@@ -18,7 +18,7 @@ Sized = tuple[int, Outcome]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SizeSeries:
-    """Cases that differ only in size, and the verified answers to each of them."""
+    """Cases that differ only in size, with the verified answers to each case."""
 
     title: str  #: family, fixed parameters, form, tolerance
     solvers: tuple[str, ...]

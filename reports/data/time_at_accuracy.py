@@ -41,8 +41,8 @@ class TimeAtAccuracy(NamedTuple):
 
     #: "between" two measured errors; "looser" than every measured error; "not reached"
     kind: str
-    #: s; None if not reached; if "looser", the time at the largest measured error,
-    #: which is an upper bound
+    #: time in s; None if not reached; for "looser", an upper bound, namely the time at
+    #: the largest measured error
     time: Interval | None
 
 
@@ -58,7 +58,7 @@ def counts(outcome: Outcome) -> bool:
 
 
 def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccuracy:
-    """Interpolate the time that a solver needs for a certified error of `error`.
+    """Interpolate the time in which a solver reaches a certified error of `error`.
 
     The interval comes from a bootstrap over the repeats at each tolerance, seeded by
     the run_ids, and is widened for few repeats (see `resampling.limits`). If a

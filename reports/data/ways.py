@@ -1,8 +1,8 @@
-"""Ways from the mesh to a verified answer: combinations of a form and a solver.
+"""Combinations of form and solver, compared from the mesh to a verified answer.
 
 The primal and the dual QP of one problem are different problems for a solver, but a
-user with a mesh may choose either. The times compared are those of dualisation (dual
-forms only), preparation and solve; assembly is the same for all ways.
+user with a mesh may choose either. The compared time is the sum of dualisation (dual
+forms only), preparation and solve; assembly is the same for all combinations.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ PRIMAL = "primal"  #: the form without dualisation
 
 
 class Way(NamedTuple):
-    """A solver on one form."""
+    """A combination of a form and a solver."""
 
     solver: str
     form: str
 
     @property
     def label(self) -> str:
-        """Solver and form; unique among ways."""
+        """Solver and form; unique among combinations."""
         return f"{self.solver} on the {self.form} form"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ways:
-    """Comparison of all ways at each accuracy."""
+    """Comparison of all combinations of form and solver at each accuracy."""
 
     comparisons: tuple[FastestSolver, ...] = ()  #: cold solves, tight accuracies first
     uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
 
 
 def compare_ways(evidence: Evidence) -> Ways:
-    """Compare the ways to solve the same problems, including dualisation.
+    """Compare combinations of form and solver on the same problems, with dualisation.
 
     A problem is included if it was measured in several forms, or if its only form has a
-    time of dualisation; for other problems this equals the comparison of solvers.
+    time of dualisation. For other problems, the comparison of solvers suffices.
     """
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
@@ -105,7 +105,7 @@ def compare_ways(evidence: Evidence) -> Ways:
 
 
 def _has_all_times(r: Record) -> bool:
-    """Return whether a record includes the time of dualisation, or needs none.
+    """Return whether a record contains the time of dualisation or has no dualisation.
 
     Journals of older versions and cases built by ranks lack this time.
     """

@@ -27,7 +27,8 @@ class ColourScale:
     high: float
     label: str = ""
     unit: float = 1.0  #: value that the bar labels as 1
-    beyond: Literal["neither", "max", "both"] = "neither"  #: ends that clip values
+    #: ends of the range beyond which values occur; the bar has triangles at these ends
+    beyond: Literal["neither", "max", "both"] = "neither"
     names: tuple[str, ...] = ()  #: names of the classes, shown beside the colour bar
 
 
@@ -53,7 +54,7 @@ class Raster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Faces:
-    """Quadrilaterals drawn one over another; those with the value NaN are outlines."""
+    """Quadrilaterals drawn back to front; for the value NaN, only the outline."""
 
     corners: NDArray[np.float64]  #: (k, 4, 2), back to front
     values: Vector  #: (k,) colours; NaN: a thin white outline
@@ -105,7 +106,7 @@ class Vectors:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """An arrow whose head is named as in matplotlib."""
+    """An arrow with one of matplotlib's arrow styles."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -159,7 +160,7 @@ class FieldFigure:
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows
-    #: colours of all panels, shown as a bar beside them
+    #: common colour scale of all panels, shown as a bar beside them; None without one
     scale: ColourScale | None = None
 
 

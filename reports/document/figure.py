@@ -64,7 +64,7 @@ class Series:
     look: Look
     intervals: Intervals | None = None
     step: bool = False  #: True for a step function, constant until the next point
-    few: bool = False  #: True for marks at a few points only
+    few: bool = False  #: True to draw marks at a few of the points only
     clipped: bool = True  #: True to clip at the edge of the panel
     solver: str = ""  #: solver of the points; empty for none
     runs: Runs = ()  #: run_ids behind each point, or one entry for all points
@@ -158,7 +158,7 @@ class Axis:
 
 
 def categories(names: Sequence[str], **how: Any) -> Axis:
-    """Return an axis with names from top to bottom; the k-th name is at −k, from 0."""
+    """Return an axis with names from top to bottom; name k = 0, 1, … is at −k."""
     ticks = tuple((-float(k), name) for k, name in enumerate(names))
     defaults = {"low": 0.4 - max(len(names), 1), "high": 0.6, "ticks": ticks}
     return Axis(**{**defaults, "marked": False, **how})

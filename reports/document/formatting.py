@@ -20,7 +20,7 @@ TIMED = (
     "linearisation and, for dual forms, dualisation are not included."
 )
 
-#: Symbol and words of every verdict, since many readers cannot see its colour.
+#: Symbol and words of every verdict. Colours alone would exclude colour-blind readers.
 VERDICTS = {
     Verdict.VERIFIED: ("✓", "verified"),
     Verdict.VERIFIED_INFEASIBLE: ("✓", "verified infeasible"),
@@ -80,12 +80,12 @@ def clean(text: str, limit: int = 96) -> str:
 
 
 def plain_value(value: object, limit: int = 96) -> str:
-    """Return a number as text without rounding, and other values cleaned by `clean`."""
+    """Return a number as unrounded text, and any other value as sanitised text."""
     return str(value) if isinstance(value, int | float) else clean(str(value), limit)
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print with `digits` significant digits, and with an exponent only if needed."""
+    """Format with `digits` significant digits, and with an exponent only if needed."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:
@@ -97,7 +97,7 @@ def significant(value: float | None, digits: int = 3) -> str:
 
 
 def power(value: float | None) -> str:
-    """Print with two significant digits: 3.2e-9, 1.4, 0.25."""
+    """Format a number with two significant digits: 3.2e-9, 1.4, 0.25."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if 0.095 <= abs(value) < 9.95:
@@ -112,13 +112,13 @@ def _short(text: str) -> str:
 
 
 def tolerance(value: float) -> str:
-    """Print a tolerance in short form: 1e-8."""
+    """Format a tolerance in short form: 1e-8."""
     mantissa, _, exponent = f"{value:.6e}".partition("e")
     return _short(f"{float(mantissa):g}e{exponent}")
 
 
 def seconds(interval: Interval | None) -> str:
-    """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
+    """Format a time with its uncertainty: "12.3 ms [11.9, 14.0]".
 
     The median and both ends have equally many decimals: enough to show three digits of
     the median and to distinguish the ends. For a single run, "1 run" replaces the ends.
@@ -142,30 +142,30 @@ def _distinguishing_decimals(low: float, high: float, decimals: int) -> int:
 
 
 def exponent(fit: PowerLaw) -> str:
-    """Print the exponent of a power law with its 95 % interval."""
+    """Format the exponent of a power law with its 95 % interval."""
     d = _distinguishing_decimals(fit.low, fit.high, 2)
     p, low, high = (round(v, d) + 0.0 for v in (fit.exponent, fit.low, fit.high))
     return f"{p:.{d}f} [{low:.{d}f}, {high:.{d}f}]"
 
 
 def bracketed(value: float, low: float, high: float) -> str:
-    """Print a number and its interval, three digits each: "1.43 [0.890, 2.57]"."""
+    """Format a number and its interval, three digits each: "1.43 [0.890, 2.57]"."""
     return f"{significant(value)} [{significant(low)}, {significant(high)}]"
 
 
 def estimate(of: Sequence[float]) -> str:
-    """Print an estimate and its interval, which are the first three items of `of`."""
+    """Format an estimate and its interval, which are the first three items of `of`."""
     return bracketed(*of[:3])
 
 
 def fixed(of: Sequence[float], digits: int = 3) -> str:
-    """Print a value and its interval, the first three items, with `digits` decimals."""
+    """Format a value and its interval, the first three items, with `digits` places."""
     value, low, high = (f"{v + 0.0:.{digits}f}" for v in of[:3])
     return f"{value} [{low}, {high}]"
 
 
 def span(least_most: tuple[int, int] | None) -> str:
-    """Print a count, or its range if the two values differ."""
+    """Format a count, or its range if the two values differ."""
     if least_most is None:
         return ABSENT
     least, most = least_most

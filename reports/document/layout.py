@@ -24,7 +24,7 @@ _RUN = "run "  #: prefix of the run_ids in the title of a cell
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One entry of a table: plain text with its meaning, without markup."""
+    """Entry of a table: plain text without markup, with attributes for renderers."""
 
     text: str = ABSENT
     symbol: str = ""  #: symbol before the text, if the format supports it
@@ -164,7 +164,7 @@ class Section:
 
     @classmethod
     def of(cls, name: str, title: str, parts: Iterable[Part]) -> Section | None:
-        """Build a section from parts of any type; None if there are no parts."""
+        """Return a section that contains the parts, or None if there are no parts."""
         kinds: dict[type, list[Any]] = {}
         for part in parts:
             kinds.setdefault(type(part), []).append(part)
@@ -192,9 +192,9 @@ class Page:
     title: str
     dateline: str
     sections: tuple[Section, ...]
-    footer: str = ""  #: text on where the data are; empty for a result folder
+    footer: str = ""  #: location of the data; empty for the standard text
     records: tuple[Record, ...] = ()  #: measurements behind the numbers
-    solvers: tuple[str, ...] = ()  #: labels, in the order of their looks in figures
+    solvers: tuple[str, ...] = ()  #: labels; the position determines colour and marker
 
     def sections_of(self, statement: Statement) -> list[Section]:
         """Return the sections of the page that support a statement."""
@@ -215,6 +215,6 @@ def named(title: str) -> list[str]:
 
 
 def short(run_id: str) -> str:
-    """Print a run_id; sanitise it unless it is short, alphanumeric and ASCII."""
-    is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
-    return run_id if is_ours else clean(run_id, 40)
+    """Return a run_id, sanitised unless it is short, alphanumeric and ASCII."""
+    is_safe = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
+    return run_id if is_safe else clean(run_id, 40)

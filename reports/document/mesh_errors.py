@@ -25,7 +25,7 @@ def mesh_table(meshes: Sequence[Discretisation]) -> Table:
             "limit": "; ".join(
                 filter(None, ["relative to the limit of fine meshes", d.note])
             ),
-            "change": f"change to the next mesh only: {d.note}",
+            "change": f"only the change to the next mesh is known: {d.note}",
             "rounding": "the mesh represents the solution exactly, up to rounding",
         }.get(d.kind, d.note)
         return Cell.words(clean(text, 200))

@@ -69,7 +69,7 @@ def csv_tables(
 
 
 def frame_csv(frame: pd.DataFrame) -> str:
-    """Return a data frame as CSV text, see `harness.files.csvfile`."""
+    """Return a data frame as CSV text; `harness.files.csvfile` defines the format."""
     rows = frame.astype(object).where(frame.notna(), None)
     return csv_text(list(frame.columns), rows.itertuples(index=False, name=None))
 

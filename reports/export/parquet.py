@@ -15,7 +15,8 @@ from mortarbench.harness import Record
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.record import JOURNAL, finite
 
-_TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
+#: types of numeric columns; all other columns are text
+_TYPES = {"int": pa.int64(), "float": pa.float64()}
 
 
 def write_records(path: Path, records: Sequence[Record]) -> Path:

@@ -1,4 +1,4 @@
-"""Deformed states for ParaView: one .vtu file, or a .pvd series of them.
+"""Deformed states for ParaView: a single .vtu file, or a .pvd series of .vtu files.
 
 Every .vtu is accompanied by a CSV along each contact of the state.
 """

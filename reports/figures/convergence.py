@@ -30,13 +30,14 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import VERDICTS, tolerance
 from mortarbench.reports.figures.style import TITLE, below, legible, look
 
-#: kinds of steps that are marked: letter in the history, name and marker; most other
-#: steps are CG steps
+#: step types that have markers: letter in the history, name, and marker; most of the
+#: other steps are CG steps
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
 WIDE = 10.0  #: ratio of longest to shortest run above which the axis is logarithmic
 CLOSEST = 5.0  #: minimum distance between markers of one step type on a curve, points
 COLUMNS = 4  #: number of columns of a legend
-FLOOR = 1e-5  #: smallest value shown, in tolerances; smaller values are rounding
+#: smallest value shown, relative to the tolerance; smaller values are due to rounding
+FLOOR = 1e-5
 _BESIDE = 0.8  #: width of the labels left of the axes, inches
 _TOLERANCE = Look(colour=INK, width=0.6, dash=(1, 2))
 
@@ -105,7 +106,7 @@ def active_set_figure(c: CaseHistories) -> Figure | None:
 
 
 def marked(c: CaseHistories) -> list[str]:
-    """Return the names of the kinds of steps that `convergence_figure` marks."""
+    """Return the names of the step types that `convergence_figure` marks."""
     return [name for letter, name, _ in KINDS if c.taken(letter)]
 
 
@@ -200,7 +201,7 @@ def _line(c: CaseHistories, run: SolverRun, x: Vector, y: Vector) -> Series:
 def _steps(
     c: CaseHistories, run: SolverRun, values: Vector, panel: Panel, height: float
 ) -> list[Series]:
-    """Mark the kinds of steps on a curve, omitting overlapping markers."""
+    """Mark the step types on a curve, omitting overlapping markers."""
     markers = []
     ends = limits([panel], "x"), limits([panel], "y")
     sizes = 72 * (WIDTH - _BESIDE), 72 * height  # points
@@ -230,7 +231,7 @@ def _steps(
 
 
 def _style(c: CaseHistories, run: SolverRun) -> Look:
-    """Return colour and dashes of a solver; markers are reserved for kinds of steps."""
+    """Return colour and dashes of a solver; markers are reserved for step types."""
     return replace(look(c.solvers.index(run.outcome.solver)), marker="")
 
 

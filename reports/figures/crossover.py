@@ -61,7 +61,7 @@ def crossover_figure(
         title = legible(one.title, 44)
         panels = (
             _panel(one, charged, "time from mesh to answer in s", time_limit, title),
-            # no letters here: the peaks of several routes are close together
+            # omit letters, because the peaks of several routes are close together
             replace(
                 _panel(one, memory, "peak memory in MiB", memory_limit, title),
                 texts=(),
@@ -103,7 +103,7 @@ def _panel(
 
 
 def _letters(ends: Sequence[tuple[int, float, str]]) -> tuple[Text, ...]:
-    """Write letters at (dofs, value); those that would overlap share a place."""
+    """Return texts with the letters at (dofs, value); join letters that overlap."""
     groups = list[list[tuple[int, float, str]]]()
     for end in sorted(ends):
         last = groups[-1][-1] if groups else (0, 0.0, "")

@@ -37,8 +37,8 @@ from mortarbench.reports.figures.projection import (
     visible_faces,
 )
 
-#: Percentile of the nodal stresses at which the colour scale ends, since stresses are
-#: singular at corners.
+#: Percentile of the nodal stresses at which the colour scale ends. The maximum is not
+#: used, because stresses are singular at corners.
 PERCENTILE = 99.5
 SCALE = 1.0  #: factor of the displacement in figures drawn to scale
 #: Displacements below `SEEN` times the size of the bodies are not visible. They are
@@ -50,7 +50,8 @@ _ACTIVE = (
     1e-6  #: fraction of the largest force above which a contact node counts as loaded
 )
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
-_ARROW = "#101214"  #: dark on any page, as arrows are drawn on coloured bodies
+#: colour of arrows; dark also on dark pages, because bodies are coloured
+_ARROW = "#101214"
 #: colours of arrows by friction state; arrows of frictionless pairs are dark
 FRICTION = {
     "stick": ("#0b5fa5", "blue"),
@@ -116,7 +117,7 @@ def automatic_scale(fields: Fields) -> float:
         return SCALE
     target = SHOWN * span / largest
     power = 10.0 ** np.floor(np.log10(target))
-    if not np.isfinite(power):  # displacements of the size of rounding
+    if not np.isfinite(power):  # displacements that are zero up to rounding
         return SCALE
     return float(max(step * power for step in (1, 2, 5) if step * power <= target))
 
@@ -313,7 +314,7 @@ def _pressure_panel(
     labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
     size = float((high - low).max())
     arrows, key = _friction_arrows(fields, side, camera, size)
-    if arrows:  # extend the panel, so that its frame cuts off no arrow
+    if arrows:  # extend the panel, so that its frame does not cut off arrows
         ends = [(mark.feet, mark.feet + mark.vectors) for mark in arrows]
         shown_ends = np.vstack([*itertools.chain(*ends), low, high])
         low = shown_ends.min(axis=0) - _MARGIN * size

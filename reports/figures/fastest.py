@@ -174,7 +174,7 @@ def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
 
 
 def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
-    """Return the ratio of medians if cases are averaged, else that within blocks."""
+    """Return the ratio of medians if cases are averaged, else the ratio by blocks."""
     if case in c.by_case and not f.over_cases:
         return c.by_case[case]
     mine, its = time_of(c.outcomes[case]), time_of(f.first.outcomes[case])

@@ -81,7 +81,7 @@ def rivals(ranking: Ranking) -> list[int]:
 
 
 def banded(ranking: Ranking) -> bool:
-    """Return whether `profile_figure` has bands; `pairwise_figure` always has them."""
+    """Return whether `profile_figure` has bands; `pairwise_figure` always has bands."""
     group = ranking.group
     return len(group.solvers) <= 2 or len(group.cases) >= BANDED
 

@@ -70,7 +70,7 @@ def visible_faces(
     """Divide the faces (k, 4) towards the camera into tiles, sorted back to front.
 
     A face may be large compared with the distance between bodies. Sorting whole faces
-    by depth could then draw hidden parts on top, which sorting tiles avoids.
+    by depth could then draw hidden parts on top. Sorting tiles avoids this error.
 
     values : (N,) values at the nodes, shown as colours and bilinear within faces
     mesh : True to outline each face

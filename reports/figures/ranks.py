@@ -74,11 +74,11 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
         label = legible(s.title, _LONG)
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
     if any(s.copies for s in series):
-        keys.append(Key(label="as many simultaneous copies", look=_copies_look(INK)))
+        keys.append(Key(label="simultaneous copies", look=_copies_look(INK)))
     if any(s.crowded(n) for s in series for n in s.several):
         crowded = replace(look(0), dash=None, fill="none")
         keys.append(Key(label="more ranks than CPUs (CPUs shared)", look=crowded))
-    keys.append(Key(label="as many times as ranks", look=GUIDE))
+    keys.append(Key(label="ideal speed-up", look=GUIDE))
     return _figure(panels, keys, 1)
 
 
@@ -151,8 +151,8 @@ def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Fig
     keys = (
         Key(label="measured", look=_line(look(0))),
         Key(label="model, not measured", look=_MODEL),
-        Key(label="band of the fit", look=_bar(_PALE)),
-        Key(label="as many times as ranks", look=GUIDE),
+        Key(label="uncertainty of the fit", look=_bar(_PALE)),
+        Key(label="ideal speed-up", look=GUIDE),
     )
     return _figure(panels, keys, 4)
 

@@ -21,10 +21,11 @@ from mortarbench.reports.document.figure import (
 )
 from mortarbench.reports.document.formatting import clean
 
-#: One hue for each solver, at least 28° apart up to the eighth and 6° up to the last.
-#: The first four are Okabe and Ito's. Each further one is the OKLCH colour farthest
-#: from its predecessors under normal vision, deuteranopia and protanopia (Machado et
-#: al. 2009), with a contrast of at least 2.4 on light and dark pages.
+#: Colours of the solvers. The hues of the first eight differ by at least 28°, and the
+#: hues of all colours differ by at least 6°. The first four colours are Okabe and
+#: Ito's. Every further colour is the OKLCH colour farthest from all previous ones under
+#: normal vision, deuteranopia and protanopia (Machado et al. 2009), with a contrast of
+#: at least 2.4 on light and dark pages.
 COLOURS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8b6bf7", "#b0a93b", "#e17ffe",
     "#c9212e", "#216e45", "#4851d5", "#b02e9a", "#b775fe", "#698e2f", "#31a3b0",

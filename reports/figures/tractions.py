@@ -19,7 +19,7 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.figures.deformed import FRICTION, length_unit, prefixed
 from mortarbench.reports.figures.style import below, curve, legible
 
-SHOWN = 1e-6  #: fraction of the largest pressure below which a node is not loaded
+SHOWN = 1e-6  #: fraction of the largest pressure below which a node counts as unloaded
 BESIDE = 0.15  #: margin on either side, relative to the length of the loaded part
 _EXACT = Look(colour=INK, width=0.9)
 _NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)

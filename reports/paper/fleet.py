@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     size: int
     outcome: Outcome
-    dofs: bool  #: True for sizes of the primal problem, False for the dual
+    dofs: bool  #: True if the size is n (primal), False if the size is m (dual)
 
     @property
     def time(self) -> Interval | None:
@@ -64,7 +64,7 @@ class Place(NamedTuple):
 
     @property
     def failed(self) -> bool:
-        """True if the problem was tried but not verified; then no time is shown."""
+        """True if the solver tried the problem and its answer is not verified."""
         return self.tried and not self.outcome.verified
 
 
@@ -230,8 +230,8 @@ def totals_table(evidence: Evidence) -> Table:
     return Table(
         caption=f"Total times at n = {n}, prepare and solve. The dualisation of one "
         "load step, including the factorisation, is measured once for all "
-        "solvers, so the intervals in the last column are those of the "
-        "solver alone.",
+        "solvers, so the intervals in the last column contain only the "
+        "scatter of the solver times.",
         columns=("", "primal", "dual", "dualising", "dual with dualising"),
         rows=tuple(rows),
     )

@@ -35,7 +35,7 @@ CONTACTS = {  #: name in tables → label in figures
     "mortar": "mortar, dual basis",
     "mortar-standard": "mortar, standard basis",
 }
-EXACT = 1e-12  #: smaller relative errors are rounding and are drawn at this value
+EXACT = 1e-12  #: smaller relative errors are due to rounding and drawn at this value
 QUANTITIES = {  #: name in the figure → columns of its components
     "tip displacement": ("tip_x", "tip_y"),
     "contact force": ("force_x", "force_y"),

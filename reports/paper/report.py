@@ -186,7 +186,8 @@ def _summary(rows: Sequence[Row]) -> Section:
             "distribution-free 95 % interval of the median in brackets and as bars "
             "(below six repeats: minimum and maximum, with lower coverage). Garbage "
             "collection is off. All methods, including those marked “the paper's "
-            "way”, are our implementations: the code of the paper is not public.",
+            "method”, are our implementations, because the code of the paper is not "
+            "public.",
         ),
     )
 
@@ -359,13 +360,14 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
                     figure=verification_figure(tables["verification"]),
                     caption="Contact rows compared with exact solutions. (a): "
                     "largest error of σy at the Gauss points of the patch "
-                    "test with 3 elements meeting 2 (errors below 1e-12 are "
-                    "rounding, drawn at 1e-12). On the finest mesh it is "
+                    "test, in which 3 elements meet 2 (errors below 1e-12 are "
+                    "due to rounding and are drawn at 1e-12). On the finest "
+                    "mesh, this error is "
                     f"{100 * float(left['error']):.2g} % for node-to-segment, "
-                    f"and at most {mortar:.0e} for mortar. (b): pressure "
-                    "between two cylinders compared with Hertz's, in L²; its "
-                    "error is at least of order a²/R² because the bodies are "
-                    "finite.",
+                    f"and at most {mortar:.0e} for mortar. (b): L² error of "
+                    "the pressure between two cylinders relative to the "
+                    "solution of Hertz. This error is at least of order a²/R², "
+                    "because the bodies are finite.",
                 ),
             ),
         ),

@@ -35,13 +35,13 @@ from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 DOFS = "degrees of freedom $n$"
 METHODS = {  #: name in tables → label in the report
-    "triplets": "triplets, vectorised (the paper's way)",
+    "triplets": "triplets, vectorised (the paper's method)",
     "compiled": "compiled, pattern included",
     "compiled-reused": "compiled, pattern reused",
     "geometric": "Cholesky, fixing nodes by geometry",
-    "spectral": "Cholesky, fixing nodes by spectra (the paper's way)",
+    "spectral": "Cholesky, fixing nodes by spectra (the paper's method)",
     "pinv": "dense pinv",
-    "per-row": "one solve per row (the paper's way)",
+    "per-row": "one solve per row (the paper's method)",
     "condensed": "condensed",
 }
 LINES = {  #: row of the table of times → parts of an analysis
@@ -111,7 +111,7 @@ def medians(
 
 
 def times(rows: Iterable[Row], x: str, **where: Any) -> list[Point]:
-    """Return medians of selected rows against column `x`; parts of a repeat add up."""
+    """Return medians of selected rows against column `x`; sum the rows of a repeat."""
     by_size = medians(select(rows, **where), [x])
     return [Point(float(key), time) for (key,), time in sorted(by_size.items())]
 
@@ -320,7 +320,7 @@ def largest(experiment: Experiment) -> list[Row]:
 
 
 def of_table_1(rows: Sequence[Row]) -> bool:
-    """Return whether the size equals that of the published times."""
+    """Return whether the rows have the size for which the paper states times."""
     return (rows[0]["Nr"], rows[0]["Nh"]) == (30, 15)
 
 
@@ -387,7 +387,13 @@ def timings(experiment: Experiment) -> Table:
         "Condensed: the factorisation includes the condensation onto the interface and "
         "should be compared together with the dualisation. Ratio: published time over "
         "our condensed time, on different machines.",
-        columns=("", "published", "ours, the paper's way", "ours, condensed", "ratio"),
+        columns=(
+            "",
+            "published",
+            "ours, the paper's method",
+            "ours, condensed",
+            "ratio",
+        ),
         rows=tuple(lines),
     )
 

@@ -82,7 +82,7 @@ def strict(content: Any) -> str:
 
 
 def plots(page: Page, rows: Rows) -> dict[str, list[Data]]:
-    """Describe every figure of curves, by its name."""
+    """Return the plot data of every figure of curves, by the name of the figure."""
     solvers = {s: i for i, s in enumerate(page.solvers)}
     return {
         picture.name: [_numbered(one, rows) for one in panels(picture.figure, solvers)]

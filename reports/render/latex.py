@@ -150,7 +150,8 @@ def escaped(text: str) -> str:
     """Escape for text mode; characters missing in OT1 become their code points.
 
     A leading bracket is braced, because TeX would read it as an optional argument
-    after the end of a row. Consecutive hyphens are separated, or TeX would join them.
+    after the end of a row. Consecutive hyphens are separated, because TeX would combine
+    them to dashes.
     """
     if _PLAIN.fullmatch(text):  # most cells of a large report
         return text

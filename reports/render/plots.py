@@ -155,7 +155,7 @@ def _line(series: Series) -> Data:
 
 
 def _thinned(y: Numbers) -> list[int]:
-    """Select the extremes of every stretch of a long line, and its ends."""
+    """Return indices of the ends of a line and of the extremes of its stretches."""
     count = len(y)
     if count <= MOST:
         return list(range(count))

@@ -43,7 +43,7 @@ def save(figure: Figure | FieldFigure, path: Path) -> None:
     if path.suffix not in ENDINGS:
         known = ", ".join(sorted(ENDINGS))
         raise InputError(
-            f"{path}: unknown kind of picture {path.suffix!r}; known: {known}"
+            f"{path}: unknown picture format {path.suffix!r}; known: {known}"
         )
     canvas = draw(figure)
     _save(canvas, _placed(canvas), [path])

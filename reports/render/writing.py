@@ -18,7 +18,7 @@ RENDERED = frozenset({"html", "md", "tex"})  #: formats that contain a page
 
 
 def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]:
-    """Write a page in those formats that `RENDERED` contains, and its figures.
+    """Write a page in every format of `formats` that is in `RENDERED`, with figures.
 
     The format html gives index.html, md gives report.md, and tex gives a file in
     tables/ for each section. The figures are written to figures/.

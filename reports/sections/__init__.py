@@ -59,7 +59,7 @@ class Analysis:
 
     @cached_property
     def ways(self) -> Ways:
-        """Comparison of ways (see `reports.data.ways`), over all forms."""
+        """Comparison of combinations of form and solver, see `reports.data.ways`."""
         return compare_ways(self.evidence)
 
     @cached_property
@@ -97,7 +97,7 @@ def section(
 ) -> Callable[[Write], Callable[[Analysis], Section | None]]:
     """Register a generator of a section; a section without contents is left out.
 
-    place : number that determines the position; sections are in increasing order
+    place : sort key of the section; sections are in ascending order of `place`
     name : anchor, and stem of the section's files
     needs : title and required measurements, listed in reports without this section
     """
@@ -120,7 +120,7 @@ def sections(analysis: Analysis) -> Iterator[Section]:
     for entry in _entries():
         if entry.place >= APPENDIX and missing:
             prose = (
-                "These sections are missing because their measurements are missing.",
+                "The following sections are omitted because measurements are missing.",
             )
             title = "Not in this report"
             yield Section(name="absent", title=title, prose=prose, points=(*missing,))

@@ -1,7 +1,7 @@
 """Opening of the report: the fastest solver of each form, its lead, and the failures.
 
-A suite of one solver opens with the growth of its iterations, with condition numbers
-and speed-up on ranks.
+If the suite has only one solver, the report opens with the growth of the solver's
+iterations, with condition numbers, and with the speed-up on ranks.
 """
 
 from __future__ import annotations
@@ -184,10 +184,11 @@ def _statement(
     for f in found:
         evidence |= {"accuracy"} if f.key.sweep else set()
         evidence |= {"means", "ranking"} if f.over_cases else {"times", "ratios"}
+    counted = "case" if len(found) == 1 else "answer"
     remarks = (
         *_faster_elsewhere(found[0]),
-        TEXT("failed", failed, "case" if len(found) == 1 else "answer"),
-        TEXT("declined", declined),
+        TEXT("failed", failed, counted),
+        TEXT("declined", declined, counted),
         *_reservations(found),
         f"{len(found) - len(selected)} more tolerances are in the sections below."
         if len(selected) < len(found)

@@ -142,7 +142,7 @@ def _means_table(ranking: Ranking) -> Table:
 
 
 def _share(p: float) -> str:
-    """Print a share of the draws with as many digits as 2000 draws support."""
+    """Format a share of the draws with as many digits as 2000 draws support."""
     return "0" if p == 0 else "< 0.01" if p < 0.01 else f"{p:.2f}"
 
 

@@ -55,7 +55,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
     yield from TEXT.parts("claim_counts")
     yield Table.of(
-        "Claims beside verdicts.",
+        "Claims of the solvers and our verdicts.",
         a.evidence.solvers,
         (
             ("solver", Cell.name),
@@ -112,7 +112,7 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
 def iterations(a: Analysis) -> Iterator[Part]:
     """Tabulate iterations, and the further counts of each solver."""
     yield from TEXT.parts("iterations")
-    caption = "Iterations, as each solver counts them."
+    caption = "Iterations, as counted by the solvers."
     yield grid(a.evidence, caption, _iterations)
     for solver in a.evidence.solvers:
         mine = [o for o in a.evidence.flat if o.solver == solver and o.first.counts]

@@ -30,7 +30,7 @@ from mortarbench.reports.statistics.growth import (
 from mortarbench.reports.statistics.intervals import PowerLaw
 
 MOST_DRAWN = 8  #: largest number of figures of counts; all counts are tabulated
-#: counts listed first; the others follow in the order in which the solver reports them
+#: counts that tables list first, before the other counts in the solver's order
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
 
@@ -176,7 +176,7 @@ def _trend(fit: Growth | None) -> Cell:
 
 
 def per_decade(fit: Growth) -> str:
-    """Print the change per decade and its interval: "+4 % [-1, +9]"."""
+    """Format the change per decade and its interval: "+4 % [-1, +9]"."""
     change, low, high = (f"{min(100 * v, 9999):+.0f}" for v in fit.per_decade)
     return f"{change} % [{low}, {high}]"
 

@@ -37,7 +37,7 @@ TEXT = Sentences(
 
 @section(12, "summary", "Summary")
 def summary(a: Analysis) -> Iterator[Part]:
-    """Summarise the measurements in a few sentences and one table."""
+    """Summarise the measurements in a few sentences and a table."""
     evidence = a.evidence
     tried = [o for o in evidence.flat if o.verdict is not Verdict.DECLINED]
     yield from TEXT.parts(

@@ -179,8 +179,8 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
 def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
     """Return "best" or "tied" for the fastest solvers of a row.
 
-    A time that is only bounded from above gets no mark. Because it may be the smallest,
-    no other time of its row is called the best.
+    A time that is only bounded from above gets no entry. Because the true time may be
+    the smallest of the row, no other time of the row is marked as the best.
     """
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:

@@ -26,7 +26,7 @@ class Restricted(NamedTuple):
     mean: Interval  #: s
     solved: int
     stopped: int  #: number of cases stopped at the time limit, which are censored
-    never: int  #: number of cases that ended before it without a verified answer
+    never: int  #: number of cases that ended earlier without a verified answer
 
 
 def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:

@@ -142,8 +142,8 @@ def cost_model(
 ) -> CostModel:
     """Fit W and C ≥ 0 to the times of one solve by least squares of relative errors.
 
-    Repeats are averaged by geometric means. Draws resample the repeats on every number
-    of ranks, those of the copies, and their communication.
+    Repeats are averaged by geometric means. Each draw resamples the repeats on every
+    number of ranks, the repeats of the copies, and the communication.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ class Share(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """Step function: the value is `share` from each `at` to the next."""
+    """Step function with the value share[i] from at[i] to at[i + 1]."""
 
     at: Array
     share: Share

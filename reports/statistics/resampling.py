@@ -68,11 +68,11 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     are reversed for all pairs. The statistic of a pair is compared with the maxima over
     all pairs in the flips [3]_. There are two statistics: Σd/√Σd², which is equivalent
     to Student's t, and the same expression for the signed ranks of d, which a few
-    failures with a large penalty do not distort. A statistic is used only if its sign
-    agrees with that of the mean. The more significant of the two is used, for the data
+    failures with a large penalty do not distort. A statistic is used only if it has the
+    sign of the mean. The more significant of the two statistics is used, for the data
     and for every flip. Therefore, for any number of equal solvers, at most one set of
     cases in twenty yields a significant pair. With fewer than six cases no pair is
-    significant: five signs agree in 2 of 2⁵ flips.
+    significant, because five signs agree by chance in 2 of 2⁵ flips.
 
     Parameters
     ----------

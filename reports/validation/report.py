@@ -224,7 +224,7 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Tabulate the answers of each solver that stand out, with the worst of them."""
+    """Tabulate the number of answers of each solver that stand out, and the worst."""
     grouped: dict[str, list[Data]] = {}
     for d in data["remarks"]:
         grouped.setdefault(d["solver"], []).append(d)
@@ -233,8 +233,8 @@ def _remarks(data: Data) -> Iterator[Part]:
             s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
         }
         yield Table.of(
-            "Answers within their claims, but far less accurate than those of other "
-            "solvers.",
+            "Answers within their claims, but far less accurate than the answers of "
+            "other solvers.",
             grouped,
             (
                 ("solver", Cell.label),

@@ -1,6 +1,6 @@
-"""Times at matched certified errors, and what accuracy beyond the mesh's costs.
+"""Times at equal certified errors, and the cost of accuracy beyond the mesh error.
 
-The sweeps below follow laws that are known: times and errors are planted.
+The sweeps follow known laws, because times and errors are planted.
 """
 
 import json
@@ -39,7 +39,7 @@ def record(solver="a", tol=1e-6, repeat=0, **changes):
 
 
 def sweep(solver="a", seconds=lambda tol: 1e-3 * tol**-0.25, repeats=3, **changes):
-    """One solver whose certified error is its tolerance."""
+    """Return the records of a solver whose certified error equals the tolerance."""
     return [
         record(solver, tol, i, total_seconds=seconds(tol) * (1 + 0.01 * i), **changes)
         for tol in TOLS
@@ -80,7 +80,7 @@ def test_a_power_law_is_interpolated_exactly(error):
     assert found.time.samples == 1
 
 
-def test_beyond_the_sweep_nothing_is_invented():
+def test_times_are_not_extrapolated_beyond_the_sweep():
     points = outcomes(sweep(repeats=1))
 
     assert time_at_accuracy(points, 0.9e-8) == ("not reached", None)
@@ -90,7 +90,7 @@ def test_beyond_the_sweep_nothing_is_invented():
 
 
 def test_a_better_answer_never_takes_less_time():
-    """The noise of two tolerances is pooled, not followed."""
+    """Times of two tolerances that decrease with accuracy are averaged."""
     errors = np.array([1e-2, 1e-4, 1e-6, 1e-8])
     times = np.array([1.0, 4.0, 1.0, 8.0])
     at = [times_at(e, errors, times) for e in np.geomspace(1e-2, 1e-8, 40)]
@@ -118,14 +118,14 @@ def test_two_tolerances_with_one_answer_are_one_point():
         dict(energy_bound=None),
     ],
 )
-def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
+def test_only_certified_answers_of_completed_solves_are_points(ending):
     records = [r.replace(**ending) if r.tol == 1e-8 else r for r in sweep()]
 
     assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
     assert time_at_accuracy(outcomes(records), 1e-5).kind == "between"
 
 
-def test_one_repeat_that_failed_takes_the_point_away():
+def test_one_failed_repeat_removes_the_point():
     records = sweep()
     records[-1] = records[-1].replace(verdict=Verdict.FAILED, claimed="failed")
 
@@ -133,13 +133,13 @@ def test_one_repeat_that_failed_takes_the_point_away():
 
 
 def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
-    """The loose end of a sweep that is judged at a strict accuracy."""
+    """This occurs at loose tolerances of a sweep judged at a strict accuracy."""
     refuted = [r.replace(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
     assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
 
 
-def test_many_curves_at_once_are_fitted_as_one_by_one():
+def test_simultaneous_fits_equal_separate_fits():
     rng = np.random.default_rng(141421)
     for k in (1, 2, 5, 9):
         y, weights = rng.standard_normal((20, k)), rng.integers(1, 4, k)
@@ -174,8 +174,8 @@ def test_the_interval_comes_from_the_repeats_and_is_the_same_every_time():
 
 
 @pytest.mark.parametrize("n", [40, pytest.param(120, marks=pytest.mark.slow)])
-def test_intervals_of_medians_hold_the_true_time_nearly_as_often_as_they_say(n):
-    """Lognormal times of 10 %, nine repeats; such a bootstrap is somewhat short."""
+def test_intervals_of_medians_have_nearly_nominal_coverage(n):
+    """Times are lognormal with 10 % scatter; such bootstrap intervals are too short."""
     rng, held = np.random.default_rng(161803), 0
     for trial in range(n):
         records = [
@@ -199,8 +199,8 @@ def test_the_table_names_the_fastest_at_each_error(page):
     assert [row["b"].kind for row in found] == ["", "best", "best"]
 
 
-def test_upper_bounds_have_no_order_and_nothing_beside_them_is_fastest(page):
-    """Whatever takes at most so long may take less than anything else."""
+def test_rows_with_upper_bounds_have_no_fastest_solver(page):
+    """A time with only an upper bound may be smaller than any other time."""
     direct, other = (sweep(s, repeats=6, energy_bound=1e-12) for s in ("c", "d"))
     bounds, *_ = tables(page([*direct, *other]), "accuracy")
     mixed, *_ = tables(page([*sweep(repeats=6), *direct]), "accuracy")
@@ -210,7 +210,7 @@ def test_upper_bounds_have_no_order_and_nothing_beside_them_is_fastest(page):
 
 
 def test_intervals_that_overlap_are_marked_at_matched_errors(page):
-    """Repeats scatter by 5 %: 2 % more is not told apart, 20 % more is."""
+    """With 5 % scatter, a difference of 2 % is not resolved, and 20 % is resolved."""
     records = [
         r
         for name, factor in (("a", 1.0), ("b", 1.02), ("c", 1.2))
@@ -230,7 +230,7 @@ def test_a_null_arm_does_not_compete_at_matched_errors(page):
     assert {row["a null"].kind for row in found} == {""}
 
 
-def test_the_table_says_why_there_is_no_time(page):
+def test_the_table_states_why_there_is_no_time(page):
     direct = sweep("direct", repeats=2, energy_bound=1e-12)
     weak = [r for r in sweep("weak") if r.tol > 1e-5]
     none = dict(claimed="declined", energy_bound=None, total_seconds=None)
@@ -265,12 +265,12 @@ def test_cases_without_certificates_keep_their_residuals(page):
     assert len(section.tables) == 2
 
 
-def test_two_tolerances_are_no_sweep(page):
+def test_two_tolerances_are_not_a_sweep(page):
     few = [r for r in sweep() if r.tol > 1e-5]
     assert not any(s.name == "accuracy" for s in page(few).sections)
 
 
-def test_the_curve_joins_what_counts_and_the_rest_is_hollow():
+def test_the_curve_joins_certified_points_and_others_are_hollow():
     records = [
         r.replace(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-8 else r
@@ -299,7 +299,10 @@ MESH = Discretisation(
 
 
 def test_a_solver_is_compared_with_the_error_of_the_mesh(page):
-    """Enough is 5e-3: of 1e-2, 1e-4, … the second; then times grow tenfold."""
+    """The sufficient error is 5e-3, so that 1e-4 is the loosest sufficient tolerance.
+
+    Times grow tenfold from tolerance to tolerance.
+    """
     meshes, shares, prices = tables(page(sweep(), [MESH]), "worth")
 
     assert meshes[0]["error"].value == 5e-2
@@ -312,7 +315,7 @@ def test_a_solver_is_compared_with_the_error_of_the_mesh(page):
     assert after.endswith("times as long at 1e-8")
 
 
-def test_the_headline_is_the_median_price_of_digits_that_nobody_needed(page):
+def test_the_first_sentence_is_the_median_cost_of_unneeded_digits(page):
     records = [*sweep(), *sweep("b", lambda _: 1e-3)]
     (section,) = (s for s in page(records, [MESH]).sections if s.name == "worth")
 
@@ -320,14 +323,14 @@ def test_the_headline_is_the_median_price_of_digits_that_nobody_needed(page):
     assert "(from 1.0 to 10 times)" in section.prose[0]
 
 
-def test_answers_that_never_are_good_enough_have_no_price(page):
+def test_insufficient_answers_have_no_cost(page):
     bad = sweep(energy_bound=0.02)
     *_, prices = tables(page(bad, [MESH]), "worth")
 
     assert prices[0]["a"].text == "never accurate enough"
 
 
-def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
+def test_a_solve_that_a_limit_ended_is_never_sufficient(page):
     records = [
         r.replace(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-4 else r
@@ -342,13 +345,18 @@ def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
 @pytest.mark.parametrize(
     ("kind", "error", "note", "told"),
     [
-        ("change", 0.1, "a point load", "change to the next mesh only: a point load"),
+        (
+            "change",
+            0.1,
+            "a point load",
+            "only the change to the next mesh is known: a point load",
+        ),
         ("limit", 0.0, "", "relative to the limit of fine meshes"),
         ("rounding", 1e-8, "", "the mesh represents the solution exactly"),
         ("unknown", None, "too large", "too large"),
     ],
 )
-def test_what_is_not_known_of_a_mesh_is_said(page, kind, error, note, told):
+def test_notes_describe_unknown_mesh_errors(page, kind, error, note, told):
     mesh = Discretisation(case="box", kind=kind, error=error, note=note)
     found = tables(page(sweep(), [mesh]), "worth")
 
@@ -356,11 +364,11 @@ def test_what_is_not_known_of_a_mesh_is_said(page, kind, error, note, told):
     assert len(found) == (3 if kind == "change" else 1)
 
 
-def test_without_the_file_there_is_no_such_section(page):
+def test_without_mesh_errors_there_is_no_section(page):
     assert not any(s.name == "worth" for s in page(sweep()).sections)
 
 
-def test_a_damaged_file_is_one_line(tmp_path):
+def test_a_damaged_file_causes_a_one_line_error(tmp_path):
     (tmp_path / FILE).write_text("{")
     with pytest.raises(InputError, match=FILE):
         compose(Evidence(directory=tmp_path, records=tuple(sweep())))

@@ -1,4 +1,4 @@
-"""A report stands on its own, and prints no digit that is not known."""
+"""Reports explain their contents, and print only significant digits."""
 
 import re
 
@@ -34,7 +34,7 @@ ELASTIC = {
 
 @pytest.fixture
 def measured():
-    """Factory: one record of beam-ring, verified unless told otherwise."""
+    """Return a factory of records of beam-ring, by default verified."""
 
     def make(solver="a", repeat=0, *, form="dual", physical="beam-ring", **changes):
         defaults = dict(
@@ -80,7 +80,7 @@ def grown(measured, sizes=(10, 20, 40), **changes):
     ]  # fmt: skip
 
 
-def test_wherever_times_are_shown_the_report_says_what_is_not_in_them(measured, page):
+def test_the_definition_of_times_is_stated_with_all_times(measured, page):
     assert "dualisation are not included" in TIMED
     made = page(grown(measured))
     assert TIMED in section(made, "times").tables[0].legend
@@ -89,7 +89,7 @@ def test_wherever_times_are_shown_the_report_says_what_is_not_in_them(measured, 
     assert any(TIMED in point for point in section(made, "definitions").points)
 
 
-def test_exponents_are_given_against_both_sizes_and_both_are_named(measured, page):
+def test_exponents_refer_to_both_sizes(measured, page):
     records = [
         r.replace(quantities=r.quantities | {"equality_rows": 0})
         for r in grown(measured)
@@ -107,7 +107,7 @@ def test_exponents_are_given_against_both_sizes_and_both_are_named(measured, pag
         assert "m: size of the dual" in table.legend
 
 
-def test_a_reader_sees_every_parameter_and_the_sizes_of_the_qp(measured, page):
+def test_all_parameters_and_sizes_of_the_qp_are_listed(measured, page):
     shared = {"steps": 10, "plane": "strain"}
     records = [
         measured(physical=f"beam-ring/step={k}", params={"step": k} | shared)
@@ -133,12 +133,12 @@ def energies(measured, *values, **changes):
     ("others", "text"),
     [
         ([-333734.443434567 * (1 + 2e-6)], "-333734"),  # five digits agree
-        ([-333734.443434567 * (1 + 2e-4)], "-3.337e5"),  # never zeros as digits
-        ([-333734.443434567], "-333734.443435"),  # no more than twelve
-        ([], "-333734.443"),  # alone: what the tolerance 1e-8 promises
+        ([-333734.443434567 * (1 + 2e-4)], "-3.337e5"),  # without insignificant zeros
+        ([-333734.443434567], "-333734.443435"),  # at most twelve digits
+        ([], "-333734.443"),  # single answer: digits according to the tolerance 1e-8
     ],
 )
-def test_energies_have_the_digits_that_answers_agree_on_and_one_more(
+def test_energies_have_one_more_digit_than_answers_agree_on(
     measured, page, others, text
 ):
     made = page(energies(measured, -333734.443434567, *others))
@@ -146,14 +146,14 @@ def test_energies_have_the_digits_that_answers_agree_on_and_one_more(
     assert rows(section(made, "physics").tables[1])[0]["energy in J/m"].text == text
 
 
-def test_a_stress_has_three_digits_and_the_caveats_stand_beside_it(measured, page):
+def test_a_stress_has_three_digits_and_caveats(measured, page):
     table = section(page([measured()]), "physics").tables[1]
     assert rows(table)[0]["max von Mises beam in Pa"].text == "7.99e8"
     assert "singular under the point load" in table.legend
     assert "tip displacement and energy also depend on the mesh" in table.legend
 
 
-def test_a_component_has_no_digits_that_its_vector_lacks(measured, page):
+def test_a_component_has_the_decimals_of_its_vector(measured, page):
     forces = ([4e-7, -999999.7], [-6e-3, -999999.8])
     tips = ([0.00123456789, 1.0], [0.00123456789, 1.00002])
     records = [
@@ -163,13 +163,11 @@ def test_a_component_has_no_digits_that_its_vector_lacks(measured, page):
     (row,) = rows(section(page(records), "physics").tables[1])
     assert row["contact force x in N/m"].text == "0"
     assert row["contact force y in N/m"].text == "-999999.7"
-    assert row["tip x in m"].text == "0.001235"  # seven digits of a vector of 1
+    assert row["tip x in m"].text == "0.001235"  # the vector of length 1 has 7 digits
     assert row["tip y in m"].text == "1.0000"
 
 
-def test_physical_results_are_those_of_the_smallest_residual_and_say_whose(
-    measured, page
-):
+def test_physical_results_are_of_the_answer_with_smallest_residual(measured, page):
     records = [
         measured("tight", dual=9e-9, quantities=ELASTIC | {"tip": [1.0, 1.0]}),
         measured("best", tol=1e-6, dual=3e-9, quantities=ELASTIC | {"tip": [2.0, 2.0]}),
@@ -192,7 +190,7 @@ def test_active_rows_on_which_answers_differ_are_a_range(measured, page):
     assert "λ_i > 1e-6 max λ" in table.legend
 
 
-def test_units_are_those_of_elastic_bodies_and_of_no_others(measured, page):
+def test_only_elastic_bodies_have_units(measured, page):
     found = {"dofs": 9, "energy": 4.25, "force": {"left": [1.0, 2.0]}, "x": [0.0] * 99}
     made = page([measured(quantities=found, family="obstacle")])
     table = section(made, "physics").tables[1]
@@ -205,7 +203,7 @@ def test_units_are_those_of_elastic_bodies_and_of_no_others(measured, page):
     assert not any("SI" in text for text in section(made, "physics").prose)
 
 
-def test_one_sign_means_one_thing(measured, page):
+def test_each_symbol_has_one_meaning(measured, page):
     times = {"fast": (1, 2, 3), "tied": (2, 3, 4), "bad": (1, 2, 3)}
     records = [
         measured(s, i, total_seconds=t / 1000,
@@ -234,7 +232,7 @@ def test_unequal_numbers_of_repeats_are_mentioned(measured, page):
     assert "3 to 10" in " ".join(section(page(three + ten), "summary").prose)
 
 
-def test_what_a_solver_declined_is_no_measurement(measured, page):
+def test_declined_cases_do_not_count_as_measurements(measured, page):
     records = [
         *(measured("a", i) for i in range(3)),
         measured("shy", verdict=Verdict.DECLINED, total_seconds=None),
@@ -259,7 +257,7 @@ def test_the_energy_bound_is_explained_only_where_there_is_one(measured, page):
     assert "Energy bound" in bounded
 
 
-def test_where_no_answer_has_a_point_there_is_no_table_of_residuals(measured, page):
+def test_without_points_there_is_no_table_of_residuals(measured, page):
     none = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
     lost = measured(verdict=Verdict.CRASHED, claimed=None, **none)
     found = section(page([lost]), "errors")
@@ -268,7 +266,7 @@ def test_where_no_answer_has_a_point_there_is_no_table_of_residuals(measured, pa
     assert "no residuals" in found.prose[0]
 
 
-def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, page):
+def test_a_residual_above_a_tenth_is_marked_at_any_tolerance(measured, page):
     found = section(page([measured(tol=0.05, dual=0.2, gap=0.05)]), "errors")
     (row,) = rows(found.tables[0])
     assert (row["dual"].kind, row["gap"].kind) == ("over", "")
@@ -292,19 +290,19 @@ def test_bodies_in_space_have_forces_in_newtons_and_others_per_metre(measured, p
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_report_looks_for_the_picture_of_bodies_in_space(measured, tmp_path):
+def test_a_missing_picture_of_bodies_in_space_is_reported(measured, tmp_path):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured(fields="0123456789abcdef", quantities=IN_SPACE))
     write_report(tmp_path, ["md"])
     text = (tmp_path / "report/report.md").read_text("utf-8")
 
     assert "no verified answer has bodies to draw" not in text
-    assert "No picture of" in text  # its fields are not in the folder
+    assert "No picture of" in text  # the folder lacks the fields
 
 
 @pytest.mark.parametrize("damaged", [False, True])
 @pytest.mark.usefixtures("only_svg")
-def test_the_journal_alone_makes_a_report(measured, tmp_path, damaged):
+def test_a_report_needs_only_the_journal(measured, tmp_path, damaged):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured(fields="0123456789abcdef"))
     if damaged:
@@ -319,7 +317,7 @@ def test_the_journal_alone_makes_a_report(measured, tmp_path, damaged):
     assert not (tmp_path / "report/figures/deformed.png").exists()
 
 
-def test_an_interval_of_a_time_never_collapses():
+def test_the_ends_of_time_intervals_are_distinguishable():
     narrow = median_interval([0.1196, 0.1199, 0.1201])
     assert seconds(narrow) == "119.9 ms [119.6, 120.1]"
     nearly = median_interval([0.11998, 0.12, 0.12001])
@@ -327,7 +325,7 @@ def test_an_interval_of_a_time_never_collapses():
     assert exponent(PowerLaw(1.5, 1.4999, 1.5001, 1, 4)) == "1.5000 [1.4999, 1.5001]"
 
 
-def test_the_text_says_what_an_interval_presumes_and_how_weak_it_is(measured, page):
+def test_the_text_states_assumptions_and_coverage_of_intervals(measured, page):
     three = section(page([measured("a", i) for i in range(3)]), "times")
     text = " ".join(three.prose)
     assert "independent and identically distributed" in text
@@ -337,7 +335,7 @@ def test_the_text_says_what_an_interval_presumes_and_how_weak_it_is(measured, pa
     assert "weak" not in " ".join(seven.prose)
 
 
-def test_numbers_are_written_as_one_writes_them():
+def test_numbers_are_formatted_in_the_usual_way():
     assert [power(v) for v in (1.4, 0.25, 3.2e-9, 14.0)] == (
         ["1.4", "0.25", "3.2e-9", "1.4e1"]
     )
@@ -348,11 +346,11 @@ def test_numbers_are_written_as_one_writes_them():
 def test_the_last_rows_of_a_table_are_ruled_off_once(measured, page):
     times, _ = section(page(grown(measured)), "scaling").tables
     body = latex((times,)).split(r"\midrule")
-    assert len(body) == 3  # heads, sizes, the two exponents
+    assert len(body) == 3  # headings, sizes, the two exponents
     assert body[2].count("p against") == 2
 
 
-def test_words_begin_at_the_left_in_every_medium(measured, page):
+def test_words_are_left_aligned_in_every_format(measured, page):
     text = markdown(page([measured()], environment={"machine": {"cpu": "x"}}))
     assert "| key | value |\n| :-- | :-- |" in text
     words = Table(
@@ -363,9 +361,7 @@ def test_words_begin_at_the_left_in_every_medium(measured, page):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_wide_table_says_that_it_scrolls_and_keeps_its_first_column(
-    measured, tmp_path
-):
+def test_a_wide_table_scrolls_with_a_fixed_first_column(measured, tmp_path):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured())
     write_report(tmp_path, ["html"])
@@ -395,7 +391,7 @@ def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
 
 
 def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
-    """Thirty solvers leave the axes as high as three do."""
+    """The height of the axes is the same with three and with thirty solvers."""
 
     def height(count):
         names = [f"solver-{i}" for i in range(count)]
@@ -409,10 +405,8 @@ def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
     assert height(30) >= 0.8 * height(3)
 
 
-def test_what_an_accuracy_allows_is_what_the_table_of_refuted_claims_says(
-    measured, page
-):
-    """Asked for 1e-4, judged at 1e-6: a residual of 5e-5 is above 1e-5."""
+def test_refuted_claims_are_listed_with_the_common_accuracy(measured, page):
+    """At tolerance 1e-4 and accuracy 1e-6, a residual of 5e-5 exceeds 1e-5."""
     record = measured(
         tol=1e-4, accuracy=1e-6, gap=5e-5, verdict=Verdict.INACCURATE, primal=0.0
     )
@@ -422,7 +416,7 @@ def test_what_an_accuracy_allows_is_what_the_table_of_refuted_claims_says(
     assert row["evidence"].text == "gap 5.0e-5 > 1.0e-5"
 
 
-def test_a_suite_of_cold_solves_and_sequences_misses_nothing(measured, page):
+def test_a_suite_of_cold_solves_and_sequences_is_complete(measured, page):
     cold = [measured(physical="beam-ring/n=1")]
     steps = [
         measured("a (sequence)", physical=f"beam-ring/n={n}", mode="sequence")

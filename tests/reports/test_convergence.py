@@ -1,7 +1,8 @@
-"""Figures of histories: what is drawn is what was told, of the cases that were chosen.
+"""Figures of histories: selection of cases, curves and markers.
 
-The first run below has projected gradients (5, 2.5, 0.5, 0)/5 by (3, 4), (2.4, 0.7),
-(0.3, 0.4) and 0, and two outer iterations that end after 4 and 7 products.
+In the history `KNOWN`, the free and the chopped gradient are (3, 4), (2.4, 0.7),
+(0.3, 0.4) and (0, 0), so that the relative projected gradient is (5, 2.5, 0.5, 0)/5.
+The two outer iterations end after 4 and 7 products.
 """
 
 import shutil
@@ -31,7 +32,10 @@ MARKERS = {"e": "^", "f": "x", "p": "o"}
 
 @pytest.fixture
 def folder(tmp_path):
-    """Factory: a result folder of (solver, history, changes to the record)."""
+    """Return a function that writes a result folder from records with histories.
+
+    measured : (solver, history, changes to the record)
+    """
 
     def make(*measured):
         out = tmp_path / "out"
@@ -83,7 +87,10 @@ def convergence_of(page):
 
 
 def curves(axes, marker="None"):
-    """Points of the lines with that marker; marks of steps are lines of their own."""
+    """Return the points of all lines with a given marker.
+
+    The markers of each step type form a separate line.
+    """
     return [
         line.get_xydata().tolist()
         for line in axes.lines
@@ -104,7 +111,7 @@ def test_the_projected_gradient_is_drawn_relative_to_its_first_value(folder):
     assert figure.axes[-1].get_xlabel() == "products with $P$"
 
 
-def test_rounding_far_below_the_tolerance_does_not_squeeze_the_curves(folder):
+def test_values_far_below_the_tolerance_do_not_extend_the_axis(folder):
     tiny = KNOWN | {"free_gradient": [3, 1, 1e-20, 0], "chopped_gradient": [4, 0, 0, 0]}
     low, high = (
         convergence_figure(comparison(folder(("a", tiny, {})))).axes[0].get_ylim()
@@ -114,7 +121,7 @@ def test_rounding_far_below_the_tolerance_does_not_squeeze_the_curves(folder):
     assert high > 1
 
 
-def test_steps_are_marked_by_kind_on_the_upper_panel_and_cg_is_bare(folder):
+def test_steps_are_marked_by_type_on_the_upper_panel_except_cg(folder):
     gradient, infeasibility, _ = convergence_figure(
         comparison(folder(("a", KNOWN, {})))
     ).axes
@@ -125,7 +132,7 @@ def test_steps_are_marked_by_kind_on_the_upper_panel_and_cg_is_bare(folder):
     assert all(not curves(infeasibility, m) for m in MARKERS.values())
 
 
-def test_marks_that_would_overlap_are_left_out_and_the_curve_is_whole(folder):
+def test_overlapping_markers_are_omitted(folder):
     n = 5000
     many = {
         "step": ["e"] * n, "free_gradient": np.geomspace(1, 1e-6, n),
@@ -146,7 +153,7 @@ def test_ticks_show_where_outer_iterations_end(folder):
     assert [segment[0][0] for segment in ticks.get_segments()] == [4, 7]
 
 
-def test_one_outer_iteration_makes_no_ticks(folder):
+def test_a_single_outer_iteration_has_no_ticks(folder):
     figure = convergence_figure(
         comparison(folder(("a", KNOWN | {"outer": [1, 1, 1, 1]}, {})))
     )
@@ -162,7 +169,7 @@ def test_the_active_set_is_drawn_as_steps_over_products(folder):
     assert line.get_drawstyle() == "steps-post"
 
 
-def test_rows_that_slip_are_drawn_below_the_active_set(folder):
+def test_slipping_rows_are_drawn_below_the_active_set(folder):
     rough = KNOWN | {"outer": [1] * 4, "two_sided": [0, 1, 3, 2]}
     figure = convergence.active_set_figure(comparison(folder(("a", rough, {}))))
     above, below = figure.panels
@@ -171,7 +178,7 @@ def test_rows_that_slip_are_drawn_below_the_active_set(folder):
     assert (above.y.label, below.y.label) == ("active bounds", "active, two-sided")
 
 
-def test_one_solver_that_does_not_count_products_puts_all_on_iterations(folder):
+def test_iterations_are_the_axis_unless_all_solvers_count_products(folder):
     bare = {name: KNOWN[name] for name in ("free_gradient", "chopped_gradient")}
     out = folder(("a", KNOWN, {}), ("b", bare, {}))
     gradient, *_, last = convergence_figure(comparison(out)).axes
@@ -195,7 +202,7 @@ def test_each_solver_has_its_colour_and_an_unverified_one_its_verdict(folder):
     assert len(colours) == 2
 
 
-def test_courses_of_very_different_length_share_a_logarithmic_axis(folder):
+def test_runs_of_very_different_length_have_a_logarithmic_axis(folder):
     def scale(longest):
         longer = KNOWN | {"products": [2, 40, 60, longest]}
         out = folder(("a", KNOWN, {}), ("b", longer, {}))
@@ -205,7 +212,7 @@ def test_courses_of_very_different_length_share_a_logarithmic_axis(folder):
     assert scale(71) == "log"
 
 
-def test_what_cannot_be_drawn_is_left_out(folder, svg_only):
+def test_invalid_histories_are_left_out(folder, svg_only):
     strange = {
         "step": [1, 2, 3, 4], "products": ["a"] * 4, "outer": ["x", "y", "z", "z"],
         "free_gradient": [np.nan, np.inf, 2, 1], "chopped_gradient": [0, 0, 0, 0],
@@ -232,15 +239,13 @@ def test_what_cannot_be_drawn_is_left_out(folder, svg_only):
         ({"active": [np.nan]}, []),
     ],
 )
-def test_any_subset_of_columns_gives_the_figures_it_suffices_for(
-    folder, history, names
-):
+def test_figures_need_only_their_columns(folder, history, names):
     found = section(folder(("a", history, {})))
 
     assert [p.name for p in found.pictures if found] == names if names else not found
 
 
-def test_of_each_form_the_largest_case_at_its_last_step_and_finest_tol_is_drawn(folder):
+def test_the_largest_case_of_each_form_is_drawn(folder):
     def case(form, size, step, tol):
         return {
             "case": f"beam-ring/size={size}/step={step}/{form}", "form": form,
@@ -266,7 +271,7 @@ def test_of_each_form_the_largest_case_at_its_last_step_and_finest_tol_is_drawn(
     ]
 
 
-def test_no_more_cases_are_drawn_than_the_text_says(folder):
+def test_the_number_of_drawn_cases_is_limited(folder):
     out = folder(
         *(
             ("a", KNOWN, {"form": f"f{i}", "case": f"beam-ring/f{i}", "size": i})
@@ -280,7 +285,7 @@ def test_no_more_cases_are_drawn_than_the_text_says(folder):
     assert "f1 " not in " ".join(p.caption for p in found.pictures)
 
 
-def test_the_first_repeat_that_kept_a_history_speaks_for_all(folder):
+def test_the_first_stored_history_of_the_repeats_is_used(folder):
     later = KNOWN | {"active": [9, 9, 9, 9]}
     out = folder(
         ("a", {}, {"repeat": 0, "run_id": "r0"}),
@@ -302,7 +307,7 @@ def test_a_report_without_histories_has_no_such_section(folder, svg_only):
     assert not any("convergence" in name or "active" in name for name in names)
 
 
-def test_a_history_that_is_gone_is_said_and_costs_nothing_else(folder):
+def test_a_missing_history_is_reported(folder):
     out = folder(("a", KNOWN, {}), ("b", KNOWN, {}))
     first, *_ = sorted((out / "vectors").iterdir())
     first.unlink()
@@ -313,7 +318,7 @@ def test_a_history_that_is_gone_is_said_and_costs_nothing_else(folder):
     assert len(found.pictures) == 2
 
 
-def test_figures_are_in_the_page_and_in_files_the_same_bytes_every_time(folder):
+def test_figures_in_page_and_files_are_reproducible(folder):
     out = folder(("a", KNOWN, {}), ("_b$x^2", KNOWN, {}))
 
     def written(target):

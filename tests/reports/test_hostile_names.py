@@ -1,4 +1,4 @@
-"""Names that no one should give break neither tables nor figures, in any format."""
+"""Hostile names do not break tables or figures in any format."""
 
 import csv
 import re
@@ -59,14 +59,14 @@ def report(tmp_path_factory, svg_only):
 
 
 @pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
-def test_a_clean_name_is_one_short_line_that_hides_nothing(name):
+def test_a_clean_name_is_one_short_visible_line(name):
     shown = clean(name)
     assert len(shown) <= 96
     assert not re.search(r"[\n\r\x00-\x1f\x7f-\x9f\u2028\u2029]", shown)
     assert not {"Cc", "Cf", "Cs"} & {unicodedata.category(c) for c in shown}
     marks = "".join("m" if unicodedata.combining(c) else "." for c in shown)
-    assert "mmm" not in marks  # or they reach into the rows above and below
-    assert not marks.startswith("m")  # or it joins what stands before
+    assert "mmm" not in marks  # more accents would reach into adjacent rows
+    assert not marks.startswith("m")  # an accent would join the preceding character
 
 
 def test_names_that_differ_invisibly_do_not_look_the_same():
@@ -90,12 +90,12 @@ def test_every_row_of_every_latex_table_has_its_columns(report):
     ("name", "printed"),
     [
         ('say "so"', r"say \symbol{34}so\symbol{34}"),  # OT1 has no \textquotedbl
-        ("a--b---c", r"a-{}-b-{}-{}-c"),  # no dashes that were not there
-        ("«þ»", "U+00ABU+00FEU+00BB"),  # OT1 has none of them
+        ("a--b---c", r"a-{}-b-{}-{}-c"),  # TeX must not form dashes from hyphens
+        ("«þ»", "U+00ABU+00FEU+00BB"),  # OT1 lacks these characters
         ("ünï", "ünï"),
     ],
 )
-def test_latex_prints_what_is_there_with_no_further_package(name, printed):
+def test_latex_prints_all_characters_without_further_packages(name, printed):
     assert tex(name) == printed
 
 
@@ -109,15 +109,15 @@ def test_every_row_of_a_markdown_table_has_its_columns_and_links_nowhere(report)
 
 
 @pytest.mark.parametrize("name", ["1. x", "1) x", "- x", "+ x"])
-def test_markdown_makes_no_list_of_a_name(name):
+def test_names_do_not_become_lists_in_markdown(name):
     assert re.match(r"\d*\\[-+.)] x$", md(name))
 
 
-def test_markdown_leaves_numbers_alone():
+def test_markdown_does_not_escape_numbers():
     assert [md(n) for n in ("-1.5e-3", "1.25", "3")] == ["-1.5e-3", "1.25", "3"]
 
 
-#: of those that are not written as they are
+#: names that CSV files contain in another form
 IN_CSV = {
     '=HYPERLINK("http://evil.example")': "'=HYPERLINK(\"http://evil.example\")",
     "\u202ertl \u0645\u0631\u062d\u0628\u0627 \u2066\u2069":
@@ -131,7 +131,7 @@ IN_CSV = {
 }  # fmt: skip
 
 
-def test_csv_holds_every_name_as_a_text_and_numbers_as_numbers(report):
+def test_csv_contains_names_as_text_and_numbers_as_numbers(report):
     with (report / "tables" / "measurements.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 3 * len(NAMES)
@@ -143,7 +143,7 @@ def test_csv_holds_every_name_as_a_text_and_numbers_as_numbers(report):
 
 
 def is_formula(cell):
-    is_rule = set(cell) <= set("-:")  # of Markdown; LaTeX's dash for what is absent
+    is_rule = set(cell) <= set("-:")  # rule of Markdown, or LaTeX's dash for no value
     is_number = re.fullmatch(r"-[0-9.]+(e-?[0-9]+)?", cell)
     return cell[:1] in tuple("=+-@") and not (is_rule or is_number)
 
@@ -176,7 +176,7 @@ def test_every_column_of_csv_tables_has_the_numbers_that_pandas_writes():
     assert frame_csv(frame) == plain
 
 
-def test_the_page_holds_no_character_that_hides(report):
+def test_the_page_contains_no_invisible_characters(report):
     text = (report / "index.html").read_text("utf-8")
     hiding = {c for c in text if unicodedata.category(c) in {"Cf", "Cs", "Zl", "Zp"}}
     controls = {c for c in text if unicodedata.category(c) == "Cc"}

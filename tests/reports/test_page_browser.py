@@ -1,6 +1,7 @@
-"""The page in a real browser: offline, by mouse and by keyboard, on a phone, at night.
+"""The page in a browser: offline, by mouse and keyboard, on phones, in dark mode.
 
-One Chromium for all tests, one page of a small campaign; hostile names have their own.
+All tests share one Chromium and one page of a small campaign. Tests of hostile names
+use a separate page.
 """
 
 import os
@@ -25,7 +26,7 @@ pytestmark = pytest.mark.together  # one browser, long pages
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOLVERS, CASES, REPEATS = 4, 40, 3
-#: what is off the screen is not laid out, and what is not has no text
+#: Browsers do not lay out figures off the screen, and such figures have no inner text.
 ALL_LAID_OUT = "figure { content-visibility: visible !important }"
 HOSTILE = (
     '<script>window.broken=1</script>"><img src=http://evil.example/x onerror=a()>',
@@ -73,7 +74,10 @@ def records():
 
 @pytest.fixture(scope="session")
 def tabs(browser):
-    """A tab for each set of options, in which the next page opens in half the time."""
+    """Return a factory of tabs, one per set of options.
+
+    Tabs are reused, because a page opens in half the time in an existing tab.
+    """
     tabs, said, asked = {}, [], []
 
     def tab(**options):
@@ -93,7 +97,7 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(tabs):
-    """Open a page; at the end it has said nothing and asked for nothing."""
+    """Open a page; at the end, assert that there were no messages and no requests."""
     tab, said, asked = tabs
     said.clear()
     asked.clear()
@@ -103,7 +107,7 @@ def visit(tabs):
         page = tab(**options)
         scripts = options.get("java_script_enabled", True)
         visits.append((page, scripts))
-        page.goto("about:blank")  # another fragment alone would load nothing
+        page.goto("about:blank")  # a change of the fragment alone would not load a page
         page.set_viewport_size({"width": width, "height": 900})
         page.goto((path / "report" / "index.html").as_uri() + fragment)
         if scripts:
@@ -119,7 +123,7 @@ def visit(tabs):
             page.evaluate("localStorage.clear()")
     assert said == []
     assert all(url.startswith("file:") for url in asked)
-    assert len(asked) == len(visits)  # the pages themselves, nothing else
+    assert len(asked) == len(visits)  # only requests of the pages themselves
 
 
 def table(page, section, number=0):
@@ -127,7 +131,7 @@ def table(page, section, number=0):
 
 
 def column(figure, head):
-    """Texts of one column of the rows that are shown."""
+    """Return the texts of one column in the visible rows."""
     heads = figure.locator("thead th:visible").all_inner_texts()
     cells = figure.locator(f"tbody td:nth-child({heads.index(head) + 1})")
     return [text.strip() for text in cells.all_inner_texts()]
@@ -141,7 +145,7 @@ def names(records, **wanted):
 
 
 def opened(page):
-    """The dialog, once its measurements are unpacked."""
+    """Return the dialog after its measurements are unpacked."""
     dialog = page.get_by_role("dialog")
     dialog.wait_for()
     return dialog
@@ -199,7 +203,7 @@ def test_no_text_of_the_first_figure_leaves_its_drawing(visit, folder, width):
         assert box["x"] + box["width"] <= edges["x"] + edges["width"] + 1
 
 
-def test_a_sentence_of_the_answer_leads_to_its_evidence_by_keyboard(visit, folder):
+def test_evidence_links_work_by_keyboard(visit, folder):
     page = visit(folder, reduced_motion="reduce")
     link = page.locator("#forms dd a", has_text="Means over cases").first
     link.focus()
@@ -230,7 +234,7 @@ def test_a_table_of_many_rows_shows_the_first_and_pages_through_all(
     assert errors.locator("tbody tr").count() == outcomes
 
 
-def test_a_filter_leaves_exactly_the_rows_that_it_names(visit, folder, records):
+def test_a_filter_shows_exactly_the_matching_rows(visit, folder, records):
     page = visit(folder)
     times = table(page, "times")
     times.locator("input").fill("Nr=6/ mortar dual")
@@ -248,7 +252,7 @@ def test_a_filter_leaves_exactly_the_rows_that_it_names(visit, folder, records):
     assert points
 
 
-def test_a_verdict_leaves_exactly_the_cases_that_have_it(visit, folder, records):
+def test_the_verdict_filter_shows_exactly_the_matching_cases(visit, folder, records):
     page = visit(folder)
     page.select_option("#verdict", "wrong")
     wanted = set(names(records, verdict=Verdict.WRONG))
@@ -260,7 +264,7 @@ def test_a_verdict_leaves_exactly_the_cases_that_have_it(visit, folder, records)
     assert set(found) == {
         (r.case, r.solver) for r in records if r.verdict is Verdict.WRONG
     }
-    toggle(page, "solver-a")  # a row whose wrong answer is hidden has none
+    toggle(page, "solver-a")  # rows are hidden with their wrong answers
     wanted = {
         r.case
         for r in records
@@ -269,9 +273,7 @@ def test_a_verdict_leaves_exactly_the_cases_that_have_it(visit, folder, records)
     assert set(column(table(page, "verdicts"), "case")) == wanted
 
 
-def test_a_click_on_a_head_sorts_by_value_and_another_one_turns_round(
-    visit, folder, records
-):
+def test_a_click_on_a_heading_sorts_and_a_second_click_reverses(visit, folder, records):
     errors = table(visit(folder), "errors")
     head = errors.get_by_role("button", name="dual", exact=True)
     head.click()
@@ -311,7 +313,7 @@ def test_hiding_a_solver_hides_it_everywhere(visit, folder):
     assert columns()[3] == "solver-b"
 
 
-def test_what_a_table_draws_anew_is_what_the_page_was_written_with(visit, folder):
+def test_redrawn_tables_equal_the_written_ones(visit, folder):
     page = visit(folder)
     bodies = "[...document.querySelectorAll('tbody')].map((b) => b.innerHTML.trim())"
     clean = r".replace(/ tabindex=.-?\d.|\n/g, '')"
@@ -320,17 +322,17 @@ def test_what_a_table_draws_anew_is_what_the_page_was_written_with(visit, folder
     assert page.evaluate(f"{bodies}.map((t) => t{clean})") == written
 
 
-def test_a_hostile_table_is_drawn_anew_as_it_was_written(visit, hostile):
+def test_a_redrawn_hostile_table_equals_the_written_one(visit, hostile):
     page = visit(hostile)
     rows = "[...document.querySelectorAll('tbody tr')].map((r) => r.innerText.trim())"
     written = page.evaluate(rows)
     page.evaluate("hidden.add(0); redraw(); hidden.clear(); redraw()")
     assert page.evaluate(rows) == written
-    assert page.locator("bdi").count() > 3  # letters that run from right to left
+    assert page.locator("bdi").count() > 3  # right-to-left text
 
 
 @pytest.mark.parametrize(("scheme", "paper"), [("light", 255), ("dark", 21)])
-def test_colours_follow_the_system_until_the_reader_chooses(
+def test_colours_follow_the_system_until_a_theme_is_chosen(
     visit, folder, scheme, paper
 ):
     page = visit(folder, color_scheme=scheme)
@@ -349,7 +351,7 @@ def test_colours_follow_the_system_until_the_reader_chooses(
     assert (button.inner_text(), red()) == ("colours: system", paper)
 
 
-def test_the_tab_key_reaches_all_that_a_mouse_can_use(visit, folder):
+def test_the_tab_key_reaches_all_controls(visit, folder):
     page = visit(folder)
     reached = page.evaluate(
         """() => {
@@ -399,7 +401,7 @@ def test_keys_toggle_solvers_sort_tables_and_walk_through_numbers(visit, folder)
     assert below.evaluate("(a) => a === document.activeElement")
 
 
-def test_a_number_leads_to_the_line_of_the_journal(visit, folder, records):
+def test_a_number_links_to_its_journal_line(visit, folder, records):
     page = visit(folder)
     wanted = records[0]
     times = table(page, "times")
@@ -413,7 +415,7 @@ def test_a_number_leads_to_the_line_of_the_journal(visit, folder, records):
     fields = dict(zip(dialog.locator("th").all_inner_texts(),
                       dialog.locator("td").all_inner_texts(), strict=True))  # fmt: skip
     line = page.evaluate("(line) => JSON.parse(line)", wanted.to_json())
-    # as in lines from before there were any
+    # fields with their defaults, which journal lines of older versions lack
     line |= {"session": "", "step_tol": None, "ranks": 1, "build_peak_mib": None}
     line |= {"rank_seconds": {}, "rank_counts": {}, "rank_network": {}}
     told = page.evaluate("(id) => line(runs.id.indexOf(id))", wanted.run_id)
@@ -429,7 +431,7 @@ def test_a_number_leads_to_the_line_of_the_journal(visit, folder, records):
     dialog.get_by_role("heading", name=f"Run {records[1].run_id}").wait_for()
 
 
-def test_every_link_to_a_run_has_one(visit, folder, records):
+def test_every_run_link_has_a_target(visit, folder, records):
     page = visit(folder)
     links = page.evaluate(
         "[...document.querySelectorAll('a[href^=\"#run-\"]')].map((a) => a.hash)"
@@ -476,7 +478,7 @@ def test_a_plot_zooms_changes_its_axes_and_names_the_point_under_the_pointer(
 
 @pytest.fixture(scope="session")
 def compared(tmp_path_factory):
-    """The page of two runs, with a name that is long and one that is far too long."""
+    """Return the page that compares two runs with a long and a very long name."""
     paths = [tmp_path_factory.mktemp(name) for name in ("before", "after")]
     for path in paths:
         with Journal(path, "test") as journal:
@@ -498,9 +500,7 @@ def compared(tmp_path_factory):
 
 
 @pytest.mark.parametrize("width", [1400, 390])
-def test_names_beside_a_plot_are_whole_or_shortened_but_never_cut(
-    visit, compared, width
-):
+def test_names_beside_a_plot_are_not_clipped(visit, compared, width):
     drawing = visit(compared, width=width).locator("#times .panel > svg").first
     drawing.scroll_into_view_if_needed()
     edge = drawing.bounding_box()["x"]
@@ -521,14 +521,14 @@ def test_names_beside_a_plot_are_whole_or_shortened_but_never_cut(
      ([5e-5, 2], ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹", "10⁰"]),
      ([0.05, 2], ["0.05", "0.1", "0.2", "0.5", "1", "2"])],
 )  # fmt: skip
-def test_the_ticks_of_an_axis_are_numbers_of_one_kind(visit, folder, view, texts):
+def test_the_ticks_of_an_axis_have_one_format(visit, folder, view, texts):
     axis = {"view": view, "log": True}
     found = visit(folder).evaluate("axis => labelled(axis, 8)", axis)
 
     assert [text for _, text in found] == texts
 
 
-def test_dragging_over_a_plot_enlarges_what_is_within(visit, folder):
+def test_dragging_over_a_plot_zooms_into_the_rectangle(visit, folder):
     page = visit(folder)
     drawing = page.locator("#times .panel svg").first
     drawing.scroll_into_view_if_needed()
@@ -556,7 +556,7 @@ def test_a_phone_shows_the_page_without_scrolling_sideways(visit, folder):
 
 
 @pytest.mark.parametrize(("width", "wider"), [(1400, False), (390, True)])
-def test_a_printed_figure_says_when_there_is_more_of_it_beside_the_screen(
+def test_a_figure_wider_than_the_screen_has_a_scroll_hint(
     visit, tmp_path, width, wider
 ):
     cell = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)])
@@ -608,7 +608,7 @@ def hostile(tmp_path_factory):
     return paged(folder)
 
 
-def test_hostile_names_are_text_wherever_the_script_puts_them(visit, hostile):
+def test_hostile_names_are_inserted_as_text_by_the_script(visit, hostile):
     page = visit(hostile)
     kinds = "[...new Set([...document.querySelectorAll('*')].map((e) => e.localName))]"
     before = set(page.evaluate(kinds))
@@ -629,7 +629,7 @@ def test_hostile_names_are_text_wherever_the_script_puts_them(visit, hostile):
     assert page.evaluate("document.documentElement.scrollWidth") == 1400
 
 
-def test_the_policy_of_the_page_stops_what_an_injection_would_do(browser, folder):
+def test_the_content_security_policy_blocks_injections(browser, folder):
     context = browser.new_context()
     page = context.new_page()
     refused, stopped = [], []

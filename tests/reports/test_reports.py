@@ -1,4 +1,4 @@
-"""Reports say what the journal holds, no more; whatever the names in it are."""
+"""Contents of reports agree with the journal, also for hostile names."""
 
 import csv
 import re
@@ -45,7 +45,7 @@ HOSTILE = (
 
 @pytest.fixture(scope="module")
 def measured():
-    """Factory: one record of beam-ring/size=N/FORM, verified unless told otherwise."""
+    """Return a factory of records of beam-ring/size=N/FORM, by default verified."""
 
     def make(solver="a", size=10, repeat=0, *, form="dual", **changes):
         defaults = dict(
@@ -82,7 +82,7 @@ def write(folder, records):
 
 
 def table(page, section, number=0):
-    """Rows of one table as dicts from column to cell."""
+    """Return the rows of one table as dicts from column to cell."""
     (found,) = (s for s in page.sections if s.name == section)
     chosen = found.tables[number]
     return [dict(zip(chosen.columns, row, strict=True)) for row in chosen.rows]
@@ -103,7 +103,7 @@ def test_an_unverified_answer_is_never_the_fastest(measured, evidence):
     (row,) = table(compose(evidence(records)), "times")
     assert row["honest"].kind == "best"
     assert (row["liar"].kind, row["liar"].after) == ("void", "wrong")
-    assert row["liar"].value is None  # it does not sort among results either
+    assert row["liar"].value is None  # without a value, it is not sorted with times
 
 
 def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evidence):
@@ -172,7 +172,7 @@ def test_no_time_is_printed_without_its_uncertainty(measured, evidence):
     assert "probability 0.75 for 3 repeats" in text
 
 
-def test_times_read_as_a_physicist_would_write_them():
+def test_times_have_unit_and_significant_digits():
     from mortarbench.reports.statistics.intervals import median_interval
 
     assert seconds(median_interval([0.0119, 0.0123, 0.0140])) == "12.3 ms [11.9, 14.0]"
@@ -185,7 +185,9 @@ def test_energies_keep_twelve_digits():
     assert significant(-333734.443434567, 12) == "-333734.443435"
 
 
-def test_the_summary_names_who_misses_the_tolerance_and_where(measured, evidence):
+def test_the_summary_names_solvers_and_cases_that_miss_the_tolerance(
+    measured, evidence
+):
     records = [
         measured("osqp", 10),
         measured("osqp", 20, verdict=Verdict.INACCURATE, dual=4e-6),
@@ -213,7 +215,7 @@ def test_the_summary_names_who_misses_the_tolerance_and_where(measured, evidence
     assert counts["shy"]["declined"].value == 1
 
 
-def test_each_tolerance_has_a_sentence_of_its_own(measured, evidence):
+def test_each_tolerance_has_a_separate_sentence(measured, evidence):
     found = evidence([measured("a"), measured("a", tol=1e-4, verdict=Verdict.WRONG)])
     loose, tight = sentences(found, "a")
     assert "wrong on 1 of 1 case at tol 1e-4" in loose
@@ -243,7 +245,7 @@ def test_energies_are_compared_across_solvers_and_forms(measured, evidence):
     assert {(o.solver, o.first.form) for o in tight.pair} == {
         ("a", "primal"), ("b", "dual"),
     }  # fmt: skip
-    assert loose.relative is None  # nothing to compare with, and no zero either
+    assert loose.relative is None  # a single answer has no difference, not zero
 
 
 def test_the_difference_of_energies_is_relative_to_the_larger(measured, evidence):
@@ -253,7 +255,7 @@ def test_the_difference_of_energies_is_relative_to_the_larger(measured, evidence
     assert spread.relative == 0.25
 
 
-def test_repeats_of_one_answer_do_not_confirm_each_other(measured, evidence):
+def test_repeats_of_one_answer_are_not_compared_as_energies(measured, evidence):
     (spread,) = spreads(evidence([measured("a", repeat=i) for i in range(3)]).flat)
     assert len(spread.answers) == 1
     assert spread.relative is None
@@ -287,7 +289,7 @@ def test_a_planted_exponent_is_found_from_the_records(measured, evidence):
     assert "****" not in markdown(compose(evidence(records)))
 
 
-def test_load_steps_are_no_sizes_and_stay_apart(measured, evidence):
+def test_load_steps_are_separate_series(measured, evidence):
     def on_step(size, step):
         return measured(
             "a", size, params={"size": size, "step": step}, run_id=f"{size}-{step}",
@@ -303,7 +305,7 @@ def test_load_steps_are_no_sizes_and_stay_apart(measured, evidence):
     assert [len(series.curve("a")) for series in found] == [3, 3]
 
 
-def test_two_sizes_make_no_scaling_table(measured, evidence):
+def test_two_sizes_have_no_scaling_table(measured, evidence):
     page = compose(evidence([measured("a", 10), measured("a", 20)]))
     assert "scaling" not in [s.name for s in page.sections]
 
@@ -314,7 +316,7 @@ def test_the_last_line_of_a_measurement_counts(measured, evidence):
     assert record.iterations == 9
 
 
-def test_cases_are_in_the_order_of_numbers_not_of_letters(measured, evidence):
+def test_cases_are_sorted_numerically(measured, evidence):
     found = evidence([measured("a", size) for size in (100, 9, 20)])
     assert [o.first.params["size"] for o in found.flat] == [9, 20, 100]
 
@@ -326,7 +328,7 @@ def test_solvers_are_in_the_order_of_the_suite(measured, evidence):
 
 
 class Page(HTMLParser):
-    """Collects what a browser would run or fetch."""
+    """Parser that collects all scripts and links of a page."""
 
     def __init__(self):
         super().__init__()
@@ -369,7 +371,7 @@ def hostile_folder(hostile, tmp_path_factory, svg_only):
     return folder / "report"
 
 
-def test_hostile_names_put_nothing_into_the_page(hostile_folder):
+def test_hostile_names_do_not_add_elements_to_the_page(hostile_folder):
     text = (hostile_folder / "index.html").read_text("utf-8")
     page = Page()
     page.feed(text)
@@ -380,7 +382,7 @@ def test_hostile_names_put_nothing_into_the_page(hostile_folder):
     assert all(link.startswith(("#", "data:", "figures/")) for link in page.links)
     assert "&lt;script&gt;" in text
     assert "\u202e" not in text
-    assert "long" * 600 not in text  # shortened, even where pointed at
+    assert "long" * 600 not in text  # abbreviated, also in hover texts
 
 
 def test_names_break_at_slashes_and_numbers_do_not_break():
@@ -415,11 +417,11 @@ def test_latex_rows_have_as_many_columns_as_the_table(measured, evidence):
     assert {len(re.split(r"(?<!\\)&", row)) for row in rows} == {4}
 
 
-def test_latex_escapes_what_tex_would_obey():
+def test_latex_escapes_special_characters():
     assert escaped(r"\a_{b}^2 50% $ # & ~") == (
         r"\textbackslash{}a\_\{b\}\textasciicircum{}2 50\% \$ \# \& \textasciitilde{}"
     )
-    assert escaped("[1]") == "{}[1]"  # after \\ it would be an optional argument
+    assert escaped("[1]") == "{}[1]"  # after \\, "[1]" would be an optional argument
     assert escaped("漢") == "U+6F22"
 
 
@@ -442,7 +444,7 @@ def test_markdown_shows_entities_and_markup_as_they_are():
     assert md_escaped("&lt; *a* |") == r"&amp;lt; \*a\* \|"
 
 
-def test_names_are_cut_in_the_middle_and_stay_distinct():
+def test_names_are_abbreviated_in_the_middle_and_stay_distinct():
     assert clean("a\x00b\n c") == "a\ufffdb c"
     one, other = clean("x" * 10_000 + "1"), clean("x" * 10_000 + "2")
     assert len(one) == 96
@@ -475,7 +477,7 @@ def test_the_same_journal_gives_the_same_bytes(measured, square, tmp_path):
         assert a.read_bytes() == b.read_bytes(), a.name
 
 
-def test_a_report_takes_away_numbered_figures_that_only_an_earlier_one_had(tmp_path):
+def test_a_report_removes_obsolete_numbered_figures(tmp_path):
     figures = tmp_path / "figures"
     figures.mkdir()
     for name in ("profiles-2.pdf", "deformed.png", "profiles-2.txt", "my-2 notes.pdf"):
@@ -523,7 +525,7 @@ def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_pa
     assert [len(p.figure.panels) for p in pictures] == [1, 1]
 
 
-def test_csv_holds_full_precision_and_every_time_with_its_interval(measured, tmp_path):
+def test_csv_contains_full_precision_and_intervals_of_times(measured, tmp_path):
     times = [0.1 + 0.2, 0.7, 0.1]
     write(tmp_path, timed(measured, "a", times))
     paths = write_report(tmp_path, ["csv"])
@@ -545,7 +547,9 @@ def test_only_the_formats_asked_for_are_written(measured, tmp_path):
     assert written == {"report.md", "figures"}
 
 
-def test_bad_input_is_one_line_that_says_what_would_be_right(tmp_path, measured):
+def test_bad_input_causes_a_one_line_message_with_the_expected_value(
+    tmp_path, measured
+):
     with pytest.raises(InputError, match="'htm'; did you mean 'html'") as unknown:
         write_report(tmp_path, ["htm"])
     with pytest.raises(InputError, match="no such folder") as missing:

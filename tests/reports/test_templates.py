@@ -1,4 +1,4 @@
-"""Sentences of pages: what modules ask for, and what their templates hold."""
+"""Templates of sentences: every macro exists and is used."""
 
 import ast
 from pathlib import Path
@@ -17,7 +17,7 @@ TEMPLATES = sorted(path for path in ROOT.rglob("*.j2") if path.parent.name != "a
 
 @pytest.fixture
 def sentences(tmp_path, monkeypatch):
-    """Return a factory of sentences from a template in a package of its own."""
+    """Return a factory of sentences from a template in a temporary package."""
     package = tmp_path / f"pages_{tmp_path.name}"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -31,7 +31,7 @@ def sentences(tmp_path, monkeypatch):
 
 
 def asked(source):
-    """Names of macros that a module asks for, and all of its other words."""
+    """Return the names of macros that a module calls, and all of its other words."""
     names, strings = set(), set()
     for node in ast.walk(ast.parse(source)):
         match node:
@@ -52,14 +52,14 @@ def test_every_sentence_that_a_module_asks_for_is_in_its_template(path):
     names, strings = asked(path.with_suffix(".py").read_text("utf-8"))
     assert names - macros == set()
     used = strings | {name.name for name in tree.find_all(Name)}
-    assert macros - used == set(), "nobody asks for these"
+    assert macros - used == set(), "unused macros"
 
 
 def test_there_are_templates():
     assert len(TEMPLATES) > 10
 
 
-def test_lines_of_a_template_are_one_sentence_and_empty_ones_part_paragraphs(sentences):
+def test_empty_lines_of_a_template_separate_paragraphs(sentences):
     text = sentences(
         "{% macro said(n) %}\nOne\n  line of {{ n | plural('word') }}.\n\n"
         "{% if n > 5 %}\nmany\n{% endif %}\n\n- A point\n"
@@ -71,7 +71,7 @@ def test_lines_of_a_template_are_one_sentence_and_empty_ones_part_paragraphs(sen
     assert [type(part) for part in parts] == [str, Point]
 
 
-def test_a_name_that_nobody_gave_is_no_empty_word(sentences):
+def test_an_undefined_name_raises_an_error(sentences):
     text = sentences("{% macro said() %}{{ missing }}{% endmacro %}")
     with pytest.raises(UndefinedError, match="'missing' is undefined"):
         text("said")

@@ -1,4 +1,4 @@
-"""Statements of a report on the measurement of times and on their omissions."""
+"""Sections on times: dualisation, null arms, canaries and time to accuracy."""
 
 import re
 from dataclasses import replace
@@ -40,14 +40,14 @@ def rows(table):
     return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
 
 
-def test_old_journals_have_no_such_sections(record, section):
+def test_old_journals_have_no_sections_on_precision(record, section):
     old = [record(repeat=i) for i in range(3)]
     assert section(old, "precision") is None
     assert section(old, "accuracy") is None
     assert len(section(old, "times").tables) == 1
 
 
-def test_dualising_is_charged_to_dual_forms_only(record, section):
+def test_only_dual_forms_include_dualisation(record, section):
     primal = [record(form="primal", repeat=i, total_seconds=0.05) for i in range(3)]
     dual = [record(repeat=i, dualise_seconds=0.04) for i in range(3)]
     _, charged = section(primal + dual, "times").tables
@@ -89,7 +89,7 @@ def test_a_null_arm_does_not_win(record, section):
         assert [row[s].kind for s in ("a", "b", "a (A/A)")] == ["best", "", ""]
 
 
-def test_a_null_arm_that_drove_a_sequence_is_paired_with_one_that_did(record, section):
+def test_null_arms_of_sequences_are_paired_with_sequences(record, section):
     records = [
         record(f"a{arm} (sequence)", i, role="null" if arm else "", mode="sequence")
         for arm in ("", " (A/A)")
@@ -108,14 +108,14 @@ def test_the_drift_of_the_canary_is_that_of_the_machine(record, section):
     assert found[0]["canary"].value == pytest.approx(1.25e-5)
 
 
-def test_one_canary_has_no_spread(record, section):
+def test_a_single_canary_time_has_no_spread(record, section):
     first, *_ = rows(section([record(canary_seconds=1e-5)], "precision").tables[0])
 
     assert (first["central 90 %"].text, first["central 90 %"].value) == ("–", None)
     assert first["drift"].text == "–"
 
 
-def test_time_to_accuracy_is_that_of_the_cheapest_verified_answer(record, section):
+def test_time_to_accuracy_is_the_time_of_the_fastest_verified_answer(record, section):
     sweep = [
         record(tol=1e-2, accuracy=1e-6, total_seconds=0.001, verdict=Verdict.WRONG),
         record(tol=1e-4, accuracy=1e-6, total_seconds=0.002),

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 SUPPORT = Path(__file__).parent
-ROOT = SUPPORT.parents[1]  #: of the checkout
+ROOT = SUPPORT.parents[1]  #: root of the checkout
 
 ACCIDENTS = SUPPORT / "accidents.py"
 ADVERSARIES = SUPPORT / "adversaries.py"

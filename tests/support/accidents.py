@@ -1,9 +1,10 @@
 """Plug-in with solvers that disturb a run, and one that detects disturbances.
 
-They solve `tiny` of adversaries.py correctly, apart from their side effects. `witness`
-fails if a process of another solver runs while it solves.
+The solvers solve `tiny` of adversaries.py correctly, but have side effects. `witness`
+fails if a process of another solver runs during its solve.
 
-Run as a program with the name of a solver and two file descriptors, it is a worker.
+If the module is run as a program with the name of a solver and two file descriptors, it
+acts as a worker.
 """
 
 import mmap
@@ -43,7 +44,7 @@ def processes(of_run):
 
 
 class Witness(Honest):
-    """Fails if another process can run that is neither stopped nor a sub-reaper."""
+    """Solver that fails if another process of the run can run, except sub-reapers."""
 
     def act(self, qp):
         mine = {os.getppid(), *descendants(os.getppid())}
@@ -72,7 +73,7 @@ def reply_pipe():
 
 
 class WritesNoise(Honest):
-    """Writes to the file descriptor of the replies by mistake."""
+    """Solver that writes to the file descriptor of the replies by mistake."""
 
     def act(self, qp):
         for fd in reply_pipe():
@@ -81,7 +82,7 @@ class WritesNoise(Honest):
 
 
 class WritesEndlessly(Honest):
-    """Writes megabytes without an end of line."""
+    """Solver that writes megabytes without an end of line."""
 
     def act(self, qp):
         (fd,) = reply_pipe()
@@ -90,7 +91,7 @@ class WritesEndlessly(Honest):
 
 
 class Daemon(Honest):
-    """Leaves a process behind that burns CPU time, in a session of its own."""
+    """Solver that leaves a process in a new session, which uses CPU time."""
 
     def act(self, qp):
         if os.fork() == 0:
@@ -104,7 +105,7 @@ class Daemon(Honest):
 
 
 class ExecutedDaemon(Honest):
-    """Starts another program that has closed all inherited descriptors."""
+    """Solver that starts another program without inherited file descriptors."""
 
     def act(self, qp):
         code = "import os\nif os.fork() == 0:\n  os.setsid()\n  while True: pass"
@@ -113,7 +114,7 @@ class ExecutedDaemon(Honest):
 
 
 class ForkBomb(Honest):
-    """Starts processes that replace each other faster than single kills."""
+    """Solver whose processes fork faster than they can be killed one by one."""
 
     def act(self, qp):
         if os.fork() == 0:
@@ -131,7 +132,7 @@ class HangsWithADaemon(Daemon):
 
 
 class Burns(Honest):
-    """Leaves a thread behind that burns CPU time."""
+    """Solver that leaves a thread behind, which uses CPU time."""
 
     def act(self, qp):
         threading.Thread(target=self.burn, daemon=True).start()
@@ -143,7 +144,7 @@ class Burns(Honest):
 
 
 class Pools(Honest):
-    """Leaves a thread behind that sleeps."""
+    """Solver that leaves a sleeping thread behind."""
 
     def act(self, qp):
         threading.Thread(target=time.sleep, args=[3600], daemon=True).start()
@@ -151,7 +152,7 @@ class Pools(Honest):
 
 
 class HoardsInShm(Honest):
-    """Leaves 600 MiB in /dev/shm."""
+    """Solver that leaves 600 MiB in /dev/shm."""
 
     def act(self, qp):
         with open(f"/dev/shm/{os.environ['WATCHED']}-{os.getpid()}", "wb") as file:
@@ -162,7 +163,7 @@ class HoardsInShm(Honest):
 
 
 class SharesPages(Honest):
-    """Uses 150 MiB that four processes share: 600 MiB if each were counted."""
+    """Solver with four processes that share 150 MiB, to be counted once."""
 
     def act(self, qp):
         hoard = np.ones(150 * 2**17)
@@ -180,7 +181,7 @@ class SharesPages(Honest):
 
 
 class HoardsInADaemon(Honest):
-    """Uses 600 MiB in a process that has left the session."""
+    """Solver that uses 600 MiB in a process outside the session."""
 
     def act(self, qp):
         hoarded, tells = os.pipe()
@@ -206,7 +207,7 @@ def spin(seconds):
 
 
 class Computes(Honest):
-    """Computes for some milliseconds, like an honest solver."""
+    """Solver that computes for some milliseconds, like an honest solver."""
 
     def act(self, qp):
         matrix, vector = np.ones((200, 200)), np.ones(200)
@@ -216,7 +217,7 @@ class Computes(Honest):
 
 
 class PatchesTheClock(Honest):
-    """Works for 2 ms under a library that replaces the clock, as some tests do."""
+    """Solver that works for 2 ms while the clock is replaced, as in some tests."""
 
     def act(self, qp):
         from mortarbench.harness.verify import measure
@@ -227,7 +228,7 @@ class PatchesTheClock(Honest):
 
 
 class Remembers(Honest):
-    """Works for 16 ms at first, then returns a cached answer, in all measurements."""
+    """Solver that works for 16 ms once, and then always returns a cached answer."""
 
     known: ClassVar[dict] = {}
 
@@ -240,7 +241,7 @@ class Remembers(Honest):
 
 
 class WorksInDeclines(Honest):
-    """Works for 20 ms in `declines`."""
+    """Solver that works for 20 ms in `declines`."""
 
     def declines(self, qp):
         if qp.q[0] == -4.0:
@@ -253,7 +254,7 @@ class StopsItself(Honest):
 
 
 class KillsItself(Honest):
-    """Ends by SIGKILL, after the supervisor has polled its memory."""
+    """Solver that ends by SIGKILL after the supervisor has polled the memory."""
 
     def act(self, qp):
         time.sleep(0.2)
@@ -261,7 +262,7 @@ class KillsItself(Honest):
 
 
 class KilledOnceWarmingUp(Honest):
-    """Ends once by SIGKILL in the warm-up; the file $KILLED records that."""
+    """Solver that ends by SIGKILL in the first warm-up, and then creates $KILLED."""
 
     def prepare(self, qp, tol):
         killed = Path(os.environ["KILLED"])

@@ -3,7 +3,9 @@
     min x₁² + ½x₂² − 4x₁ + 3x₂   s.t.   x₁ ≤ h,  x ≥ 0
 
 has, for h ≤ 2, the solution x = (h, 0) with multipliers z = 4 − 2h and z_box = (0, −3).
-Run as a program with the name of a solver and two file descriptors, it is a worker.
+
+If the module is run as a program with the name of a solver and two file descriptors, it
+acts as a worker.
 """
 
 import ctypes
@@ -137,7 +139,7 @@ class Dies(Honest):
 
 
 class DiesLater(Honest):
-    """Returns an answer, and ends the process a moment later."""
+    """Solver that returns an answer and ends the process a moment later."""
 
     def act(self, qp):
         Timer(0.3, os._exit, [7]).start()
@@ -150,7 +152,7 @@ class Segfaults(Honest):
 
 
 class AlwaysSegfaults(Honest):
-    """Even in the warm-up."""
+    """Solver that crashes even in the warm-up."""
 
     def prepare(self, qp, tol):
         ctypes.string_at(0)
@@ -163,7 +165,7 @@ class Hangs(Honest):
 
 
 class AlwaysHangs(Honest):
-    """Even in the warm-up."""
+    """Solver that hangs even in the warm-up."""
 
     def prepare(self, qp, tol):
         time.sleep(3600)
@@ -183,14 +185,14 @@ class PrintsEndlessly(Honest):
 
 
 class AsksForTheMoon(Honest):
-    """Requests more memory than the machine has, by one allocation."""
+    """Solver that requests more memory than the machine has in one allocation."""
 
     def act(self, qp):
         np.ones(2**40)
 
 
 class AbortsForMemory(Honest):
-    """Aborts like programs in Rust and C++ when an allocation fails."""
+    """Solver that aborts like a Rust or C++ program after a failed allocation."""
 
     def act(self, qp):
         print("memory allocation of 64 bytes failed", file=sys.stderr, flush=True)
@@ -198,7 +200,7 @@ class AbortsForMemory(Honest):
 
 
 class SpikesUnseen(Honest):
-    """Exceeds the memory limit for less time than between two polls, then answers."""
+    """Solver that exceeds the memory limit only between two polls, then answers."""
 
     def act(self, qp):
         np.ones(2**26)  # 512 MiB
@@ -206,7 +208,7 @@ class SpikesUnseen(Honest):
 
 
 class ForksAHoarder(Honest):
-    """Exceeds the memory limit in a child process."""
+    """Solver that exceeds the memory limit in a child process."""
 
     def act(self, qp):
         if os.fork() == 0:
@@ -215,7 +217,7 @@ class ForksAHoarder(Honest):
 
 
 class WrongSign(Honest):
-    """Returns a multiplier of the wrong sign; primal residual and gap are zero."""
+    """Solver that returns a multiplier of the wrong sign, with zero gap."""
 
     def act(self, qp):
         s = at_the_row(qp)
@@ -223,7 +225,7 @@ class WrongSign(Honest):
 
 
 class AnswersAnotherProblem(Honest):
-    """Returns the answer to the first problem for all problems."""
+    """Solver that returns the answer to the first problem for all problems."""
 
     first = None
 
@@ -234,7 +236,7 @@ class AnswersAnotherProblem(Honest):
 
 
 class Sleeps(Honest):
-    """Sleeps for 20 ms."""
+    """Solver that sleeps for 20 ms."""
 
     def act(self, qp):
         time.sleep(0.02)
@@ -242,7 +244,7 @@ class Sleeps(Honest):
 
 
 class Products(Honest):
-    """Computes for some milliseconds."""
+    """Solver that computes for some milliseconds."""
 
     def act(self, qp):
         matrix, vector = np.ones((200, 200)), np.ones(200)
@@ -253,11 +255,11 @@ class Products(Honest):
 
 @dataclass(frozen=True)
 class SleepsByPower(Honest):
-    """Sleeps 0.02·(n/10)^1.5 s on the QPs of `Sized`, now 1 % more, now 1 % less.
+    """Solver that sleeps for 0.02·(n/10)^1.5 s, ± 1 %, on the QPs of `Sized`.
 
-    More at the ends and less between, so that the scatter has no slope. The clock of
-    its worker counts only the requested time, so that a busy machine, on which sleeps
-    take longer, adds no scatter.
+    The deviation is +1 % for the smallest and the largest n and −1 % between, so that
+    it does not change the slope. The clock of the worker counts only the requested
+    time, because sleeps take longer on a busy machine.
     """
 
     clock: ClassVar[list[float]] = [0.0]
@@ -282,7 +284,7 @@ class SleepsByPower(Honest):
 
 @dataclass(frozen=True)
 class Chains(Honest):
-    """Reports as its iterations the number of QPs of a sequence so far."""
+    """Solver whose iterations are the number of QPs of the sequence so far."""
 
     def chain(self, tol):
         seen = []
@@ -295,7 +297,7 @@ class Chains(Honest):
 
 
 class Tightens(Chains):
-    """Reports also the tolerance of each QP of a sequence."""
+    """Solver that also reports the tolerance of each QP of a sequence."""
 
     def tightening(self):
         prepare = self.chain(0.0)
@@ -308,7 +310,7 @@ class Tightens(Chains):
 
 
 class BreaksItsChain(Honest):
-    """Dies at the second QP of a sequence."""
+    """Solver whose process ends at the second QP of a sequence."""
 
     def chain(self, tol):
         seen = []
@@ -342,7 +344,10 @@ def above(process):
 
 
 class ReturnsTwice(Honest):
-    """Lets a child return first; reports the grandparent of the one that returns."""
+    """Solver whose forked child returns first.
+
+    Each process reports the process ID of its grandparent.
+    """
 
     def act(self, qp):
         if os.fork() != 0:
@@ -366,7 +371,7 @@ class ReturnsNaN(Honest):
 
 
 class Zero(Honest):
-    """Claims that x = 0 is the solution."""
+    """Solver that claims that x = 0 is the solution."""
 
     def act(self, qp):
         return replace(at_the_row(qp), x=np.zeros(2), z=np.zeros(1), z_box=np.zeros(2))
@@ -378,7 +383,7 @@ class Mutates(Honest):
 
 
 class MutatesByForce(Honest):
-    """Returns the correct answer, then changes the arrays of the QP."""
+    """Solver that returns the correct answer, then changes the arrays of the QP."""
 
     def act(self, qp):
         answer = at_the_row(qp)
@@ -389,7 +394,7 @@ class MutatesByForce(Honest):
 
 
 class Warm(Honest):
-    """Needs fewer iterations when a prepared QP is solved again."""
+    """Solver that needs fewer iterations when a prepared QP is solved again."""
 
     def prepare(self, qp, tol):
         iterations = iter([9, 1, 1])
@@ -407,7 +412,7 @@ class Lacks(Honest):
 
 
 class NumpyScalars(Honest):
-    """Returns numpy scalars, which equal plain numbers but are not JSON."""
+    """Solver that returns numpy scalars, which json does not serialise."""
 
     def act(self, qp):
         return replace(

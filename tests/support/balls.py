@@ -1,4 +1,4 @@
-"""A convex set that the project lacks: balls ‖x_I‖ ≤ r on blocks of variables."""
+"""A convex set that mortarbench does not provide: balls on blocks of variables."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from mortarbench.harness.sets.convex import Limits, Sum
 
 @dataclass(frozen=True, eq=False)
 class Balls:
-    """‖x[index[i]]‖ ≤ radius[i], for blocks of one size without common variables."""
+    """The set ‖x[index[i]]‖ ≤ radius[i] for disjoint blocks of equal size."""
 
     index: np.ndarray  #: (k, d)
     radius: np.ndarray  #: (k,)
@@ -56,7 +56,10 @@ class Balls:
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
     def substituted(self, T, a):
-        """For one factor in T, which may move no centre."""
+        """Return the balls in the variables y of x = T y + a.
+
+        All entries of T have the same absolute value, and a is zero on the blocks.
+        """
         assert not a[self.index].any()
         entries = T.tocoo()
         assert len({*np.abs(entries.data)}) == 1

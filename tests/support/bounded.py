@@ -6,18 +6,18 @@ import signal
 from contextlib import contextmanager
 from pathlib import Path
 
-_SPARE = 4 * 2**30  #: bytes of address space; allocators reserve more than they use
+_SPARE = 4 * 2**30  #: further bytes of address space, which allocators may reserve
 
 
 class HangError(BaseException):
-    """Timeout; a BaseException, which readers do not catch."""
+    """Timeout, raised as a BaseException so that file readers do not catch it."""
 
 
 @contextmanager
 def bounded(seconds=300, mib=1024):
-    """Raise `HangError` after `seconds`; assert that at most `mib` more were resident.
+    """Raise `HangError` after `seconds`; assert that resident memory grew by ≤ `mib`.
 
-    Address space is limited far above that, so that a test cannot stop the machine.
+    The address space is limited to a much larger value, which protects the machine.
     """
 
     def ring(*_):

@@ -10,8 +10,8 @@ SIDE, MASS, GRAVITY_STEP = 0.2, 3.0, 9.81e-3
 def box_stack(boxes=3, mu=0.4, seed=5):
     """Return M (6b,), H (6b, 12b), f (6b,) and μ (4b,): four contacts below each box.
 
-    Boxes have random tangential velocities and spins besides that of gravity; W has
-    half of full rank.
+    In addition to the velocity due to gravity, boxes have random tangential velocities
+    and spins. The rank of W is half its order.
     """
     rng = np.random.default_rng(seed)
     inertia = MASS * SIDE**2 / 6
@@ -37,7 +37,7 @@ def box_stack(boxes=3, mu=0.4, seed=5):
 
 
 def local_arrays(W, q, mu, dim=3):
-    """Return the arrays of a local problem, W stored by rows, as in many files."""
+    """Return the arrays of a local problem, with W stored by rows as in many files."""
     i, j = np.nonzero(W)
     counts = np.bincount(i, minlength=len(W))
     sizes = dict(nzmax=i.size, m=len(W), n=len(W), nz=-2)
@@ -53,9 +53,10 @@ def local_arrays(W, q, mu, dim=3):
 
 
 def global_arrays(M, H, f, mu, *, rows_first=False):
-    """Return the arrays of a global problem, matrices as triplets.
+    """Return the arrays of a global problem, with matrices as triplets.
 
-    rows_first : the order of FCLIB's documentation, p for rows; else that of CSparse
+    rows_first : True for the order in FCLIB's documentation (p contains rows), False
+        for the order of CSparse (p contains columns)
     """
     arrays = {"spacedim": np.array([3], np.int32), "vectors/f": f, "vectors/mu": mu}
     arrays["vectors/w"] = np.zeros(H.shape[1])

@@ -1,4 +1,4 @@
-"""Randomly damaged data files, which readers must refuse or read."""
+"""Randomly damaged data files, which must be read or refused with an error message."""
 
 import io
 import json
@@ -68,7 +68,7 @@ def tiny_qp(dense=False):
 
 
 def seeds(folder):
-    """Return intact files of every kind, by the ending of their names."""
+    """Return intact files of every format by file suffix."""
     qp, meta = tiny_qp(), {"name": "tiny", "scale": 2.0, "constant": 1.0}
     found = {kind: [] for kind in ("npz", "mat", "parquet", "qps")}
 
@@ -112,7 +112,7 @@ def repacked(path, compression):
 
 
 def msh_22():
-    """Two quadrilaterals and an edge, in the text format 2.2."""
+    """Return a mesh of two quadrilaterals and an edge in the ASCII format 2.2."""
     points = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)]
     nodes = "\n".join(f"{i} {x} {y} 0" for i, (x, y) in enumerate(points, 1))
     return f"""$MeshFormat
@@ -231,20 +231,20 @@ def numbered(rng, data, at, others):
 
 
 def worded(rng, data, at, others):
-    """Overwrite with, or insert, an unusual word."""
+    """Insert an unusual word, or overwrite bytes with it."""
     word = WORDS[rng.integers(0, len(WORDS))]
     return over(data, at, word) if rng.random() < 0.5 else data[:at] + word + data[at:]
 
 
 def refielded(rng, data, at, others):
-    """Replace a field of a text."""
+    """Replace a field of a text file."""
     fields = data.split(b" ")
     fields[rng.integers(0, len(fields))] = WORDS[rng.integers(0, len(WORDS))]
     return b" ".join(fields)
 
 
 def doubled(rng, data, at, others):
-    """Write forty bytes twice."""
+    """Repeat forty bytes."""
     return data[:at] + data[max(at - 40, 0) :]
 
 
@@ -264,7 +264,7 @@ DAMAGES = (
 
 
 def damaged(rng, data, others):
-    """Damage `data` in one to three places."""
+    """Return `data` with damage at one to three positions."""
     for _ in range(rng.integers(1, 4)):
         if data:
             damage = DAMAGES[rng.integers(0, len(DAMAGES))]
@@ -273,7 +273,7 @@ def damaged(rng, data, others):
 
 
 def read(path):
-    """Read a file as cases do; return whether it was read, which needs a valid QP."""
+    """Read a file like a case; return True if it contains a valid QP."""
     try:
         if path.suffix in (".msh", ".inp", ".med"):
             mesh = read_msh(path)
@@ -298,7 +298,7 @@ def read(path):
 
 
 def fuzz(kind, count, seed, folder, seconds):
-    """Read `count` damaged files of a kind; return how many were accepted."""
+    """Read `count` damaged files of one format; return the number of accepted files."""
     rng = np.random.default_rng(seed)
     whole = seeds(folder)[kind]
     path = folder / f"damaged.{kind}"

@@ -20,7 +20,7 @@ VALUES = (
 
 
 def damaged(text, random):
-    """Cut, repeat, swap or insert a few times."""
+    """Return a text after a few random deletions, repetitions, swaps or insertions."""
     for _ in range(random.choice((1, 1, 1, 2, 4))):
         i, j = sorted(random.randrange(len(text) + 1) for _ in range(2))
         j = min(j, i + random.choice((1, 3, 30)))

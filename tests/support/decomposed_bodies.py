@@ -31,7 +31,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 
 def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
-    """Return bodies with labels (E,) of their cells; all nodes are listed."""
+    """Return a subdivision by cell labels (E,) that lists all nodes."""
     every = np.arange(len(bodies.mesh.points))
     return mesh_in_subdomains(bodies.mesh, label, bodies.body, every)
 
@@ -43,7 +43,7 @@ def decompose_by_labels(
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> DecomposedBodies:
-    """Decompose bodies with their QP, with friction."""
+    """Decompose bodies, their QP and its friction into subdomains."""
     return on_one_process(parts_by(bodies, layout, primal, friction, rows)).decomposed
 
 
@@ -54,7 +54,7 @@ def parts_by(
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> DecomposedProblem:
-    """Return the QP of the bodies, with friction, on their subdomains."""
+    """Return the QP of the bodies and its friction on the subdomains."""
     of = elastic_bodies_of(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
     contact = Contact(*contact_rows(primal, friction), friction.bound)
@@ -62,7 +62,7 @@ def parts_by(
 
 
 def parts_of(name: str) -> DecomposedProblem:
-    """Describe the dual of a case; its earlier load steps are solved."""
+    """Return the decomposed dual of a case, after solving the earlier load steps."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
@@ -83,7 +83,7 @@ def parts_of(name: str) -> DecomposedProblem:
 def decomposed_pair(
     rows: str = "orthonormal", most: int = 2
 ) -> tuple[Bodies, Any, DecomposedBodies]:
-    """Return bodies of 32 × 4 and 36 × 6 cells with their QP, and both decomposed."""
+    """Return bodies of 32 × 4 and 36 × 6 cells, their QP, and the decomposed bodies."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))

@@ -8,11 +8,11 @@ import mortarbench as mb
 from mortarbench.harness import QP, Cones, Discs
 from mortarbench.harness.operators import assembled
 
-SIZES = {88: 12, 376: 24, 820: 36, 1468: 48}  #: cells per side of that many discs
+SIZES = {88: 12, 376: 24, 820: 36, 1468: 48}  #: number of discs → cells per side
 
 
 def mindlin(discs, nu, Q):
-    """Return the problem of Cattaneo and Mindlin with an explicit P."""
+    """Return the QP of the Cattaneo-Mindlin problem with an explicit P."""
     case = f"half-space/n={SIZES[discs]}/law=mindlin/nu={nu}/Q={Q}/dual"
     qp = mb.build(case).qp
     assert qp.sets[1].radius.size == discs
@@ -32,7 +32,7 @@ def natural_map(qp, s):
 
 
 def qp_on_discs(seed, *, rows=0, dim=2, spread=0.0, touching=False):
-    """Return a QP on discs, beside bounds, and its solution.
+    """Return a QP with discs and bounds, and its solution.
 
     rows : number of equality rows
     spread : radii differ by up to 10**spread
@@ -61,7 +61,7 @@ def qp_on_discs(seed, *, rows=0, dim=2, spread=0.0, touching=False):
 
 
 def qp_on_cones(seed, dim=3):
-    """Return a QP on cones, beside free variables, and its solution."""
+    """Return a QP with cones and free variables, and its solution."""
     rng = np.random.default_rng(seed)
     k, others = int(rng.integers(2, 12)), int(rng.integers(0, 6))
     index = rng.permutation(dim * k + others)[: dim * k].reshape(k, dim)

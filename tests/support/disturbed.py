@@ -20,7 +20,7 @@ def scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def wrong_rows(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move forces from rows in contact to others."""
+    """Move forces from rows in contact to other rows."""
     z, swapped = s.z.copy(), rng.random(s.z.size) < max(size, 1.5 / max(s.z.size, 1))
     z[swapped] = rng.permutation(z)[swapped]
     return replace(s, z=z)
@@ -50,7 +50,7 @@ def relative_noise(s: Solution, size: float, rng: np.random.Generator) -> Soluti
 def moved_apart(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Move each body rigidly, by up to ten thousand times its displacement."""
+    """Move each body rigidly by up to 10⁴ times its displacement."""
     far = 10 ** rng.uniform(0, 4) * size * np.linalg.norm(s.x)
     R = mechanics.rigid
     return replace(s, x=s.x + R @ (far * rng.standard_normal(R.shape[1])))
@@ -59,7 +59,7 @@ def moved_apart(
 def bent(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Bend bodies in their mode of least energy."""
+    """Add the deformation mode of least energy to the displacements."""
     whole, x = mechanics.whole, s.x.astype(Real)
     v = whole.apply_inverse(
         whole.apply_inverse(rng.standard_normal(x.size).astype(Real))
@@ -74,7 +74,7 @@ DISTURBANCES = (noise, scaled, wrong_rows, infeasible, shifted)
 def disturbed(
     s: Solution, i: int, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Apply the i-th disturbance, in turn, of relative size 1e-13 to 2."""
+    """Apply the disturbance i (modulo their number) with relative size 1e-13 to 2."""
     size = 10 ** rng.uniform(-13, 0.3)
     ways = len(DISTURBANCES) + 3
     match i % ways - len(DISTURBANCES):

@@ -1,22 +1,23 @@
-"""Ranks that end in a known order: one by itself, the others when they notice that.
+"""Ranks that end in a known order, to test which rank `launch` reports as the first.
 
-``dying_ranks.py COUNT TRIALS SEED SECONDS``: in each trial so many ranks are launched,
-of which one is killed, exits, or prints a line that could pass for one of ours and is
-killed. The others die at once when it has, or stay; some are killed together with what
-is above them. Prints the trials of which `launch` named another rank, as JSON.
+``dying_ranks.py COUNT TRIALS SEED SECONDS`` launches COUNT ranks in each trial. One of
+them is killed, exits, or is killed after printing a line that resembles our messages.
+The other ranks either exit as soon as they notice this, or continue. In some trials,
+the parent process of the first rank is killed as well. The program prints, as JSON, the
+trials in which `launch` named a wrong rank.
 
-It imports nothing, so that a rank starts within milliseconds.
+The module has no imports at the top, so that a rank starts within milliseconds.
 """
 
 import os
 import sys
 
-WAYS = ("killed", "exits 0", "exits 3", "prints", "flooding", "with the one above")
+ENDINGS = ("killed", "exits 0", "exits 3", "prints", "flooding", "with its parent")
 SIGKILL = 9
 
 
 def be_rank(first, way, count, follow, folder):
-    """End first, or after that rank; ranks exchange process IDs in files."""
+    """End as the first rank, or after it; ranks exchange process IDs in files."""
     rank = int(os.environ["PMI_RANK"])
     with open(f"{folder}/{rank}.new", "w") as file:
         file.write(str(os.getpid()))
@@ -51,7 +52,7 @@ def die(way):
     if way == "flooding":
         for _ in range(64):
             os.write(1, b"x" * 2**20)
-    if way == "with the one above":
+    if way == "with its parent":
         os.kill(os.getppid(), SIGKILL)
     os.kill(os.getpid(), SIGKILL)
 
@@ -67,7 +68,7 @@ def main(count, trials, seed):
 
     wrong, rng = [], random.Random(seed)
     for trial in range(trials):
-        first, way = rng.randrange(count), WAYS[trial % len(WAYS)]
+        first, way = rng.randrange(count), ENDINGS[trial % len(ENDINGS)]
         follow = rng.random() < 0.5
         requests, replies = os.pipe(), os.pipe()
         with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +83,7 @@ def main(count, trials, seed):
         last = said.getvalue().splitlines()[-1]
         ended = {
             "exits 0": "exit code 0", "exits 3": "exit code 3",
-            "with the one above": "",
+            "with its parent": "",
         }.get(way, "Killed")  # fmt: skip
         if not last.startswith(f"rank {first} of {count} ranks ended: {ended}"):
             wrong.append([first, way, follow, last])

@@ -1,7 +1,7 @@
 """Program of tests/problems/feti/test_distributed_dual.py on ranks; prints JSON.
 
-Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The shares that
-ranks emit are assembled and compared with the QP that one process emits.
+Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The local parts of
+the QP that the ranks emit are assembled and compared with the QP of one process.
 """
 
 import json
@@ -27,12 +27,12 @@ from tests.support.decomposed_bodies import parts_of
 
 
 def probe(n):
-    """Return a random vector (n,) to multiply with."""
+    """Return a random vector (n,) for test products."""
     return np.random.default_rng(3).standard_normal(n)
 
 
-def told(name, ranks):
-    """Emit on all ranks; gather a description of each share on the first."""
+def emitted(name, ranks):
+    """Emit the QP on all ranks; gather descriptions of the local parts on rank 0."""
     case = parse(name, PROBLEMS)
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
     share = made.share().qp
@@ -40,11 +40,11 @@ def told(name, ranks):
     own = rows[share.P.halo.owned]
     mine = own_subdomains(name, ranks)
     B = share.P.local.B.tocoo()
-    Fx, factorised = forming(lambda: share.P @ probe(made.variables)[own])
+    Fx, factorised = factorised_in(lambda: share.P @ probe(made.variables)[own])
     return ranks.comm.gather({
         "factorised": factorised,
         "formed": [
-            named(group.template, group.touched)
+            class_digest(group.template, group.touched)
             for group in share.P.local.packed.groups if group.explicit
         ],
         "sizes": [made.variables, made.equality_rows],
@@ -63,7 +63,7 @@ def told(name, ranks):
 
 
 def own_subdomains(name, ranks):
-    """Hold what ranks hold, whose shares are those of the first problem of a path."""
+    """Return the local subdomains of this rank for the first problem of a path."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
@@ -76,20 +76,20 @@ def own_subdomains(name, ranks):
     return LocalSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 
 
-def named(kind, touched):
-    """Return a name of the data that the blocks of a kind depend on."""
+def class_digest(kind, touched):
+    """Return a digest of the data that determine the blocks of a subdomain class."""
     return hex_digest((kind.K.data.tobytes(), touched.tobytes()))
 
 
-def forming(act):
-    """Return what an act gives, and the kinds that this rank factorises in it."""
+def factorised_in(act):
+    """Return the result of `act()`, and the classes that this rank factorises in it."""
     factor, names = SubdomainClass.border_factor, []
 
-    def noted(kind, touched):
-        names.append(named(kind, touched))
+    def recording(kind, touched):
+        names.append(class_digest(kind, touched))
         return factor(kind, touched)
 
-    SubdomainClass.border_factor = noted
+    SubdomainClass.border_factor = recording
     try:
         return act(), names
     finally:
@@ -97,7 +97,7 @@ def forming(act):
 
 
 def compared(name, everyone):
-    """Return the differences between the shares and the QP of one process."""
+    """Return the differences between the assembled QP and the QP of one process."""
     qp = parse(name, PROBLEMS).build(reference_solution).qp
     whole = qp.P.build()
 
@@ -170,7 +170,7 @@ def _off(found, known):
 
 
 def _bounds_off(found, known):
-    """Return the difference of finite bounds; infinite if other ones are finite."""
+    """Return the difference of finite bounds, or inf if infinite bounds differ."""
     finite = np.isfinite(known)
     if not np.array_equal(found[~finite], known[~finite]):
         return float("inf")
@@ -179,11 +179,11 @@ def _bounds_off(found, known):
 
 def main():
     ranks = Ranks(MPI.COMM_WORLD)
-    shares = {name: told(name, ranks) for name in sys.argv[1:]}
+    shares = {name: emitted(name, ranks) for name in sys.argv[1:]}
     if ranks.rank == 0:
         print(json.dumps({name: compared(name, s) for name, s in shares.items()}))
     done = ranks.comm.Ibarrier()
-    while not done.Test():  # others wait asleep, which MPI itself does not
+    while not done.Test():  # sleep while waiting, since MPI would use CPU time
         time.sleep(0.01)
 
 

@@ -22,12 +22,12 @@ from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-#: tolerances, and factors of the multipliers: the last answer is wrong by a hundredth
+#: (tolerance, factor of the multipliers); the factor makes the last answer wrong by 1 %
 WRONG = ((1e-4, 1.0), (1e-6, 1.0), (1e-6, 1.01))
 
 
 def evaluated(name, ranks):
-    """Evaluate answers on all ranks; the first also returns the answers."""
+    """Evaluate answers on all ranks; rank 0 also returns the answers."""
     case_id = parse(name, PROBLEMS)
     emit = case_id.family.emission(case_id.form, case_id.params)
     emitted = emit(ranks, reference_over_ranks)
@@ -50,7 +50,7 @@ def evaluated(name, ranks):
 
 
 def beside_one_process(name, found):
-    """Add to answers their evaluation by one process that has built the case."""
+    """Add to each answer its evaluation by a single process that builds the case."""
     case = parse(name, PROBLEMS).build(reference_solution)
     for told, whole in found:
         one = {"objective": case.qp.objective(whole.x)}
@@ -74,7 +74,7 @@ def main():
         compared = {name: [*beside_one_process(name, f)] for name, f in found.items()}
         print(json.dumps(compared, default=float))
     done = ranks.comm.Ibarrier()
-    while not done.Test():  # others wait asleep, which MPI itself does not
+    while not done.Test():  # sleep while waiting, since MPI would use CPU time
         time.sleep(0.01)
 
 

@@ -8,10 +8,11 @@ from mortarbench.harness import QP
 
 
 def is_feasible(qp, relaxed=0):
-    """Run the simplex method, by Bland's rule, on the rows and bounds of a QP.
+    """Return whether the rows and bounds of a QP are feasible.
 
-    With x = x⁺ − x⁻ and a slack for each inequality, phase one minimises the sum of
-    artificial variables; the tableau holds fractions.
+    Phase one of the simplex method with Bland's rule minimises the sum of artificial
+    variables, with x = x⁺ − x⁻ and a slack for each inequality. All entries of the
+    tableau are fractions.
 
     relaxed : relative relaxation of right-hand sides and bounds
     """
@@ -56,12 +57,12 @@ def is_feasible(qp, relaxed=0):
 
 
 def nearly_contradicting(rng):
-    """Draw rows and bounds of up to six variables that contradict, or nearly do.
+    """Draw infeasible or nearly infeasible rows and bounds of up to six variables.
 
-    Rows are integers, reals, or combinations of others; a certificate is planted, and
-    the right-hand side is off a contradiction by a gap of either sign. Rows and
-    variables are scaled by powers of ten, single entries disturbed in their last bits,
-    bounds are absent, zero, close, or huge.
+    Rows have integer or real entries or are linear combinations of other rows. The
+    right-hand side is chosen such that a planted certificate is violated or satisfied
+    by a small gap. Rows and variables are scaled by powers of ten, single entries are
+    disturbed in their last bits, and bounds are absent, zero, close or huge.
     """
     n, m, p = rng.integers(1, 7), rng.integers(0, 4), rng.integers(1, 6)
     draw = rng.choice([

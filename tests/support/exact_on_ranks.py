@@ -1,7 +1,7 @@
 """Certify disturbed exact solutions on several ranks; prints JSON.
 
 Run as ``mpiexec -n N python -m mpi4py exact_on_ranks.py COUNT CASE…``. The first rank
-builds the whole, and solves it exactly.
+builds the undivided problem and solves it exactly.
 """
 
 import json
@@ -22,7 +22,7 @@ SHARP = (1e-7, 0.1)
 
 
 def certified(name, count, ranks):
-    """Return faults, and bounds over errors, on the first rank."""
+    """Return faults, and the ratios of bound to error, on the first rank."""
     problem, build = posed(f"{name}/dual")
     mechanics = build().mechanics if ranks.rank == 0 else None
     exact = exact_solution(mechanics) if ranks.rank == 0 else None

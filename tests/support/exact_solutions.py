@@ -1,10 +1,10 @@
-"""Solutions of stored contact problems in integers, and errors in their energy norm.
+"""Solutions of stored contact problems in integers, and errors in the energy norm.
 
 A number is an integer times 2^−BITS, so that data, sums and products are exact. The KKT
-equations for guessed closed rows are solved by elimination in extended precision, and
-refined with exact residuals until nothing changes above 2^−FINE; then the signs of all
-multipliers, gaps and slips are checked. The guess of which rows are closed is the only
-part that the code under test has in it, and a wrong one is found out.
+equations for a guessed set of closed rows are solved by elimination in extended
+precision. Exact residuals refine the solution until it changes by less than 2^−FINE.
+Then the signs of all multipliers, gaps and slips are checked. Only the guess of the
+closed rows uses the code under test, and the check detects a wrong guess.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.supported_by_contact import _eliminated, _loose, _substituted
 
-BITS = 500  #: after the binary point
-FINE = 330  #: bits, relative to the largest unknown, that refinement settles
+BITS = 500  #: number of bits after the binary point
+FINE = 330  #: number of correct bits after refinement, relative to the largest unknown
 Integers = NDArray[np.object_]
 
 
 def integers(v: Any) -> Integers:
-    """Return v, doubles or extended, times 2^BITS; digits beyond are cut off."""
+    """Return v (double or extended precision) times 2^BITS, truncated to integers."""
     v = np.asarray(v)
     high = v.astype(np.float64)
     low = (v - high).astype(np.float64)
@@ -71,7 +71,7 @@ class Rows:
         self._entries = integers(M.data)
 
     def __matmul__(self, x: Integers) -> Integers:
-        """Return M x, rounded to 2^−BITS down."""
+        """Return M x, rounded down to multiples of 2^−BITS."""
         terms = self._entries * x[self._at]
         sums = np.zeros(len(self._start) - 1, dtype=object)
         for i, (a, b) in enumerate(zip(self._start[:-1], self._start[1:], strict=True)):
@@ -85,7 +85,7 @@ class UnsettledError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class ExactSolution:
-    """The solution of the stored K, f, B, c of a problem in one piece."""
+    """The solution of an undivided problem with the stored K, f, B and c."""
 
     mechanics: Mechanics
     u: Integers  #: (n,)
@@ -118,7 +118,7 @@ class ExactSolution:
         return _float(isqrt(max(square, 0)))
 
     def error(self, u: Any) -> float:
-        """Return ‖u − u*‖ for u (n,), doubles or extended."""
+        """Return ‖u − u*‖ for u (n,) in double or extended precision."""
         return self.length(integers(u) - self.u)
 
     @cached_property
@@ -127,7 +127,7 @@ class ExactSolution:
         return self.length(self.u)
 
     def answer(self) -> Solution:
-        """Return u and λ in doubles, as `Mechanics.to_primal` would give them."""
+        """Return u and λ in double precision, in the form of `Mechanics.to_primal`."""
         m = self.mechanics
         u, lam = (np.array([_float(x) for x in v]) for v in (self.u, self.multipliers))
         contact = m.primal.h.size
@@ -137,9 +137,10 @@ class ExactSolution:
         return Solution(status=Status.SOLVED, x=u, y=none, z=z, z_box=0 * u)
 
     def exceeded(self, found: Certificate, s: Solution, u: Any) -> tuple[float, float]:
-        """Return the relative error of û (n,) and the answer, and over the bound.
+        """Return the larger relative error of û (n,) and s, and its ratio to the bound.
 
-        The bound may be infinite where that of the absolute error is not.
+        The bound of the relative error may be infinite although the bound of the
+        absolute error is finite.
         """
         error = max(self.error(s.x), self.error(u))
         within = min(found.error, found.bound * self.norm)
@@ -147,12 +148,13 @@ class ExactSolution:
 
 
 def exact_solution(mechanics: Mechanics) -> ExactSolution:
-    """Solve the stored problem; motions that closed rows do not feel are pinned.
+    """Solve the stored problem; fix rigid motions that closed rows do not prevent.
 
     Raises
     ------
     UnsettledError
-        When no set of closed rows satisfies all conditions within some exchanges.
+        If some number of exchanges does not yield closed rows that satisfy all
+        conditions.
 
     """
     mechanics = mechanics.whole
@@ -170,7 +172,7 @@ def exact_solution(mechanics: Mechanics) -> ExactSolution:
 def _given(
     mechanics: Mechanics, states: States, pinned: Any
 ) -> tuple[Integers, Integers]:
-    """Solve with equality on the closed rows."""
+    """Solve for u and λ with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
     lower, upper = hull(exact.forces.sets, exact.c.size)
@@ -197,9 +199,9 @@ def _given(
 def _exchanged(
     mechanics: Mechanics, states: States, u: Integers, lam: Integers
 ) -> States:
-    """Return the states with rows exchanged that violate a condition.
+    """Return the states after exchanging the rows that violate a condition.
 
-    Zeros are known to 2^−FINE of the largest number only.
+    Values below about 2^−FINE times the largest number count as zero.
     """
     exact = mechanics.exact
     v = Rows(mechanics.rows) @ u - integers(exact.c)
@@ -222,7 +224,7 @@ def _exchanged(
 
 
 def _solve(A: NDArray[np.float64], b: Integers) -> Integers:
-    """Solve Ax = b (n,) to FINE bits."""
+    """Solve Ax = b (n,) with FINE correct bits."""
     scale, scaled = np.ones(len(b)), A.copy()
     for _ in range(20):
         by = 2.0 ** np.round(0.5 * np.log2(np.abs(scaled).max(axis=1)))

@@ -1,6 +1,6 @@
-"""Plug-in with solvers that make false claims, two of them real but misused.
+"""Plug-in with solvers that make false claims; two are real solvers, used wrongly.
 
-It has two families without mechanics: a membrane, and  min ½(x + 1)²,  x ≤ 0.
+It contains two families without mechanics: a membrane, and  min ½(x + 1)²,  x ≤ 0.
 """
 
 from dataclasses import dataclass, field, replace
@@ -41,7 +41,7 @@ class Half:
 
 
 class Any:
-    """Takes every QP."""
+    """Solver that accepts every QP."""
 
     def declines(self, qp):
         return None
@@ -55,7 +55,7 @@ class Exact(Any):
 
 @dataclass(frozen=True)
 class Stale(Any):
-    """Returns the answer to the previous QP of the same shape."""
+    """Solver that returns the answer to the previous QP of the same shape."""
 
     def prepare(self, qp, tol):
         def solve():
@@ -68,7 +68,7 @@ class Stale(Any):
 
 @dataclass(frozen=True)
 class Pulls(Any):
-    """Returns a multiplier of the wrong sign, on a row or bound that is not active."""
+    """Solver that returns a multiplier of the wrong sign on an inactive constraint."""
 
     def prepare(self, qp, tol):
         def solve():
@@ -85,7 +85,7 @@ class Pulls(Any):
 
 @dataclass(frozen=True)
 class AtTheRow(Any):
-    """Returns x = 0 with a multiplier of the wrong sign that balances the gradient."""
+    """Solver that returns x = 0 and balances the gradient by a multiplier < 0."""
 
     def prepare(self, qp, tol):
         none = dict(y=np.zeros(0), z_box=np.zeros(1))
@@ -96,7 +96,7 @@ class AtTheRow(Any):
 
 @dataclass(frozen=True)
 class Denies(Any):
-    """Claims that the QP is infeasible."""
+    """Solver that claims that the QP is infeasible."""
 
     def prepare(self, qp, tol):
         return lambda: Solution.without_point(qp, Status.INFEASIBLE)
@@ -104,7 +104,7 @@ class Denies(Any):
 
 @dataclass(frozen=True)
 class UncheckedProxQP(Any):
-    """ProxQP with its defaults, without the test of the duality gap."""
+    """ProxQP with its default options, which do not test the duality gap."""
 
     def prepare(self, qp, tol):
         from proxsuite import proxqp
@@ -130,7 +130,7 @@ class UncheckedProxQP(Any):
 
 @dataclass(frozen=True)
 class BareHiGHS(Any):
-    """HiGHS with its defaults, on a QP with bounds only."""
+    """HiGHS with its default options, for QPs with bounds only."""
 
     def prepare(self, qp, tol):
         import highspy
@@ -161,7 +161,7 @@ class BareHiGHS(Any):
         return solve
 
 
-MEMORY = {}  #: of `Stale`: the last answer of each size
+MEMORY = {}  #: last answer of `Stale` for each size
 SOLVERS = {
     "exact": Exact(),
     "stale": Stale(),

@@ -1,10 +1,11 @@
 """Search for answers whose error exceeds the bound that ranks prove; prints JSON.
 
-Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. The truth is
-the reference point of the whole, which the first rank builds. Every other trial
-disturbs the answer that came nearest to its bound so far.
+Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. Errors are
+relative to the reference point of the undivided problem, which the first rank builds.
+Every second trial disturbs the answer with the largest ratio of error to bound so far.
 
-Without cases, it prints why ranks, and one process, refuse loads without equilibrium.
+Without cases, the program prints the reasons for which ranks and one process refuse
+loads without equilibrium.
 """
 
 import json
@@ -29,27 +30,27 @@ from tests.support.decomposed_bodies import parts_of
 from tests.support.disturbed import DISTURBANCES
 from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
-#: of a disc between plates: what holds it but contact, and where all of it is
+#: variants of a disc between plates: name → arguments of `disc_between_plates`
 DISCS = {
     "sliding disc": {}, "disc under rollers": {"rollers": True},
     "tilted disc": {"tilt": 0.5}, "soft disc": {"E": (70e9, 70e3, 70e9)},
 }  # fmt: skip
-ROUNDED = 1 + 1e-9  #: local solves are those of doubles
-NOISE = 1e-7  #: relative error from which on effectivities are measured
+ROUNDED = 1 + 1e-9  #: allowed ratio of error to bound: local solves use doubles
+NOISE = 1e-7  #: smallest relative error for which the ratio bound / error is recorded
 
 
 class KnownSolution(NamedTuple):
     """Solution of the undivided problem up to rounding, on every rank."""
 
-    u: np.ndarray  #: (n,) extended
-    multipliers: np.ndarray  #: (m,) of contact and friction rows
+    u: np.ndarray  #: (n,) displacement, extended precision
+    multipliers: np.ndarray  #: (m,) multipliers of contact and friction rows
     norm: float  #: ‖u‖
-    slack: float  #: ‖error of u‖
-    rigid: np.ndarray  #: (n, 3 bodies) motions of single bodies
+    slack: float  #: bound of ‖error of u‖
+    rigid: np.ndarray  #: (n, 3 bodies) rigid motions of single bodies
 
 
-def posed(name):
-    """Return the problem in subdomains, and a function that builds it undivided."""
+def problem_and_build(name):
+    """Return the decomposed problem, and a function that builds the undivided one."""
     if name in DISCS:
         keys = DISCS[name]
         return disc_in_parts(**keys), lambda: disc_between_plates(**keys)
@@ -57,27 +58,27 @@ def posed(name):
     return parts_of(name), lambda: case.build(reference_solution)
 
 
-def true(build, ranks):
-    """Solve the undivided problem on the first rank, which keeps its mechanics."""
-    mechanics, told = None, None
+def known_solution(build, ranks):
+    """Solve the undivided problem on rank 0; only rank 0 returns the mechanics."""
+    mechanics, solution = None, None
     if ranks.rank == 0:
         mechanics = build().mechanics.whole
         point = reference_point(mechanics, reference_solution)
-        told = KnownSolution(
+        solution = KnownSolution(
             point.u, point.multipliers, point.norm, point.bound * point.norm,
             mechanics.rigid,
         )  # fmt: skip
-    return mechanics, ranks.comm.bcast(told)
+    return mechanics, ranks.comm.bcast(solution)
 
 
 def drifted(s, size, rng, rigid):
-    """Move each body rigidly, by up to a million times its displacement."""
+    """Move each body rigidly by up to 10⁶ times its displacement."""
     far = 10 ** rng.uniform(0, 6) * size * np.linalg.norm(s.x)
     return replace(s, x=s.x + rigid @ (far * rng.standard_normal(rigid.shape[1])))
 
 
 def pressed(s, size, rng, rigid):
-    """Add a force on one row, which is not in equilibrium."""
+    """Add a force on one row, which violates equilibrium."""
     z = s.z.copy()
     if z.size:
         z[rng.integers(z.size)] += size * np.abs(z).max() * rng.standard_normal()
@@ -92,7 +93,7 @@ def jumped(s, size, rng, rigid):
 
 
 def disturbed(s, rng, rigid):
-    """Disturb an answer in one way."""
+    """Apply one random disturbance to an answer."""
     size, kind = 10 ** rng.uniform(-9, 0.3), rng.integers(len(DISTURBANCES) + 3)
     if kind < len(DISTURBANCES):
         return DISTURBANCES[kind](s, size, rng)
@@ -100,22 +101,22 @@ def disturbed(s, rng, rigid):
 
 
 class BoundSearch:
-    """Comparison of certificates of answers to one problem with their errors."""
+    """Comparison of certified bounds with true errors, for answers to one problem."""
 
     def __init__(self, name, ranks):
-        problem, build = posed(name)
+        problem, build = problem_and_build(name)
         self.ranks, self.name = ranks, name
-        self.mechanics, self.truth = true(build, ranks)
+        self.mechanics, self.truth = known_solution(build, ranks)
         self.own = problem_of(problem, ranks)
 
     def errors(self, found, claimed):
-        """Return errors of û, answer and pair, and if û is admissible, on all ranks."""
+        """Return errors of û, answer and pair, and whether û is admissible."""
         own, truth = self.own, self.truth
-        told = self.ranks.comm.gather((own.components, found.u))
+        parts = self.ranks.comm.gather((own.components, found.u))
         still = None
-        if told is not None:
+        if parts is not None:
             u = np.empty(truth.u.size, dtype=Real)
-            for components, part in told:
+            for components, part in parts:
                 u[components] = part
             m = self.mechanics
             motion, contact = m.exact.motion(u), m.exact.contact
@@ -128,7 +129,7 @@ class BoundSearch:
         return of_u, of_answer, float(np.hypot(of_u, np.sqrt(max(torn, 0)))), inside
 
     def tried(self, s):
-        """Certify an answer; return a fault or "", and the error over its bound."""
+        """Certify an answer; return a fault or "", and the ratio of error to bound."""
         slack = self.truth.slack
         try:
             found = certify_over_ranks(self.own, s.x[self.own.components], s.z)
@@ -144,7 +145,7 @@ class BoundSearch:
         return fault, max(of_answer, of_pair) / found.error
 
     def result(self, count):
-        """Certify `count` answers; return faults, and bounds over errors."""
+        """Certify `count` answers; return faults and ratios of bound to error."""
         rng = np.random.default_rng(sum(map(ord, self.name)))
         start = Solution(
             status=Status.SOLVED, x=self.truth.u.astype(float), y=np.zeros(0),
@@ -177,7 +178,7 @@ def problem_of(problem, ranks):
 
 
 def refused(ranks, sign, **keys):
-    """Return the reasons, of ranks and of one process, to refuse another load."""
+    """Return the reasons for which ranks and one process refuse a load."""
     problem = disc_in_parts(**keys)
     own = problem_of(replace(problem, load=lambda at: sign * problem.load(at)), ranks)
     m = disc_between_plates(**keys).mechanics
@@ -194,7 +195,7 @@ def refused(ranks, sign, **keys):
 
 
 def why(certificate):
-    """Return the reason why there is no certificate, or the bound of one."""
+    """Return the bound of a certificate, or the reason why there is no certificate."""
     try:
         return f"bound {certificate().bound}"
     except UncertifiableError as e:

@@ -1,15 +1,14 @@
 """Server that starts the processes of runs as forks with libraries loaded.
 
 A new interpreter needs half a second of CPU time for imports, more than the work of
-most tests. What `Server.popen` gives in its place is a process like any
-other: it has its own memory, signals and exit code, its files, environment and limits
-are those that it is started with, the sub-reaper above it is the one of
-`harness.processes.reaper`, and that one's parent is the process that asked. Its command
-line and environment are to be read in /proc, see proc(5). Only what an interpreter does
-before it runs a program is left out. Where that is tested, processes are started as
-users start them.
+most tests. The server therefore forks a process instead. Like any process, the fork has
+its own memory, signals and exit code, and the requested files, environment and limits.
+Its parent is the sub-reaper of `harness.processes.reaper`, whose parent is the
+requesting process. /proc shows the command line and environment of the fork, see
+proc(5). Only the start of an interpreter is left out; tests of this start launch
+processes in the ordinary way.
 
-Run as a program with a socket and modules to import, it is the server.
+If the module is run as a program with a socket and modules to import, it is the server.
 """
 
 import atexit
@@ -34,27 +33,29 @@ from types import ModuleType
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
 
-LONGEST = 2**20  #: bytes of a request
+LONGEST = 2**20  #: maximum length of a request, bytes
 LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIMIT_"]
 PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
-ARGUMENTS, ENVIRONMENT = 48, 50  #: fields of /proc/PID/stat: where they lie in memory
-ROOM = 2**16 * " "  #: for longer ones than the server was started with
+#: fields of /proc/PID/stat with the addresses of arguments and environment
+ARGUMENTS, ENVIRONMENT = 48, 50
+#: padding that reserves memory for longer arguments and environments of forks
+ROOM = 2**16 * " "
 
-#: what is loaded for plug-ins, which start as ``python -P FILE``
+#: modules loaded for plug-ins, which start as ``python -P FILE``
 PLUGINS = ("mortarbench.cli.main", "mortarbench.processes")
-#: what is loaded for ``python -P -m mortarbench``, whose solvers and cases are ours
+#: modules loaded for ``python -P -m mortarbench``, with its own solvers and cases
 OURS = (
     *PLUGINS, "mortarbench.solvers.smalbe.solver", "mortarbench.problems.fem.kernels",
     "sksparse.cholmod",
 )  # fmt: skip
 
-#: what is loaded for ``python -P -m dask``, the processes of a cluster
+#: modules loaded for ``python -P -m dask``, the processes of a cluster
 CLUSTER = (
     *PLUGINS, "dask.__main__", "distributed.cli.dask_scheduler",
     "distributed.cli.dask_worker", "mortarbench.harness.running.dask_worker",
 )  # fmt: skip
 
-#: has a program of its own, such as a notebook's kernel, start its workers as forks
+#: code that makes another program, such as a notebook kernel, start workers as forks
 INSTALL = (
     f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
     "import fork_server; from mortarbench.harness.processes import supervisor; "
@@ -82,9 +83,9 @@ class Forks:
         return Forked(self._server(modules), args[4:], **how)
 
     def dask(self, arguments, env, serves):
-        """Start ``python -m dask``; silent, and with input from nowhere.
+        """Start ``python -m dask`` with input from and output to /dev/null.
 
-        serves : True if workers that it starts are forks as well
+        serves : True if the started process also starts its workers as forks
         """
         request = {
             "program": [sys.executable, "-P", "-m", "dask", *arguments],
@@ -105,7 +106,7 @@ class Forks:
 
 
 class Server:
-    """Parent's side of a process that has loaded some modules."""
+    """Connection to a forked or started process that has loaded some modules."""
 
     def __init__(self, ours, process):
         self._ours = ours
@@ -122,7 +123,7 @@ class Server:
 
     @classmethod
     def as_fork(cls):
-        """Fork this process, which has loaded what is needed, and one thread."""
+        """Fork this process, which has loaded the modules and has a single thread."""
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         if (process := os.fork()) == 0:
             ours.close()
@@ -151,7 +152,7 @@ class Server:
 
 
 class Program:
-    """The used part of `subprocess.Popen`."""
+    """The part of `subprocess.Popen` that callers use."""
 
     def __init__(self, pid):
         self.pid = pid
@@ -178,7 +179,7 @@ class Program:
 
 
 class Forked(Program):
-    """A worker below its sub-reaper, as the supervisor starts it."""
+    """A forked worker below a sub-reaper, with the interface that supervisors use."""
 
     def __init__(self, server, arguments, *, env, stdin, stdout, stderr, **how):
         assert stdin == subprocess.PIPE
@@ -196,7 +197,10 @@ class Forked(Program):
 
 
 def adopt(orphans):
-    """Adopt orphaned descendants from now on, or stop doing so."""
+    """Start or stop the adoption of orphaned descendants.
+
+    orphans : True to start, False to stop
+    """
     CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(orphans), 0, 0, 0)
 
 
@@ -209,24 +213,25 @@ def serve(asked):
         request = json.loads(message)
         _, *program = request.get("program") or request["arguments"][3:]
         if program[1] != "-m":
-            with suppress(OSError, SyntaxError, ValueError):  # which it will tell
+            # the fork reports these errors
+            with suppress(OSError, SyntaxError, ValueError):
                 code_of(program[1])
-        told, tells = os.pipe()
+        reader, writer = os.pipe()
         if (between := os.fork()) == 0:
             if child := os.fork():
-                os.write(tells, str(child).encode())
+                os.write(writer, str(child).encode())
                 os._exit(0)
-            for fd in (told, tells, asked.detach()):
+            for fd in (reader, writer, asked.detach()):
                 os.close(fd)
             become(request, fds)
         os.waitpid(between, 0)  # from here on the child is an orphan
-        asked.send(os.read(told, 20))
-        for fd in (told, tells, *fds):
+        asked.send(os.read(reader, 20))
+        for fd in (reader, writer, *fds):
             os.close(fd)
 
 
 def become(request, fds):
-    """Run the requested program, or the sub-reaper above it."""
+    """Run the requested program, or the sub-reaper that starts it."""
     os.setsid()
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -239,7 +244,7 @@ def become(request, fds):
         os.dup2(fd, at)
         os.close(fd)
     if "program" in request:
-        sys.modules["dask"].config.refresh()  # by this environment
+        sys.modules["dask"].config.refresh()  # read the new environment
         if request["serves"]:
             supervisor = sys.modules["mortarbench.harness.processes.supervisor"]
             supervisor.subprocess = Forks({PLUGINS: Server.as_fork()})
@@ -252,11 +257,11 @@ def become(request, fds):
 
 
 def show(field, texts):
-    """Set the entries of this process in /proc as execve(2) would."""
+    """Set the arguments or environment of this process in /proc, like execve(2)."""
     stat = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = map(int, stat[field - 3 : field - 1])
     block = b"".join(os.fsencode(text) + b"\0" for text in texts)
-    assert len(block) <= end - start, "more than the server has room for"
+    assert len(block) <= end - start, "longer than the memory reserved by `ROOM`"
     memset(start, 0, end - start)
     memmove(start, block, len(block))
 
@@ -289,7 +294,7 @@ def run_file(path):
 
 
 def code_of(path):
-    """Compile a file, unless it has not changed since it was last compiled."""
+    """Compile a file if it has changed since the last compilation."""
     status = os.stat(path)
     return compiled(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
@@ -300,7 +305,7 @@ def compiled(path, *_):
 
 
 def end_well():
-    """Exit without destructors, which would copy shared pages of the libraries."""
+    """Exit without destructors, which would write to shared pages and so copy them."""
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -311,5 +316,5 @@ if __name__ == "__main__":
     _, own, _room, *loaded = sys.argv
     for module in loaded:
         import_module(module)
-    gc.freeze()  # pages that no collection writes to stay shared
+    gc.freeze()  # garbage collections would write to pages and end their sharing
     serve(socket.socket(fileno=int(own)))

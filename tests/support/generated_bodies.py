@@ -1,9 +1,10 @@
 """Random contact problems, determined by a seed.
 
-Towers of blocks on a base, beams on pillars, discs between plates: one to five contacts
-with gaps, supported bodies and bodies that only contact supports, moduli up to six
-orders apart, node to segment and mortar with either basis, either side as slave. The
-loads press bodies together, so that each has a solution.
+The bodies are towers of blocks on a base, beams on pillars, or discs between plates.
+There are one to five contacts with gaps, and some bodies are supported only by contact.
+Moduli differ by up to six orders of magnitude. The contact rows are node-to-segment or
+mortar with either basis, and either side is the slave. The loads press the bodies
+together, so that every problem has a solution.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ METHODS = (("nts", "dual"), ("mortar", "dual"), ("mortar", "standard"))
 
 
 def generated_case(seed: int) -> Case:
-    """Draw the problem of a seed: tower, pillars and disc in turn."""
+    """Draw the problem of a seed: successive seeds give a tower, pillars and a disc."""
     rng = np.random.default_rng(seed)
     contact, basis = METHODS[rng.integers(3)]
     make = (_tower, _pillars, _disc)[seed % 3]
@@ -48,9 +49,10 @@ def generated_case(seed: int) -> Case:
 
 
 def _tower(rng: np.random.Generator, contact: str, basis: str) -> Case:
-    """Stack one to three blocks on a base; only the base is held.
+    """Stack one to three blocks on a base; only the base is supported.
 
-    The faces are flat, or crowned and the load central: else the blocks would roll off.
+    The faces are flat, or they are crowned and the load is central. With an eccentric
+    load on crowned faces, the blocks would roll off.
     """
     crown, tilt = (0.01, 0.0) if rng.random() < 0.5 else (0.0, 0.5)
     parts = [_block(rng, (-1.5, -1.0), (3.0, 1.0), crown)]
@@ -80,7 +82,7 @@ def _pillars(rng: np.random.Generator, contact: str, basis: str) -> Case:
 
 
 def _disc(rng: np.random.Generator, contact: str, basis: str) -> Case:
-    """Press a disc between two plates, of which one is held or on rollers."""
+    """Press a disc between two plates, one of which is clamped or on rollers."""
     lower, disc, upper = 10 ** rng.uniform(8, 12, 3)
     return disc_between_plates(
         int(rng.integers(4, 12)), form="dual", contact=contact, basis=basis,
@@ -115,10 +117,10 @@ def _case(
     tilt: float = 0.5,
     method: tuple[str, Any],
 ) -> Case:
-    """Press on the top of the highest part; which sides are slaves is drawn.
+    """Build the case of parts under pressure on the top; draw which sides are slaves.
 
     held : part, side, and the components of the displacement that are zero there
-    tilt : bound of the relative difference of the pressure from its mean
+    tilt : bound of the relative deviation of the pressure from its mean
     """
     mesh, body = join(tuple(prefixed(m, f"{k}_") for k, m in enumerate(parts)))
 

@@ -1,6 +1,6 @@
-"""Decomposition of an undivided mesh and its gluing rows, by sparse algebra.
+"""Decomposition of an undivided mesh and its gluing rows, by sparse matrix products.
 
-An independent derivation, for tests. Rows are those of
+Tests compare this independent derivation with the package. The rows equal those of
 `mortarbench.problems.feti.subdomains`.
 """
 
@@ -22,20 +22,21 @@ from mortarbench.problems.feti.tearing import SubdomainMesh, blocks, classify
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Decomposition:
-    """A mesh whose S subdomains have nodes of their own, M in all.
+    """A mesh whose S subdomains have separate nodes, M in total.
 
-    Torn nodes are numbered subdomain after subdomain, and within one in the order of
-    the nodes that they are copies of.
+    Every torn node is a copy of a node of the undivided mesh. Torn nodes are numbered
+    subdomain by subdomain, and within a subdomain in the order of the original nodes.
     """
 
-    node: Nodes  #: (M,) node of the whole mesh that each torn node is a copy of
-    nodes: int  #: of the whole mesh
+    node: Nodes  #: (M,) node of the undivided mesh of which each torn node is a copy
+    nodes: int  #: number of nodes of the undivided mesh
     start: NDArray[np.int64]  #: (S + 1,) first torn node of each subdomain, and M
-    parts: tuple[SubdomainMesh, ...]  #: the first subdomain of each kind
-    class_of: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
-    #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
+    parts: tuple[SubdomainMesh, ...]  #: first subdomain of each class
+    class_of: NDArray[np.int64]  #: (S,) class of each subdomain, an index into `parts`
+    #: (S, dim, dim) rotations Q of the first subdomain of a class into each subdomain:
+    #: x = Q x_part + t
     rotation: NDArray[np.float64]
-    label: NDArray[np.int64]  #: (E,) subdomain of each cell of the whole mesh
+    label: NDArray[np.int64]  #: (E,) subdomain of each cell of the undivided mesh
 
     @property
     def subdomain(self) -> NDArray[np.int64]:
@@ -46,11 +47,11 @@ class Decomposition:
 def structured_bodies(
     divisions: Sequence[tuple[int, ...]], most: int
 ) -> NDArray[np.int64]:
-    """Label the cells of structured meshes, one after another, each by its `blocks`.
+    """Label the cells of structured meshes with the subdomains that `blocks` yields.
 
     Parameters
     ----------
-    divisions : of each body, as of `blocks`
+    divisions : numbers of cells of each body, as for `blocks`
     most : H/h
 
     """
@@ -66,14 +67,14 @@ def decompose(
     label: NDArray[np.int64],
     material: NDArray[np.int64],
 ) -> Decomposition:
-    """Cut a mesh into the subdomains that its cells are labelled with.
+    """Decompose a mesh into subdomains by labels of its cells.
 
     Parameters
     ----------
     points : (n, dim)
     cells : (E, corners)
-    label : (E,) subdomain of each cell, 0 … S − 1, none of them empty
-    material : (E,) of each cell; subdomains of one kind have the same
+    label : (E,) subdomain of each cell, 0 … S − 1; no subdomain is empty
+    material : (E,) material of each cell; equal for all subdomains of a class
 
     """
     n, S = len(points), int(label.max()) + 1
@@ -116,22 +117,23 @@ def glue(
     shape: Vector | float = 1.0,
     rows: str = "orthonormal",
 ) -> DecomposedBodies:
-    """Pose a contact problem of the whole on the subdomains.
+    """Return the contact problem of the undivided mesh on the subdomains.
 
     Parameters
     ----------
-    kinds : of the parts of the decomposition
-    load : (n,) of the whole; shared equally by the copies of a node
+    classes : subdomain classes of the parts of the decomposition
+    load : (n,) load on the undivided mesh; the copies of a node share it equally
     supports, supported : (k, n) one unit entry per prescribed component, and (k,) its
         value
-    contact, c : (m_I, n) and (m_I,) of the whole, normals, then tangents
-    E : (nodes,) stiffness of the body that each node belongs to, without dimension
-    shape : factor of E in rows of supports and gluing, (n,) of the components or one
-    rows : how copies are glued, one of GLUE
+    contact, c : (m_I, n) and (m_I,) contact rows of the undivided mesh, normals before
+        tangents, and their gaps
+    E : (nodes,) dimensionless stiffness of the body of each node
+    shape : factor of E in rows of supports and gluing; (n,) by component, or a scalar
+    rows : gluing of the copies, one of GLUE
 
     """
     d = load.size // decomposition.nodes
-    #: of the whole, of each torn component
+    #: component of the undivided mesh for each torn component
     component = (d * decomposition.node[:, None] + np.arange(d)).ravel()
     copies = _unit_rows(component, load.size)
     turn = _rotation(decomposition, d)
@@ -171,8 +173,8 @@ def _gluing(component: Nodes, free: Nodes, weights: Weights) -> csr_array:
 
     Parameters
     ----------
-    component : (N,) of the whole, of each torn component
-    free : components of the whole that are glued
+    component : (N,) component of the undivided mesh for each torn component
+    free : components of the undivided mesh that are glued
 
     """
     order = np.argsort(component, kind="stable")
@@ -194,9 +196,9 @@ def _gluing(component: Nodes, free: Nodes, weights: Weights) -> csr_array:
 
 
 def _rotation(decomposition: Decomposition, d: int) -> csr_array:
-    """Return Q = diag(Q_1 … Q_S) (N, N): from axes of subdomains to those of the whole.
+    """Return Q = diag(Q_1 … Q_S) (N, N): from local axes of subdomains to global axes.
 
-    d : components per node; a single one is a scalar, the same in all axes
+    d : number of components per node; for d = 1, the scalar does not depend on axes
     """
     M = decomposition.node.size
     if d == 1:

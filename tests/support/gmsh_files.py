@@ -1,10 +1,13 @@
-"""Meshes as gmsh writes them, without gmsh."""
+"""Mesh files in the format of gmsh, written without gmsh."""
 
 import numpy as np
 
 
 def msh22(points, quads, curves, spots, quad_type=3):
-    """Write ASCII 2.2: gmsh's element types are 15 (point), 1 (line), 3 (quad)."""
+    """Return a file in the ASCII format 2.2, with points, lines and quadrilaterals.
+
+    The element types of gmsh are 15 (point), 1 (line) and 3 (quadrilateral).
+    """
     groups, rows, tag = [], [], 0
     for dimension, kind, named in (
         (0, 15, spots),
@@ -30,12 +33,12 @@ def text22(points, groups, rows):
     return text
 
 
-#: gmsh's types of cells and faces by their number of corners
+#: element types of gmsh for cells and faces, by the number of corners
 _SOLIDS, _FACES = {4: 4, 6: 6, 8: 5}, {3: 2, 4: 3}
 
 
 def solids22(points, bodies, faces):
-    """Write ASCII 2.2 with bodies of cells and boundaries of faces in space."""
+    """Return a file in the ASCII format 2.2 with bodies and boundary faces in space."""
     groups, rows, tag = [], [], 0
     for dimension, kinds, named in ((3, _SOLIDS, bodies), (2, _FACES, faces)):
         for name, cells in named.items():
@@ -86,8 +89,8 @@ master = "table"
 def stacked_mesh(gap=0.0, sag=0.0, **sides):
     """Return a mesh of two squares of side 2, one above the other.
 
-    sag : by which the middle of the upper one's lower side is lower than its ends
-    sides : edges of further boundaries, by their names
+    sag : depth of the middle of the upper square's lower side below the ends of it
+    sides : names and edges of further boundaries
     """
     (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0 + gap))
     upper[1, 1] -= sag
@@ -102,9 +105,9 @@ def stacked_mesh(gap=0.0, sag=0.0, **sides):
 
 
 def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
-    """Write a `stacked_mesh` and its description; return the path of the latter.
+    """Write a `stacked_mesh` and its description; return the path of the description.
 
-    Poisson's ratio is zero: pressed together, each square is in uniaxial stress.
+    Poisson's ratio is zero, so that squares pressed together are in uniaxial stress.
     """
     (folder / "blocks.msh").write_text(stacked_mesh(gap, sag))
     path = folder / "blocks.toml"

@@ -1,7 +1,7 @@
-"""QPs that mislead residuals, with a KKT point and the optimal value known exactly.
+"""QPs with misleading residuals, and their exact KKT point and optimal value.
 
-All numbers are dyadic, with so few digits that the planted point satisfies the KKT
-conditions of the QP as stored without rounding.
+All numbers are dyadic and have few digits, so that the planted point satisfies the KKT
+conditions of the stored QP without rounding errors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class HardQP:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Draft:
-    """Planted data, from which b, h and q follow."""
+    """Planted data, which determine b, h and q."""
 
     P: Vector
     A: Vector
@@ -101,13 +101,13 @@ def _fixed(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _big_m(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Activate a bound by a cost of 1e9; in half of the cases it is zero."""
+    """Activate a bound by a cost of 1e9; the bound is zero in half of the cases."""
     x = float(d.x[-1] * rng.integers(0, 2))
     return d.at(-1, x=x, lb=x, ub=np.inf, z_box=-1e9)
 
 
 def _duplicates(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Repeat a free variable: only the sum of both is determined."""
+    """Duplicate a free variable, so that only the sum of both is determined."""
     d = d.at(0, x=d.x[0] - 1, lb=-np.inf, ub=np.inf, z_box=0.0)
     wide = d.widened(1, np.ones(1))
     first = np.append(np.arange(d.x.size), 0)
@@ -115,7 +115,7 @@ def _duplicates(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _free_direction(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Add two variables without cost of which only the difference matters."""
+    """Add two variables without cost that occur only through their difference."""
     k, t = d.x.size, rng.integers(-8, 9) / 2.0
     link = np.zeros((2, k + 2))
     link[0, 0], link[:, k], link[:, k + 1] = 1, 1, -1
@@ -136,14 +136,14 @@ def _no_cost(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _cancelled(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Shift f* to 0, 2^-20 or 2^-36 by a fixed variable with a cost."""
+    """Shift the optimal value to 0, 2^-20 or 2^-36 by a fixed variable with a cost."""
     aim = float(rng.choice([0.0, 2.0**-20, 2.0**-36]))
     shift = aim - float(d.x @ d.P @ d.x / 2 + d.q @ d.x)
     return d.widened(1, np.ones(1)).at(-1, lb=1.0, ub=1.0, z_box=-shift)
 
 
 def _far_bounds(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Bound all variables by 1e12 that have no bounds."""
+    """Bound all unbounded variables by 1e12."""
     lb, ub = (np.where(np.isinf(v), np.sign(v) * 1e12, v) for v in (d.lb, d.ub))
     return replace(d, lb=lb, ub=ub)
 
@@ -166,7 +166,7 @@ def _rows(d: _Draft, rng: np.random.Generator) -> _Draft:
     )  # fmt: skip
 
 
-#: in the order in which they are applied
+#: modifications by name, in the order of their application
 KINDS: Mapping[str, Kind] = {
     "singular": _singular,
     "tiny curvature": _tiny_curvature,
@@ -185,7 +185,10 @@ KINDS: Mapping[str, Kind] = {
 
 
 def hard(kinds: frozenset[str], seed: int) -> HardQP:
-    """Plant a QP of all the given kinds (keys of `KINDS`), of 2 to 9 variables."""
+    """Return a QP with 2 to 9 variables and all modifications in `kinds`.
+
+    kinds : keys of `KINDS`
+    """
     rng = np.random.default_rng([seed, *(k in kinds for k in KINDS)])
     d = _plain(rng)
     for name, kind in KINDS.items():
@@ -199,7 +202,7 @@ def hard(kinds: frozenset[str], seed: int) -> HardQP:
 
 
 def _plain(rng: np.random.Generator) -> _Draft:
-    """Draw small integers and quarters: rows, bounds, and which of them are active."""
+    """Draw rows, bounds and active sets; entries are small integers and quarters."""
     n, m, p = (int(rng.integers(*span)) for span in ((2, 6), (0, 3), (0, 4)))
     M = rng.integers(-3, 4, (n, n)).astype(float)
     x = rng.integers(-16, 17, n) / 4.0

@@ -1,4 +1,4 @@
-"""Boxes of hexahedra, and their division into other cells, for tests."""
+"""Boxes of hexahedra, and division of hexahedra into other cells, for tests."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ WEDGES = np.array([[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])
 
 
 def bricks(divisions: tuple[int, ...], size: tuple[float, ...]) -> Mesh:
-    """Divide a box into equal cells, x numbered slowest."""
+    """Divide a box into equal cells; numbers increase slowest along x."""
     nodes = np.add(divisions, 1)
     i = np.arange(np.prod(nodes)).reshape(nodes)
     ends = [slice(None, -1), slice(1, None)]
@@ -24,7 +24,7 @@ def bricks(divisions: tuple[int, ...], size: tuple[float, ...]) -> Mesh:
 
 
 def bent(mesh: Mesh, amplitude: float = 0.05) -> Mesh:
-    """Distort a unit cube smoothly; its faces stay where they are."""
+    """Distort a unit cube smoothly without moving its faces."""
     bump = amplitude * np.prod(np.sin(np.pi * mesh.points), axis=1)
     points = mesh.points + bump[:, None] * [1, 0.7, -0.4]
     return Mesh(points, mesh.cells, mesh.boundaries)
@@ -37,6 +37,6 @@ def divided(mesh: Mesh, corners: np.ndarray) -> Mesh:
 
 
 def degenerate(mesh: Mesh) -> Mesh:
-    """Write all cells as hexahedra with repeated corners."""
+    """Return the mesh with all cells as hexahedra with repeated corners."""
     corners = REPEATED[mesh.element.kind]
     return Mesh(mesh.points, mesh.cells[:, corners], mesh.boundaries)

@@ -10,9 +10,9 @@ from mortarbench.harness import Solution, Status
 
 @dataclass(frozen=True)
 class Descent:
-    """Iteration x ← clip(x − g/‖P‖), for bounds only; needs many steps."""
+    """Solver with the slow iteration x ← clip(x − g/‖P‖), for bounds only."""
 
-    history: bool = False  #: keep a row per step
+    history: bool = False  #: True to store a row per step
     max_iter: int = 50_000
 
     def declines(self, qp):
@@ -57,7 +57,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Garbled(Descent):
-    """The same answer with an invalid history."""
+    """Solver that returns the same answer with an invalid history."""
 
     history: object = None
 

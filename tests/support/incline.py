@@ -29,7 +29,7 @@ WEIGHT = 1e5  #: G, N/m
 def incline(ratio: float, slope: float = 0.1) -> Bodies:
     """Push a block of weight G up an incline by the horizontal force ratio·G.
 
-    Drawn with the incline along x; only contact and friction support the block.
+    The incline is along the x axis. Only contact and friction support the block.
     """
     mesh, body = join((
         prefixed(rectangle((0.0, 0.0), (2.0, 0.5), (8, 2)), "base_"),
@@ -52,7 +52,7 @@ def incline(ratio: float, slope: float = 0.1) -> Bodies:
 
 
 def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
-    """Emit the QP of the block under a law of friction, in one form."""
+    """Return the case of the block with a friction law, in one form of the QP."""
     bodies = incline(ratio)
     of = elastic_bodies_of(bodies)
     problem = ContactProblem(

@@ -2,7 +2,7 @@
 
     python -m tests.support.manufactured_ranks DIR [SCATTER]
 
-writes a result folder of them.
+writes a result folder with such records.
 """
 
 import json
@@ -14,16 +14,20 @@ import numpy as np
 
 from mortarbench.harness import Record, Verdict
 
-WORK, ALIKE = 4e-6, 0.02  #: s for a dof, and of each rank
-SLOWDOWN = 1.25  #: of ranks by one another
+WORK, ALIKE = 4e-6, 0.02  #: shared work per dof, and repeated work of each rank, s
+SLOWDOWN = 1.25  #: factor by which simultaneous ranks slow each other down
 REDUCTIONS, MESSAGES, BYTES = 300, 100, 2e6
-REDUCTION, MESSAGE, BYTE = 5e-6, 3e-6, 5e-10  #: s
-PREPARED = 2e-6  #: s for a dof, of which ranks share all
-SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}  #: parts
+REDUCTION, MESSAGE, BYTE = 5e-6, 3e-6, 5e-10  #: unit costs, s
+PREPARED = 2e-6  #: time of preparation per dof, s; ranks share it completely
+#: fractions of the solve time by part
+SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}
 
 
 def sent_seconds(ranks: int) -> float:
-    """Return the time of messages: a tree of ranks, and at most six neighbours."""
+    """Return the time of communication, s.
+
+    Reductions use a tree of ranks, and each rank has at most six neighbours.
+    """
     if ranks == 1:
         return 0.0
     tree, neighbours = int(np.ceil(np.log2(ranks))), min(ranks - 1, 6)
@@ -49,7 +53,7 @@ def rank_records(
     repeats: int = 3,
     scatter: float = 0.0,
 ) -> Iterator[Record]:
-    """Yield the records of one solver on cases of these dofs, on ranks and copied.
+    """Yield the records of one solver on ranks and in copies, for cases of these sizes.
 
     scatter : standard deviation of the logarithms of times
     """
@@ -57,8 +61,10 @@ def rank_records(
     for dofs in sizes:
         for repeat in range(repeats):
             for n in ranks:
-                told = SLOWDOWN * PREPARED * dofs / n if n > 1 else PREPARED * dofs
-                times = told, solve_seconds(dofs, n)
+                preparation = (
+                    SLOWDOWN * PREPARED * dofs / n if n > 1 else PREPARED * dofs
+                )
+                times = preparation, solve_seconds(dofs, n)
                 label = f"smalbe ranks={n}" if n > 1 else "smalbe"
                 noisy = np.array(times) * random.lognormal(0, scatter, 2)
                 yield _record(dofs, n, repeat, label, "", noisy)

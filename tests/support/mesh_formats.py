@@ -1,4 +1,4 @@
-"""The same mesh in other formats: .inp as text, .med by meshio's writer."""
+"""Conversion of .msh meshes to other formats: .inp as text, .med by meshio."""
 
 import meshio
 import numpy as np
@@ -8,7 +8,12 @@ TYPES = {"tetra": "C3D4", "wedge": "C3D6", "hexahedron": "C3D8", "triangle": "S3
 
 
 def named_cells(path):
-    """Points, blocks of cells, and pairs of a block and rows by name of a .msh file."""
+    """Return the contents of a .msh file.
+
+    Returns
+    -------
+    points, blocks of cells, and the (block, rows) pairs of each named group
+    """
     mesh = meshio.gmsh.read(path)
     dims = {"line": 1, "triangle": 2, "quad": 2}
     names = {(int(tag), int(dim)): name for name, (tag, dim) in mesh.field_data.items()}
@@ -22,15 +27,15 @@ def named_cells(path):
 
 
 def listed(ids):
-    """Numbers on lines of data, at most eight on each."""
+    """Return lines of data with at most eight numbers each."""
     parts = [ids[i : i + 8] for i in range(0, len(ids), 8)]
     return "\n".join(", ".join(map(str, part)) for part in parts)
 
 
 def write_inp(source, path, sides="elements", types=TYPES):
-    """Write a file as programs for CalculiX do; numbers have gaps.
+    """Write a file in the style of CalculiX preprocessors, with gaps in the numbering.
 
-    sides : sets of elements of facets; or of nodes
+    sides : "elements" for sets of facet elements, otherwise sets of nodes
     """
     points, blocks, sets = named_cells(source)
     number = 7 + 3 * np.arange(len(points))
@@ -63,7 +68,7 @@ def write_inp(source, path, sides="elements", types=TYPES):
 
 
 def write_med(source, path):
-    """Write a MED file by meshio; each set of names of a cell is a family."""
+    """Write a MED file with meshio; cells with the same names form a family."""
     points, blocks, sets = named_cells(source)
     kinds = list(dict.fromkeys(kind for kind, _ in blocks))
     of_kind = {kind: [k for k, (other, _) in enumerate(blocks) if other == kind]

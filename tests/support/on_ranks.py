@@ -41,7 +41,7 @@ REFUSED = {
 
 
 def vectors(ranks):
-    """Compare reductions of vectors with their known values; try refused operations."""
+    """Compare reductions of vectors with known values, and test refused operations."""
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((2, 101))
     C = rng.standard_normal((3, 101))
@@ -93,9 +93,10 @@ def refined_solution(M, t):
 
 
 def factors(ranks):
-    """Factorise a sum of known matrices; and one that is singular on rank 0 only.
+    """Factorise a sum of known matrices, and a matrix that is singular on rank 0 only.
 
-    Row i of G has its columns on rank i mod P and, if i is divisible by 3, on the next.
+    Row i of G has columns on rank i mod P and, if i is divisible by 3, also on the next
+    rank.
     """
     rng, r, size = np.random.default_rng(3), 24, ranks.size
     i = np.arange(r)
@@ -137,7 +138,7 @@ def factors(ranks):
 
 
 def projected(qp, most):
-    """Project and solve in a face, where ranks may share that many rows."""
+    """Project and solve in a face; ranks may share at most `most` rows."""
     kept, factor.MAX_FILL = factor.MAX_FILL, most
     problem = projected_problem(qp, partial(by_lanczos, steps=3))
     factor.MAX_FILL = kept
@@ -149,7 +150,7 @@ def projected(qp, most):
 
 
 def operator(name, ranks):
-    """Compare products with F, its rows and its preconditioners with one process's."""
+    """Compare F, its rows and its preconditioners with the results of one process."""
     qp = mb.build(name).family_case.qp
     whole = qp.P.build()
     share = whole.share(qp, ranks)
@@ -191,7 +192,7 @@ def operator(name, ranks):
 
 
 def main():
-    from mpi4py import MPI  # late: threads that are ranks need none
+    from mpi4py import MPI  # imported here, because ranks as threads do not need it
 
     ranks = Ranks(MPI.COMM_WORLD)
     found = {"vectors": vectors(ranks), "factors": factors(ranks)}

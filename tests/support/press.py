@@ -41,7 +41,7 @@ master = "upper bottom"
 
 
 def described(folder):
-    """Put both files into a folder; return the path of the description."""
+    """Write mesh and description into a folder; return the path of the description."""
     path = folder / "press.toml"
     path.write_text(DISC)
     mesh = (ROOT / "tests" / "data" / "press.msh").read_bytes()

@@ -37,14 +37,15 @@ traction = [0, 0, -1e6]
 slave = "foot"
 master = "table"
 """
-#: side of the unit cubes, by the name of the boundary of both
+#: index of the side of the unit cubes for each boundary that both cubes have
 _PLANES = {"left": 0, "front": 1}
 
 
 def solid_blocks(folder, corners=None, toml=TOML, divisions=((3, 3, 2), (2, 2, 2))):
     """Write two unit cubes, one above the other; return the path of the description.
 
-    corners : of the cells that divide each hexahedron, see `tests.support.hexahedra`
+    corners : corners of the cells into which each hexahedron is divided, see
+        `tests.support.hexahedra`
     """
     points, bodies, faces, start = [], {}, {"left": [], "front": []}, 0
     for z, name, cells in zip((0.0, 1.0), ("lower", "upper"), divisions, strict=True):

@@ -41,7 +41,8 @@ def laplacian(kind: str, n: int, rng: np.random.Generator) -> csr_array:
 def sparse_matrix(n: int, rng: np.random.Generator) -> csr_array:
     """Draw P: a Laplacian, AᵀA, the square of a second difference, or a diagonal.
 
-    40 % are scaled on both sides by up to four orders of magnitude, 30 % are permuted.
+    Of these matrices, 40 % are scaled symmetrically by up to four orders of magnitude,
+    and 30 % are permuted.
     """
     kind = rng.choice(["grid", "line", "graph", "gram", "square", "diagonal"])
     if kind == "gram":
@@ -67,7 +68,7 @@ def sparse_matrix(n: int, rng: np.random.Generator) -> csr_array:
 
 
 def qp_with_minimum(seed: int, most: int = 400) -> tuple[QP, Vector]:
-    """Draw a QP with bounds of all kinds, and its minimum x (n,).
+    """Draw a QP with free, one-sided, two-sided and fixed variables, and its minimiser.
 
     About 30 % of the active bounds are degenerate (z = 0).
     """

@@ -1,4 +1,4 @@
-"""Stored points in the folder of vectors of a run."""
+"""Storage of points in the folder `vectors` of a run."""
 
 from mortarbench.harness.files.store import point_arrays, save
 

@@ -1,8 +1,8 @@
-"""Bodies supported by contact alone, and solutions with twice the digits of doubles.
+"""Bodies supported only by contact, and solutions with twice the digits of doubles.
 
-The solutions come from the KKT equations of the stored data for given closed rows:
-Gaussian elimination in extended precision, refined with residuals in fractions. Of
-the code under test, only the guess of the closed rows is used.
+The solutions satisfy the KKT equations of the stored data for given closed rows. They
+are computed by Gaussian elimination in extended precision and refined with residuals
+in rational arithmetic. Only the guess of the closed rows uses the code under test.
 """
 
 from __future__ import annotations
@@ -53,10 +53,11 @@ def disc_between_plates(
 ) -> Case:
     """Press a disc of radius 1 m between a supported plate and a free one.
 
-    n : cells across the disc
-    rollers : at the left side of the upper plate
-    turn, tilt : angles, of the mesh within the disc and of everything
-    push : share of the pressure that acts sideways
+    n : number of cells across the disc
+    rollers : True for rollers at the left side of the upper plate
+    turn : angle of the mesh within the disc, rad
+    tilt : angle by which the whole assembly is rotated, rad
+    push : horizontal traction, as a fraction of the pressure
     """
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
@@ -83,7 +84,7 @@ def disc_in_parts(
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
 ) -> DecomposedProblem:
-    """Describe the dual of `disc_between_plates`, decomposed by METIS."""
+    """Return the dual of `disc_between_plates`, decomposed by METIS."""
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
@@ -98,7 +99,7 @@ def dual_of_disc_between_plates(
     basis: str = "dual",
     turn: float = 0.0,
 ) -> Transformed:
-    """Build the dual of a disc between plates on one process, torn by METIS."""
+    """Build the dual of a disc between plates, decomposed by METIS, on one process."""
     bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
@@ -139,7 +140,7 @@ def _disc_and_plates(
 
 
 def _disc(n: int, turn: float) -> Mesh:
-    """Mesh the disc around (0, 1) by n² cells, rings from a square to the rim."""
+    """Mesh the disc around (0, 1) with n² cells in rings from a square to the rim."""
     grid = np.linspace(-1, 1, n + 1)
     p = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
     r = np.abs(p).max(axis=1)
@@ -176,9 +177,10 @@ def _rotation(angle: float) -> NDArray[np.float64]:
 def stored_solution(
     mechanics: Mechanics, closed: NDArray[np.bool_], near: Extended
 ) -> tuple[Extended, Extended]:
-    """Solve for u and λ of the stored data; rigid motions that are loose are as `near`.
+    """Solve for u and λ of the stored data.
 
-    Raises AssertionError unless no closed row pulls and no other one is violated.
+    Rigid motions that the closed rows do not prevent are taken from `near`. The
+    function asserts that no closed row is tensile and that no open row is violated.
     """
     primal = mechanics.primal
     K, B = primal.P.toarray(), primal.G.toarray()
@@ -200,7 +202,7 @@ def stored_solution(
 
 
 def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the motions among R in the kernel of these rows."""
+    """Return the motions in the range of R that lie in the kernel of the rows."""
     _, sizes, turn = np.linalg.svd(rows @ R)
     count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
     return np.asarray(R @ turn[count:].T)
@@ -247,7 +249,7 @@ def _substituted(factor: Extended, b: Extended) -> Extended:
 
 
 def _short(v: Fraction) -> Fraction:
-    """Keep 200 bits."""
+    """Round a fraction to 200 bits."""
     shift = 200 - v.numerator.bit_length() + v.denominator.bit_length()
     return Fraction(round(v * Fraction(2) ** shift)) / Fraction(2) ** shift if v else v
 

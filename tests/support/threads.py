@@ -1,7 +1,7 @@
 """Ranks as threads of one process, for tests of communication.
 
 Messages are passed in memory, so that a test on three ranks takes milliseconds. A rank
-that waits for a message which is never sent fails after `PATIENCE`.
+that waits for a message that is never sent fails after `PATIENCE` seconds.
 """
 
 from collections.abc import Callable
@@ -65,9 +65,10 @@ class Comm:
 
 
 def without_lock(monkeypatch: Any, owner: type, name: str) -> None:
-    """Let ranks exchange messages while they compute a cached property.
+    """Allow ranks to exchange messages while they compute a cached property.
 
-    Until Python 3.12 one is computed in one thread at a time, for all instances.
+    Before Python 3.12, a lock allows only one thread at a time to compute the property,
+    for all instances.
     """
     monkeypatch.setattr(vars(owner)[name], "lock", nullcontext(), raising=False)
 
@@ -83,7 +84,7 @@ def on_threads(size: int, work: Callable[[Ranks], R]) -> list[R]:
         try:
             return work(Ranks(comm))  # type: ignore[arg-type]
         except BaseException:
-            barrier.abort()  # the others would wait, here and for messages
+            barrier.abort()  # otherwise the other ranks would wait
             for other in comms:
                 other._inbox[comm.rank].put(None)
             raise

@@ -1,6 +1,7 @@
-"""Plug-in with parabolas over half lines, and solvers, some of which misbehave.
+"""Plug-in with parabolas over half lines, and with solvers, some of which misbehave.
 
-Run as a program it is a worker whose registries contain nothing else.
+If the module is run as a program, it acts as a worker whose registries contain only
+this family and these solvers.
 """
 
 import os
@@ -26,7 +27,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Well:
-    """A parabola over a half line. Nothing more."""
+    """A parabola over a half line, for tests."""
 
     name: str = "well"
     defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})
@@ -105,7 +106,7 @@ class Dies(Exact):
 
 @dataclass(frozen=True)
 class Hangs(Exact):
-    """Hangs and ignores Ctrl-C, except in the warm-up; touches $STARTED."""
+    """Solver that hangs, ignores Ctrl-C and creates $STARTED, except in the warm-up."""
 
     def prepare(self, qp, tol):
         if qp.q.size != 2:
@@ -117,7 +118,7 @@ class Hangs(Exact):
 
 @dataclass(frozen=True)
 class Slow(Exact):
-    """Sleeps. Adds a line to $STARTS at every start except in the warm-up."""
+    """Solver that sleeps and, except in the warm-up, adds a line to $STARTS."""
 
     seconds: float = 0.4
 
@@ -131,7 +132,7 @@ class Slow(Exact):
 
 @dataclass(frozen=True)
 class Murders(Exact):
-    """Kills the process that measures it, at depth 4."""
+    """Solver that kills the supervising process if the depth is 4."""
 
     def prepare(self, qp, tol):
         if qp.q[0] == -4:
@@ -142,7 +143,7 @@ class Murders(Exact):
 
 @dataclass(frozen=True)
 class Lax(Exact):
-    """Returns answers exactly as accurate as the tolerance."""
+    """Solver whose errors equal the tolerance."""
 
     def prepare(self, qp, tol):
         return Exact(factor=1 + tol).prepare(qp, tol)

@@ -10,7 +10,7 @@ from mortarbench.problems.fem.mesh import Mesh
 
 
 def halved(mesh: Mesh) -> Mesh:
-    """Cut every quadrilateral in two, along either diagonal in turn."""
+    """Divide every quadrilateral into two triangles, along alternating diagonals."""
     a, b, c, d = mesh.cells.T
     even = np.arange(len(mesh.cells)) % 2 == 0
     first = np.where(even, [a, b, c, c], [a, b, d, d])
@@ -20,7 +20,7 @@ def halved(mesh: Mesh) -> Mesh:
 
 
 def of_triangles(bodies: Bodies, which: NDArray[np.bool_]) -> Bodies:
-    """Assemble the same bodies, those of `which` (one for each) with halved cells."""
+    """Assemble the bodies again, with triangles in the bodies selected by `which`."""
     parts, owner = [], []
     for b in range(len(bodies.names)):
         cells = bodies.mesh.cells[bodies.body == b]

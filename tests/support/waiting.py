@@ -2,11 +2,11 @@
 
 import time
 
-LONGEST = 600.0  #: seconds until a wait is given up
+LONGEST = 600.0  #: maximum waiting time, s
 
 
 def soon(condition):
-    """Wait until a condition holds; return False if it does not in time."""
+    """Wait until a condition is true; return False after `LONGEST` seconds."""
     deadline = time.monotonic() + LONGEST
     while not (holds := condition()) and time.monotonic() < deadline:
         time.sleep(0.02)

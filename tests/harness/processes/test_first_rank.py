@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.support import ROOT, SUPPORT
-from tests.support.dying_ranks import WAYS
+from tests.support.dying_ranks import ENDINGS
 
 #: program that keeps CPUs busy until its standard input is closed
 BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]: pass"
@@ -30,7 +30,7 @@ def wrong_names(tmp_path, count, trials, seed):
 
 
 def test_the_rank_that_ended_first_is_named_however_it_ended(tmp_path):
-    assert wrong_names(tmp_path, 3, len(WAYS), seed=1) == []
+    assert wrong_names(tmp_path, 3, len(ENDINGS), seed=1) == []
 
 
 @pytest.mark.slow

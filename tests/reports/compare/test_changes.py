@@ -1,4 +1,4 @@
-"""Changes between two result folders: planted changes are found, and no others."""
+"""Changes between two result folders: only planted changes are reported."""
 
 import json
 import re
@@ -81,7 +81,7 @@ def only(c):
 # definitions
 
 
-def test_residuals_of_different_definitions_are_said_to_be_so(changed):
+def test_different_definitions_of_residuals_are_reported(changed):
     old = [replace(r, schema=1) for r in suite(1, cases=1)]
     said = "The definition of the residuals differs: journal schema 1 before, 2 after."
 
@@ -95,7 +95,7 @@ def test_residuals_of_different_definitions_are_said_to_be_so(changed):
 # times
 
 
-def test_a_planted_regression_is_found_in_the_solver_that_has_it(changed):
+def test_a_planted_regression_is_found_in_the_right_solver(changed):
     c = changed(suite(1), suite(2, two=1.2))
     means = {s: mean_ratio(c.of(s)) for s in SOLVERS}
 
@@ -111,7 +111,7 @@ def test_a_planted_regression_is_found_in_the_solver_that_has_it(changed):
     assert relative["one"].value == pytest.approx(1.2**-0.5, rel=0.05)  # of two others
 
 
-def test_the_other_way_round_it_is_an_improvement(changed):
+def test_in_reverse_order_a_regression_is_an_improvement(changed):
     one, two = suite(1), suite(2, two=1.2)
     there, back = changed(one, two), changed(two, one)
 
@@ -122,7 +122,7 @@ def test_the_other_way_round_it_is_an_improvement(changed):
 
 @pytest.mark.parametrize("repeats", [3, 5, 10])
 def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats):
-    """600 cells, 5 % nominal: 18 to 42 are within three standard deviations."""
+    """Of 600 cells, 5 % (30 ± 12 at three standard deviations) may show a change."""
     named = cells = 0
     for seed in range(0, 20, 2):
         first = suite(seed, cases=20, repeats=repeats)
@@ -135,8 +135,8 @@ def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats
 
 
 @pytest.mark.parametrize("cells", [4, 8, 30])
-def test_the_interval_over_cells_covers_as_it_says(cells):
-    """400 draws: 20 misses expected, 7 to 33 within three standard deviations."""
+def test_the_interval_over_cells_has_its_nominal_coverage(cells):
+    """Of 400 intervals, 20 should miss the truth, and 7 to 33 within three sigma."""
     rng = np.random.default_rng(cells)
     missed = sum(
         side(mean_of(rng.normal(0, 0.1, cells), [f"{i}-{n}" for n in range(cells)]))
@@ -153,11 +153,11 @@ def test_the_interval_over_cells_covers_as_it_says(cells):
      (0.6, 1.1, "not resolved"), (0.145, 4.437, "not resolved"),
      (0.0, np.inf, "not resolved")],
 )  # fmt: skip
-def test_what_a_change_by_half_may_hide_in_is_not_called_unchanged(low, high, word):
+def test_a_wide_interval_is_not_reported_as_unchanged(low, high, word):
     assert change_word(Mean(1.0, low, high, 3)) == word
 
 
-def test_cells_that_resolve_nothing_are_counted_apart(changed):
+def test_unresolved_cells_are_counted_separately(changed):
     """One of two unchanged cells scatters by a factor of ten."""
     times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
     before = [record(case=k, repeat=i) for k in times for i in range(2)]
@@ -171,7 +171,7 @@ def test_cells_that_resolve_nothing_are_counted_apart(changed):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_folder_has_nothing_to_say_about_itself(tmp_path):
+def test_comparing_a_folder_with_itself_is_reported(tmp_path):
     with Journal(tmp_path / "a", "j") as journal:
         for r in suite(1, cases=2, repeats=2):
             journal.append(r)
@@ -182,7 +182,7 @@ def test_a_folder_has_nothing_to_say_about_itself(tmp_path):
     assert said[0] in page.read_text()
 
 
-def test_folders_that_share_no_cell_are_told_so_in_one_sentence(changed):
+def test_folders_without_common_cells_get_one_sentence(changed):
     c = changed([record("one")], [record("two", case=k) for k in range(2)])
 
     (line,) = verdict_lines(c)
@@ -190,14 +190,14 @@ def test_folders_that_share_no_cell_are_told_so_in_one_sentence(changed):
     assert "1 cell before, 2 after" in line
 
 
-def test_one_repeat_in_each_folder_names_no_change_of_a_cell(changed):
+def test_single_repeats_do_not_show_changes_of_cells(changed):
     c = changed(suite(1, repeats=1), suite(2, repeats=1, two=1.2))
 
     assert all(p.ratio is None and p.change == 0 for p in c.pairs)
-    assert side(mean_ratio(c.of("two"))) == 1  # over twelve cells it can be told
+    assert side(mean_ratio(c.of("two"))) == 1  # twelve cells suffice
 
 
-def test_all_repeats_of_both_count_since_nothing_pairs_two_sessions(changed):
+def test_repeats_of_two_sessions_are_unpaired_samples(changed):
     before = [record(repeat=i) for i in range(3)]
     after = [record(repeat=i, total_seconds=0.02) for i in range(1, 5)]
     pair = only(changed(before, after))
@@ -207,7 +207,7 @@ def test_all_repeats_of_both_count_since_nothing_pairs_two_sessions(changed):
     assert pair.ratio.value == pytest.approx(2)
 
 
-def test_an_unverified_answer_has_no_time_to_compare(changed):
+def test_times_of_unverified_answers_are_not_compared(changed):
     before = [record(repeat=i) for i in range(3)]
     after = [r.replace(verdict=Verdict.WRONG, total_seconds=1e-6) for r in before]
     c = changed(before, after)
@@ -239,7 +239,7 @@ def test_sequences_are_compared_with_sequences(tmp_path):
     }  # fmt: skip
 
 
-def test_a_solver_is_not_set_against_its_own_null_arm(changed):
+def test_a_solver_is_not_compared_with_its_null_arm(changed):
     def run(seed, **slower):
         first = [r for r in suite(seed, **slower) if r.solver != "three"]
         twin = [
@@ -258,7 +258,7 @@ def test_a_solver_is_not_set_against_its_own_null_arm(changed):
 
 @pytest.fixture
 def folders(tmp_path):
-    """Write two result folders with environments; returns their paths."""
+    """Return a function that writes two result folders and returns their paths."""
 
     def make(one, two, before=None, after=None):
         for name, environment, records in (("a", one, before), ("b", two, after)):
@@ -279,7 +279,7 @@ HERE = {
 }  # fmt: skip
 
 
-def test_another_version_on_the_same_machine_is_what_one_compares(folders):
+def test_times_of_another_version_on_the_same_machine_are_compared(folders):
     other = HERE | {"digest": "e2", "versions": {"osqp": "1.1"}}
     after = suite(2, cases=4, repeats=3, two=1.5)
     said, _ = write_comparison(*folders(HERE, other, after=after), ["csv"])
@@ -292,7 +292,7 @@ def test_another_version_on_the_same_machine_is_what_one_compares(folders):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folders):
+def test_times_of_another_machine_are_not_compared(folders):
     other = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     after = suite(2, cases=4, repeats=3, one=9.0, two=9.0, three=9.0)
     a, b = folders(HERE, other, after=after)
@@ -308,7 +308,7 @@ def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folder
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
+def test_equal_environments_are_reported_with_one_machine(folders):
     busy = HERE | {"now": {"load": 3.0}}
     a, b = folders(HERE, busy)
     said, _ = write_comparison(a, b, ["md"])
@@ -319,7 +319,7 @@ def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
     assert said[0] == "The environments are the same: machine, versions and code."
 
 
-def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
+def test_unknown_environments_do_not_count_as_equal(changed):
     before = [record(repeat=i) for i in range(3)]
     other = changed(before, [r.replace(environment="e2") for r in before])
 
@@ -328,8 +328,8 @@ def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
     assert verdict_lines(other)[0].startswith("Environments differ")
 
 
-def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
-    """Half of the cells moved to a slower node: they alone have no ratio."""
+def test_cells_are_compared_only_on_the_same_cluster_node(folders):
+    """Half of the cells moved to a slower node, and only these cells have no ratio."""
     after = [
         r.replace(environment="n2", total_seconds=9.0) if r.params["n"] >= 2 else r
         for r in suite(2, cases=4, repeats=3)
@@ -371,14 +371,14 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
     assert "another QP" not in markdown(compose(changed(before, before)))
     old = [
         r.replace(qp=None) for r in before
-    ]  # a journal from before there were digests
+    ]  # a journal of an older version, without digests
     assert only(changed(old, before)).same_qp
 
 
 # verdicts, iterations, answers
 
 
-def test_lost_verdicts_are_worse_and_named_first(changed):
+def test_worse_verdicts_are_listed_first(changed):
     before = suite(1, cases=2, repeats=3)
     after = [
         r.replace(verdict=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
@@ -401,7 +401,9 @@ def test_lost_verdicts_are_worse_and_named_first(changed):
      ((7, 9, 8), (9, 11, 10), False), ((7, 9, 8), (10, 11, 10), True),
      ((7, 7, 7), (None, None, None), False)],
 )  # fmt: skip
-def test_iterations_changed_if_no_repeat_agrees(changed, before, after, changed_):
+def test_iterations_count_as_changed_if_ranges_do_not_overlap(
+    changed, before, after, changed_
+):
     one, two = (
         [record(repeat=i, iterations=n) for i, n in enumerate(counts)]
         for counts in (before, after)
@@ -414,7 +416,7 @@ def test_iterations_changed_if_no_repeat_agrees(changed, before, after, changed_
     [
         (-1234.5 * (1 + 1e-6), Verdict.VERIFIED, False),  # within 4 · 10 · tol
         (-1234.5 * (1 + 1e-4), Verdict.VERIFIED, True),
-        (-1000.0, Verdict.WRONG, False),  # no answer at all
+        (-1000.0, Verdict.WRONG, False),  # refuted answers are not compared
     ],
 )
 def test_verified_answers_that_differ_are_named(changed, energy, status, other):
@@ -425,14 +427,14 @@ def test_verified_answers_that_differ_are_named(changed, energy, status, other):
     assert any("different answers" in line for line in verdict_lines(c)) is other
 
 
-def test_objectives_stand_in_where_there_is_no_energy(changed):
+def test_objectives_are_compared_if_there_is_no_energy(changed):
     one = record(quantities={}, objective=-0.5)
     assert only(changed([one], [one.replace(objective=-0.6)])).other_answer
     zero = one.replace(objective=1e-25)
     assert not only(changed([zero], [zero.replace(objective=3e-25)])).other_answer
 
 
-def test_cells_in_one_folder_only_are_listed_not_compared(changed):
+def test_cells_in_one_folder_only_are_listed_separately(changed):
     c = changed([record(), record("gone")], [record(), record("new"), record(case=1)])
     page = markdown(compose(c))
 
@@ -447,7 +449,7 @@ def test_cells_in_one_folder_only_are_listed_not_compared(changed):
 # files
 
 
-def test_all_formats_are_written_beside_the_later_report_the_same_each_time(folders):
+def test_all_formats_are_written_with_reproducible_bytes(folders):
     a, b = folders(HERE, HERE)
     formats = ["html", "md", "tex", "csv", "parquet"]
     _, written = write_comparison(a, b, formats)
@@ -467,7 +469,7 @@ def test_all_formats_are_written_beside_the_later_report_the_same_each_time(fold
     np.testing.assert_allclose(one.ratio, two.ratio, rtol=1e-12)
 
 
-def test_verdicts_are_those_at_the_factor(folders):
+def test_verdicts_are_recomputed_at_the_factor(folders):
     before = [record(repeat=i, dual=5e-7) for i in range(3)]
     after = [record(repeat=i, dual=5e-6) for i in range(3)]
     a, b = folders(HERE, HERE, before, after)
@@ -478,7 +480,7 @@ def test_verdicts_are_those_at_the_factor(folders):
         assert f"Verdicts at 1 × tolerance: {found}" in " ".join(said)
 
 
-def test_a_folder_that_is_none_is_refused(folders, tmp_path):
+def test_a_missing_folder_is_refused(folders, tmp_path):
     a, _ = folders(HERE, HERE)
     with pytest.raises(InputError, match="no such folder"):
         write_comparison(a, tmp_path / "none", ["csv"])
@@ -486,7 +488,7 @@ def test_a_folder_that_is_none_is_refused(folders, tmp_path):
         write_comparison(tmp_path / "none", a, ["csv"])
 
 
-def test_a_canary_that_moved_says_that_the_machine_did(changed):
+def test_a_change_of_the_canary_is_attributed_to_the_machine(changed):
     before = suite(1)
     after = [
         replace(r, canary_seconds=1.1 * r.canary_seconds)
@@ -499,17 +501,18 @@ def test_a_canary_that_moved_says_that_the_machine_did(changed):
     assert rows["canary"][2].value == pytest.approx(1.1, rel=0.01)
     assert rows["canary"][3].text == rows["all"][3].text == "slower"
     assert any(
-        line.startswith("All solvers changed alike") for line in verdict_lines(c)
+        line.startswith("The times of all solvers changed alike")
+        for line in verdict_lines(c)
     )
     assert all(side(relative_ratio(c, s)) == 0 for s in SOLVERS)
 
 
-def test_a_change_of_one_solver_is_not_blamed_on_the_machine(changed):
+def test_a_change_of_one_solver_is_not_attributed_to_the_machine(changed):
     c = changed(suite(1), suite(2, two=1.5))
     assert not any("changed alike" in line for line in verdict_lines(c))
 
 
-def test_a_busy_machine_is_warned_of(folders):
+def test_a_busy_machine_causes_a_warning(folders):
     busy = HERE | {"now": {"load": 3.0}}
     said, _ = write_comparison(*folders(HERE, busy), ["csv"])
     assert said[1].startswith("Warning: the machine was not idle")
@@ -519,8 +522,8 @@ def test_a_busy_machine_is_warned_of(folders):
 # campaigns
 
 
-def test_an_environment_with_a_plug_in_that_another_lacks_is_no_other(folders):
-    """A plug-in changes no time of a solver that is ours; its own content does."""
+def test_an_additional_plug_in_keeps_times_comparable(folders):
+    """An additional plug-in does not affect times; a change of its content does."""
     admm, other = (
         HERE | {"digest": d, "plugins": {"admm.py": sha}}
         for d, sha in (("e2", "aaa"), ("e3", "bbb"))
@@ -583,7 +586,7 @@ def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
     assert any("two on box/n=1/dual" in line for line in found.said)
 
 
-def test_a_gate_without_verified_answers_of_a_solver_names_it(folders):
+def test_fail_on_names_solvers_without_verified_answers(folders):
     """One of the two solvers is wrong on all cases of the later folder."""
     pair = [r for r in suite(2, cases=4, repeats=3) if r.solver in ("one", "two")]
     spoilt = [
@@ -598,7 +601,7 @@ def test_a_gate_without_verified_answers_of_a_solver_names_it(folders):
     )
 
 
-def test_a_gate_that_cannot_judge_times_and_finds_nothing_worse_says_so(folders):
+def test_fail_on_slower_is_refused_if_times_cannot_be_judged(folders):
     slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     a, b = folders(HERE, slow)
     with pytest.raises(InputError, match=r"fail-on slower: .* no cell was measured on"):

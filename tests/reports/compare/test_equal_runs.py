@@ -1,4 +1,4 @@
-"""Twenty pairs of real runs of one suite: at most one may raise an alarm."""
+"""False alarms in twenty pairs of real runs of one suite: at most one is allowed."""
 
 import pytest
 
@@ -22,7 +22,7 @@ zip = [["lower", "upper"]]
 
 
 @pytest.mark.slow  # forty runs, ten minutes
-def test_of_twenty_pairs_of_equal_runs_at_most_one_is_slower(tmp_path):
+def test_at_most_one_of_twenty_pairs_of_equal_runs_is_slower(tmp_path):
     (tmp_path / "equal.toml").write_text(SUITE)
     for number in range(40):
         mb.run(tmp_path / "equal.toml", out=tmp_path / f"{number}")

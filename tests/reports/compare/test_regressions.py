@@ -1,4 +1,4 @@
-"""Failures of a CI: at most one false alarm in twenty, and detected regressions."""
+"""Regressions that fail a CI job: detection, and false alarms in at most 5 %."""
 
 from dataclasses import replace
 
@@ -26,9 +26,11 @@ def record(solver, case, repeat, seconds, **changes):
 
 
 def session(rng, name, *, draw, cases=8, repeats=4, slower=None, solvers=SOLVERS):
-    """Measure once; what slows the session, a case or a block down is common to all.
+    """Return the records of a session.
 
-    draw : logarithms that scatter by about one tenth, of a shape
+    Slowdowns of the session, of a case or of a block affect all solvers alike.
+
+    draw : function that returns logarithms with a scatter of about one tenth
     slower : factors by solver, or by solver and case
     """
     slower = slower or {}
@@ -63,20 +65,20 @@ def normal(rng):
 
 
 def heavy(rng):
-    """Student's with three degrees of freedom."""
+    """Draw from Student's distribution with three degrees of freedom."""
     return 0.1 * rng.standard_t(3) / np.sqrt(3)
 
 
 def skewed(rng):
-    """Nothing most of the time, and now and then half as long again."""
+    """Draw mostly zeros, and occasionally an increase by about a half."""
     return rng.exponential(0.1) + 0.4 * (rng.random() < 0.05)
 
 
 @pytest.mark.parametrize(
     ("draw", "shape"), [(normal, (8, 3, 3)), (heavy, (10, 3, 2)), (skewed, (3, 2, 2))]
 )
-def test_equal_runs_alarm_at_most_once_in_twenty(changed, draw, shape):
-    """No more often than is likely where every twentieth pair of runs alarms."""
+def test_equal_runs_cause_at_most_five_percent_of_alarms(changed, draw, shape):
+    """The number of alarms is consistent with an error probability of 5 %."""
     cases, repeats, solvers = shape
     rng = np.random.default_rng(662607)
     shape = dict(cases=cases, repeats=repeats, solvers=SOLVERS[:solvers])
@@ -92,10 +94,10 @@ def test_equal_runs_alarm_at_most_once_in_twenty(changed, draw, shape):
         )
         for _ in range(pairs)
     )
-    assert bdtrc(alarms - 1, pairs, 0.05) > 0.01  # as many, or more, by chance
+    assert bdtrc(alarms - 1, pairs, 0.05) > 0.01  # P(at least as many by chance)
 
 
-def test_a_solver_that_takes_half_as_long_again_is_found_and_nobody_else(changed):
+def test_only_the_solver_that_is_fifty_percent_slower_is_found(changed):
     rng = np.random.default_rng(314159)
     slower = session(rng, "b", draw=normal, slower={"two": 1.5})
     c = changed(session(rng, "a", draw=normal), slower)
@@ -111,7 +113,7 @@ def test_a_solver_that_takes_half_as_long_again_is_found_and_nobody_else(changed
     assert "two" not in {one.solver for one in back}
 
 
-def test_a_single_case_that_takes_much_longer_is_found_by_itself(changed):
+def test_a_single_much_slower_case_is_found(changed):
     rng = np.random.default_rng(141421)
     after = session(rng, "b", draw=normal, slower={("two", 3): 4.0})
     found = regressions(changed(session(rng, "a", draw=normal), after)).slower
@@ -119,7 +121,7 @@ def test_a_single_case_that_takes_much_longer_is_found_by_itself(changed):
     assert [(one.solver, one.case) for one in found] == [("two", "box/n=3/dual")]
 
 
-def test_what_slows_all_solvers_down_is_the_machine(changed):
+def test_a_slowdown_of_all_solvers_is_attributed_to_the_machine(changed):
     rng = np.random.default_rng(271828)
     twice = dict.fromkeys(SOLVERS, 2.0)
     c = changed(
@@ -128,7 +130,7 @@ def test_what_slows_all_solvers_down_is_the_machine(changed):
     assert not regressions(c).slower
 
 
-def test_who_only_falls_behind_others_that_became_faster_is_not_slower(changed):
+def test_a_solver_is_not_slower_because_others_became_faster(changed):
     rng = np.random.default_rng(173205)
     faster = {"two": 0.3, "three": 0.3}
     c = changed(
@@ -137,7 +139,7 @@ def test_who_only_falls_behind_others_that_became_faster_is_not_slower(changed):
     assert not regressions(c).slower
 
 
-def test_the_more_folders_are_compared_the_wider_are_the_intervals(changed):
+def test_intervals_widen_with_the_number_of_compared_folders(changed):
     rng = np.random.default_rng(223606)
     after = session(rng, "b", draw=normal, slower={"two": 2.0})
     c = changed(session(rng, "a", draw=normal), after)
@@ -148,7 +150,7 @@ def test_the_more_folders_are_compared_the_wider_are_the_intervals(changed):
     assert many.ratio.high > one.ratio.high
 
 
-def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
+def test_the_reason_is_reported_if_nothing_can_be_judged(changed, tmp_path):
     rng = np.random.default_rng(244948)
 
     def why(after_too=lambda made: made, **shape):
@@ -186,9 +188,7 @@ def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
     assert why(cases=3) == ""
 
 
-def test_a_solver_without_a_verified_answer_is_named_beside_what_is_judged(
-    changed, tmp_path
-):
+def test_a_solver_without_a_verified_answer_is_named(changed, tmp_path):
     rng = np.random.default_rng(141421)
     before, after = (session(rng, name, draw=normal) for name in "ab")
     spoilt = [

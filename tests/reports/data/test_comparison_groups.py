@@ -1,4 +1,4 @@
-"""From records to the sections on means, ranks, profiles, ratios, growth and claims."""
+"""Sections on means, ranks, profiles, ratios, growth and claims, from records."""
 
 import re
 from dataclasses import replace
@@ -54,7 +54,7 @@ def rows(table):
 
 
 def some_records(record, solvers, cases=6):
-    """Solver k takes k + 1 times as long as the first, on every case."""
+    """Return records in which solver k takes k + 1 times as long as the first one."""
     return [
         record(f"s{k:02d}", case, (k + 1) * 0.01 * (case + 1))
         for k in range(solvers)
@@ -71,7 +71,7 @@ ELSEWHERE = "of cases, for the reasons given under “Means over cases”."
 
 
 def over_cases(page):
-    """The sections over cases, all of which are there."""
+    """Return the sections over cases, and assert that none is missing."""
     found = {s.name: s for s in page.sections}
     return [found[name] for name in OVER_CASES]
 
@@ -80,7 +80,7 @@ def over_cases(page):
     ("solvers", "cases", "said"),
     [(3, 5, "dual, tol 1e-6: 5 cases."), (1, 6, "dual, tol 1e-6: 1 solver.")],
 )
-def test_fewer_than_six_cases_or_one_solver_make_no_statement_and_it_is_said(
+def test_fewer_than_six_cases_or_two_solvers_are_not_compared(
     record, evidence, solvers, cases, said
 ):
     page = compose(evidence(some_records(record, solvers, cases=cases)))
@@ -97,7 +97,7 @@ def test_fewer_than_six_cases_or_one_solver_make_no_statement_and_it_is_said(
 
 
 def of_two_forms(record, primal):
-    """Three dual cases and some primal ones; b takes three times as long as a."""
+    """Return records of dual and primal cases on which b takes three times as long."""
     return [
         record(s, case, seconds, form=form)
         for s, seconds in (("a", 0.1), ("b", 0.3))
@@ -106,7 +106,7 @@ def of_two_forms(record, primal):
     ]
 
 
-def test_forms_with_few_cases_are_named_with_how_to_put_them_together(record, evidence):
+def test_forms_with_few_cases_are_named_with_the_pooling_option(record, evidence):
     sections = over_cases(compose(evidence(of_two_forms(record, 3))))
     ((text,), *others) = (section.prose for section in sections)
     assert "dual, tol 1e-6: 3 cases; primal, tol 1e-6: 3 cases." in text
@@ -114,9 +114,7 @@ def test_forms_with_few_cases_are_named_with_how_to_put_them_together(record, ev
     assert set(others) == {(f"Nothing is compared here: 2 groups {ELSEWHERE}",)}
 
 
-def test_a_form_that_is_left_out_is_named_beside_those_that_are_compared(
-    record, evidence
-):
+def test_forms_that_are_not_compared_are_named(record, evidence):
     for section in over_cases(compose(evidence(of_two_forms(record, 6)))):
         assert len(section.tables) == 1
         is_first = section.name == "means"
@@ -125,7 +123,7 @@ def test_a_form_that_is_left_out_is_named_beside_those_that_are_compared(
 
 
 def test_pooled_forms_are_cases_of_one_group(record, evidence):
-    """Equal times on all cases have that mean, whatever the forms."""
+    """If the times on all cases of all forms are equal, the mean equals them."""
     page = compose(evidence(of_two_forms(record, 3)), pool_forms=True)
     for section in over_cases(page):
         assert len(section.tables) == 1
@@ -136,9 +134,7 @@ def test_pooled_forms_are_cases_of_one_group(record, evidence):
     assert not any("--pool-forms" in text for s in page.sections for text in s.prose)
 
 
-def test_a_form_that_a_solver_declines_is_unsolved_by_it_where_forms_are_pooled(
-    record, evidence
-):
+def test_declined_forms_count_as_unsolved_if_forms_are_pooled(record, evidence):
     records = [
         r for r in of_two_forms(record, 3) if (r.solver, r.form) != ("b", "dual")
     ]
@@ -151,7 +147,7 @@ def test_a_form_that_a_solver_declines_is_unsolved_by_it_where_forms_are_pooled(
     assert dict(found.forms) == {"dual": 3, "primal": 3}
 
 
-def test_what_a_report_does_not_show_is_named_with_what_it_needs(record, evidence):
+def test_missing_sections_are_named_with_their_requirements(record, evidence):
     page = compose(evidence(some_records(record, 2)))
     (absent,) = (s for s in page.sections if s.name == "absent")
     shown = {s.title for s in page.sections}
@@ -161,7 +157,7 @@ def test_what_a_report_does_not_show_is_named_with_what_it_needs(record, evidenc
     assert {s.name for s in page.sections[-2:]} == {"environment", "definitions"}
 
 
-def test_forms_tolerances_and_modes_are_compared_apart(record, evidence):
+def test_forms_tolerances_and_modes_are_compared_separately(record, evidence):
     records = [
         record(s, case, form=form, tol=tol)
         for s in "ab"
@@ -197,15 +193,13 @@ def test_times_are_medians_of_answers_that_every_repeat_verified(record, evidenc
     assert np.isinf(found.claimed[:, 1]).tolist() == [False] * 5 + [True]
 
 
-def test_null_arms_do_not_take_part(record, evidence):
+def test_null_arms_are_not_compared(record, evidence):
     null = [record("a (A/A)", case, 1e-4, role="null") for case in range(6)]
     (found,) = comparison_groups(evidence([*some_records(record, 2), *null]))
     assert found.solvers == ("s00", "s01")
 
 
-def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
-    record, evidence
-):
+def test_a_solver_that_declines_all_cases_is_not_compared(record, evidence):
     def declined(solver, case):
         return record(solver, case, None, verdict=Verdict.DECLINED, claimed=None)
 
@@ -219,7 +213,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     assert found.notes == ("Solvers that declined all cases: never.",)
 
 
-def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
+def test_cases_with_missing_measurements_are_left_out(record, evidence):
     records = some_records(record, 2, cases=8) + [
         record("late", case) for case in range(6)
     ]
@@ -233,7 +227,7 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
     )
 
 
-def test_of_a_sweep_the_cheapest_verified_answer_counts(record, evidence):
+def test_the_fastest_verified_answer_of_a_sweep_is_used(record, evidence):
     records = [
         record(s, case, seconds * (2 if s == "b" else 1), tol=tol, accuracy=1e-6,
                verdict=status)
@@ -270,7 +264,7 @@ def test_a_time_limit_is_censored_and_a_refuted_answer_is_not(record, evidence):
     assert cell["mean up to the limit"].after == "2 out of time, 2 never"
 
 
-def test_a_cell_that_was_late_once_is_late(record, evidence):
+def test_one_time_limit_makes_a_cell_late(record, evidence):
     late = dict(verdict=Verdict.TIME_LIMIT, claimed=None, seconds=None)
     records = some_records(record, 2)
     records += [record("z", case, repeat=i) for case in range(6) for i in range(2)]
@@ -292,7 +286,7 @@ def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
     assert found["s01"]["P(best)"].text == "0"
 
 
-def test_few_cases_that_both_solved_make_no_ratio(record, evidence):
+def test_a_ratio_needs_enough_cases_that_both_solved(record, evidence):
     some = [
         record(
             "some", case, 1.0, verdict=Verdict.WRONG if case > 4 else Verdict.VERIFIED
@@ -314,7 +308,9 @@ def test_a_solver_that_solves_nothing_has_no_mean(record, evidence):
     assert shares["at all"].value == 0
 
 
-def test_a_liar_is_named_as_depending_on_the_convention(record, evidence):
+def test_the_rank_of_a_solver_with_false_claims_depends_on_the_convention(
+    record, evidence
+):
     liar = [record("liar", case, 1e-4, verdict=Verdict.WRONG) for case in range(6)]
     found = section(compose(evidence([*some_records(record, 2), *liar])), "ranking")
     cells = rows(found.tables[0])
@@ -324,7 +320,7 @@ def test_a_liar_is_named_as_depending_on_the_convention(record, evidence):
     assert cells["liar"]["all"].text == "1–3"
     assert cells["liar"]["reading"].text == "depends on the convention"
     assert (
-        "reverse the order of 2 pairs, 2 of them significantly different"
+        "reverse the order of 2 pairs, of which 2 differ significantly"
         in found.points[0]
     )
 
@@ -345,7 +341,7 @@ def test_equal_solvers_are_ties(record, evidence):
     assert all("not significant" in row["reading"].text for row in cells)
 
 
-def test_ranks_that_nothing_changes_are_said_to_be_so(record, evidence):
+def test_ranks_that_no_convention_changes_are_reported(record, evidence):
     found = section(compose(evidence(some_records(record, 2))), "ranking")
     assert found.points[0].endswith(
         "1 of 1 pair significantly different; no convention reverses the order of a "
@@ -376,10 +372,10 @@ def test_the_sections_render(record, evidence):
 
 
 @pytest.mark.parametrize("count", [2, 7, 20, pytest.param(50, marks=pytest.mark.slow)])
-def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
+def test_solvers_are_distinguishable_in_every_row_of_profiles(record, evidence, count):
     records = [
         record(f"s{k:02d}", case, (1 + (k % 6) + k / 100) * 0.01 * (case + 1))
-        for k in range(count)  # solvers of one colour are next to each other
+        for k in range(count)  # solvers of equal colour are neighbours
         for case in range(6)
     ]
     found = evidence(records)
@@ -400,7 +396,7 @@ def test_every_row_of_profiles_tells_its_solvers_apart(record, evidence, count):
     assert sorted(named) == sorted(one.group.solvers[i] for i in shown)
 
 
-def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
+def test_pairwise_panels_compare_the_leader_with_the_next_solvers(record, evidence):
     found = evidence(some_records(record, 5))
     (one,) = map(ranking_of, comparison_groups(found))
     figure = draw(pairwise_figure(one, found.solvers))
@@ -410,13 +406,13 @@ def test_the_leader_meets_each_of_the_next_in_a_panel_of_two(record, evidence):
         ends = [float(line.get_ydata()[-1]) for line in axes.lines]
         starts = [float(line.get_ydata()[0]) for line in axes.lines]
         assert ends == [1, 1]
-        assert starts == [0, 1]  # the rival is never the better one, the leader always
+        assert starts == [0, 1]  # the leader is faster than the rival on every case
 
 
 @pytest.mark.parametrize(
     ("solvers", "cases", "bands"), [(2, 6, 2), (3, 6, 0), (3, 20, 3)]
 )
-def test_bands_are_drawn_where_they_do_not_hide_each_other(
+def test_bands_are_drawn_if_they_do_not_overlap_too_much(
     record, evidence, solvers, cases, bands
 ):
     found = evidence(some_records(record, solvers, cases=cases))
@@ -435,7 +431,7 @@ def test_two_solvers_need_no_pictures_of_pairs(record, evidence):
 # ---- ratios within blocks
 
 
-def test_what_slows_a_block_down_cancels_in_its_ratios(record, evidence):
+def test_a_slowdown_of_a_block_cancels_in_ratios(record, evidence):
     slow = [1.0, 10.0, 3.0, 1.5]
     records = [
         record(s, 0, factor * load, repeat)
@@ -446,7 +442,7 @@ def test_what_slows_a_block_down_cancels_in_its_ratios(record, evidence):
     assert [cell.text for cell in row[2:]] == ["1", "2.00 [2.00, 2.00]"]
 
 
-def test_ratios_that_hold_one_are_ties(record, evidence):
+def test_ratios_whose_interval_contains_one_are_ties(record, evidence):
     noise = [1.1, 0.9, 1.05, 0.97]
     records = [record("a", 0, 0.01, i) for i in range(4)]
     records += [record("b", 0, 0.0101 * e, i) for i, e in enumerate(noise)]
@@ -463,7 +459,7 @@ def test_single_runs_have_no_ratios(record, evidence):
 # ---- growth
 
 
-def test_growth_is_told_from_none_and_predictions_end_with_the_sizes(record, evidence):
+def test_growth_is_detected_and_not_predicted_beyond_the_sizes(record, evidence):
     def sized(solver, power, cases):
         return [
             record(solver, c, 1e-6 * (c + 1) ** 1.5,
@@ -491,7 +487,7 @@ def test_three_sizes_have_no_section_on_growth(record, evidence):
     assert section(page, "growth") is None
 
 
-def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
+def test_each_step_type_has_its_own_exponent(record, evidence):
     def counts(n):
         return {
             "outer": 3,
@@ -513,7 +509,7 @@ def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
     assert found["cg"]["n = 6400"].value == 72
 
 
-def test_one_mesh_torn_more_or_less_finely_has_a_table_of_its_own(record, evidence):
+def test_decompositions_of_one_mesh_have_a_separate_table(record, evidence):
     records = [
         record("s", cells, 1.0, counts={"P_products": 10 + cells}).replace(
             case=f"toy/Nr=3/feti={cells}/dual", params={"Nr": 3, "feti": cells},
@@ -537,7 +533,7 @@ def test_without_counts_there_is_no_section_on_steps(record, evidence):
 # ---- claims
 
 
-def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
+def test_claims_and_verdicts_are_counted_in_one_table(record, evidence):
     ends = [
         dict(),
         dict(verdict=Verdict.WRONG),
@@ -562,7 +558,9 @@ def test_one_refuted_repeat_refutes_the_claim(record, evidence):
 # ---- the whole way
 
 
-def test_hostile_names_reach_no_markup_and_pages_repeat(record, tmp_path, svg_only):
+def test_hostile_names_are_escaped_and_pages_are_reproducible(
+    record, tmp_path, svg_only
+):
     names = (
         "<script>x</script>",
         r"\input{a}$^_#&%",
@@ -598,7 +596,7 @@ def test_hostile_names_reach_no_markup_and_pages_repeat(record, tmp_path, svg_on
             assert not re.search(r"[#%]|\\input|U\+03", bare), line
 
 
-def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
+def test_a_lone_surrogate_in_a_name_is_accepted(record, evidence):
     records = [record(s, case) for s in ("a\ud800", "b") for case in range(6)]
     (found,) = comparison_groups(evidence(records))
     assert set(found.solvers) == {"a\ud800", "b"}
@@ -608,7 +606,7 @@ def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
     }  # fmt: skip
 
 
-def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
+def test_the_table_contests_contains_the_ratios_of_profiles(record, evidence):
     records = some_records(record, 2)
     records[0] = records[0].replace(verdict=Verdict.WRONG)
     sheet = csv_tables(evidence(records))["contests"]
@@ -620,7 +618,7 @@ def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, eviden
     assert set(sheet["contest"]) == {"dual, tol 1e-6"}
 
 
-def test_the_sheet_of_means_holds_every_convention(record, evidence):
+def test_the_table_means_contains_every_convention(record, evidence):
     sheet = csv_tables(evidence(some_records(record, 3)))["means"]
     assert len(sheet) == 3 * 19  # 18 combinations and the common cases
     usual = sheet[(sheet["shift"] == 1) & (sheet["penalty"] == 3)
@@ -634,7 +632,10 @@ def test_the_sheet_of_means_holds_every_convention(record, evidence):
 
 
 def of_two_sessions(record, factor, scatter=0.002, cases=8):
-    """Measure b beside a, and c in another session; both take `factor` as long."""
+    """Return records of a and b in one session and of c in another one.
+
+    factor : time of b and of c, relative to the time of a
+    """
     rng = np.random.default_rng(577215)
     return [
         record(
@@ -647,9 +648,7 @@ def of_two_sessions(record, factor, scatter=0.002, cases=8):
     ]  # fmt: skip
 
 
-def test_of_different_sessions_only_what_intervals_tell_on_every_case_is_ranked(
-    evidence, record
-):
+def test_sessions_are_ranked_by_unpaired_intervals_on_every_case(evidence, record):
     for factor, told in ((1.1, True), (1.0015, False)):
         (group,) = comparison_groups(evidence(of_two_sessions(record, factor)))
         faster = ranking_of(group).faster
@@ -664,7 +663,7 @@ def test_of_different_sessions_only_what_intervals_tell_on_every_case_is_ranked(
     assert group.apart.size == 0
 
 
-def test_who_was_measured_in_another_session_is_named_and_marked(evidence, record):
+def test_solvers_of_another_session_are_named_and_marked(evidence, record):
     said = markdown(compose(evidence(of_two_sessions(record, 1.1))))
 
     assert (
@@ -675,7 +674,7 @@ def test_who_was_measured_in_another_session_is_named_and_marked(evidence, recor
     assert said.count("unpaired") >= 8
 
 
-def test_what_a_sequence_took_in_two_sessions_is_paired_with_nothing_else():
+def test_sequences_of_two_sessions_are_not_paired():
     a, b = {("s", 0): 1.0, ("s", 1): 1.1}, {("s", 0): 2.0, ("s t", 1): 2.2}
 
     assert paired_ratio(a, b) is None
@@ -683,7 +682,7 @@ def test_what_a_sequence_took_in_two_sessions_is_paired_with_nothing_else():
 
 
 def test_an_unpaired_interval_is_welchs():
-    """Against scipy's, on samples of different scatter and number."""
+    """The interval equals scipy's, for samples of different scatter and size."""
     from scipy.stats import ttest_ind
 
     rng = np.random.default_rng(16180)

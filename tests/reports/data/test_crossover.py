@@ -1,4 +1,4 @@
-"""Crossover maps: routes, charged times, crossover sizes and reasons to stop."""
+"""Crossover maps: routes, times, crossover sizes and ends of routes."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ from tests.support.box_records import box_record
 
 PRIMAL, DUAL = Route("primal", "", 1), Route("dual", "", 1)
 TFETI, RANKS = Route("TFETI", "feti=4", 1), Route("TFETI", "feti=4", 2)
-SIZES = (9, 19, 39, 79)  # of the box: 1000, 2000, 4000 and 8000 dofs
+SIZES = (9, 19, 39, 79)  # parameter n of the box: 1000, 2000, 4000 and 8000 dofs
 
 
 def record(solver, n, build, total, repeat=0, form="dual", feti=0, **changes):
@@ -34,7 +34,11 @@ def record(solver, n, build, total, repeat=0, form="dual", feti=0, **changes):
 
 
 def measured(repeats=3):
-    """Primal costs n², dual 20 s and n/10, TFETI stops; a is fast, b slow."""
+    """Return records of three routes and two solvers.
+
+    The primal route takes a time proportional to n², the dual route takes 20 s + n/10,
+    and TFETI ends early. Solver a is faster than solver b.
+    """
     for n in SIZES:
         for i in range(repeats):
             noise = 1 + 0.01 * i
@@ -55,7 +59,7 @@ def evidence(tmp_path):
     return lambda records: Evidence(directory=tmp_path, records=arrange(records))
 
 
-def test_everything_from_the_mesh_to_the_recovered_answer_is_charged():
+def test_the_time_includes_all_work_from_mesh_to_recovered_answer():
     r = record("a", 9, 3.0, 4.0)
     assert charged_seconds(r) == 8.0
     assert charged_seconds(r.replace(recover_seconds=None)) is None
@@ -97,7 +101,7 @@ def test_single_runs_are_never_called_faster(evidence):
     assert one.crossover(DUAL, PRIMAL).pays is None
 
 
-def test_every_end_has_its_reason(evidence):
+def test_every_end_of_a_route_has_a_reason(evidence):
     (one,) = crossover_maps(evidence(measured()))
 
     stops = {route: (stop.dofs, stop.verdict) for route, stop in one.stops.items()}
@@ -139,14 +143,17 @@ def test_the_figure_has_a_line_per_route_and_its_measurements(evidence):
     assert all(len(series.runs) == len(series.x) for series in time.marks)
 
 
-def test_letters_of_lines_that_end_together_share_a_place(evidence):
+def test_letters_of_lines_with_the_same_end_are_joined(evidence):
     """TFETI ends at 1000 dofs with 3 s on one rank (m) and on two (?)."""
     maps = crossover_maps(evidence(measured()))
     (text,) = crossover_figure(maps, 120, 8192).panels[0].texts
     assert (text.text, text.place) == ("?, m", (1000, pytest.approx(3.0)))
 
 
-def test_the_section_opens_with_the_answer(evidence):
-    """TFETI ends at 1000 dofs, and does not count."""
+def test_the_section_starts_with_the_crossover_sizes(evidence):
+    """TFETI ends at 1000 dofs and is not considered."""
     first = crossover(Analysis(evidence(measured()))).prose[0]
-    assert first.endswith("the route “primal” is “dual”, from 2000 dofs on.")
+    assert first.endswith(
+        "from 2000 dofs on, the route “dual” is significantly faster than the route "
+        "“primal”."
+    )

@@ -1,4 +1,4 @@
-"""Strong and weak scaling and their model, of records whose times are manufactured."""
+"""Strong and weak scaling and the cost model, from records with manufactured times."""
 
 from pathlib import Path
 
@@ -57,7 +57,7 @@ def strong(manufactured):
 
 
 @pytest.mark.parametrize("n", [2, 4])
-def test_speed_up_is_the_time_on_one_rank_over_that_on_several(strong, n):
+def test_speed_up_is_the_ratio_of_times_on_one_and_several_ranks(strong, n):
     true = solve_seconds(DOFS, 1) / solve_seconds(DOFS, n)
     assert strong.speed_up(n, "solve").value == pytest.approx(true)
     assert strong.efficiency(n, "solve").value == pytest.approx(true / n)
@@ -65,15 +65,15 @@ def test_speed_up_is_the_time_on_one_rank_over_that_on_several(strong, n):
 
 
 @pytest.mark.parametrize("n", [2, 4])
-def test_copies_reach_as_much_as_their_slow_down_leaves(strong, n):
+def test_copies_show_the_slowdown_of_simultaneous_solves(strong, n):
     assert strong.reach(n, "solve").value == pytest.approx(n / SLOWDOWN)
     true = copies_seconds(DOFS) / (n * solve_seconds(DOFS, n))
     assert strong.against_copies(n, "solve").value == pytest.approx(true)
-    # preparing shares all and is as slow as copies are: as good as independent
+    # ranks share all work of the preparation and are as slow as copies
     assert strong.against_copies(n, "prepare").value == pytest.approx(1.0)
 
 
-def test_equal_times_have_no_interval_and_scattered_ones_hold_the_truth(strong):
+def test_intervals_of_scattered_times_contain_the_true_speed_up(strong):
     at = strong.speed_up(2, "solve")
     assert at.low == pytest.approx(at.high)
     noisy = evidence(rank_records(sizes=[DOFS], repeats=8, scatter=0.03))
@@ -82,7 +82,7 @@ def test_equal_times_have_no_interval_and_scattered_ones_hold_the_truth(strong):
     assert at.low < solve_seconds(DOFS, 1) / solve_seconds(DOFS, 4) < at.high
 
 
-def test_one_run_has_a_value_and_no_interval():
+def test_the_interval_of_a_single_run_has_zero_width():
     (series,) = strong_series(evidence(rank_records(sizes=[DOFS], repeats=1)))
     assert series.speed_up(2, "solve").samples == 1
     assert series.model.speed_up(8).samples == 1
@@ -101,7 +101,7 @@ def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
     )
 
 
-def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
+def test_the_model_ignores_ranks_that_shared_a_cpu():
     slow = [
         r.replace(solve_seconds=10 * r.solve_seconds) if r.ranks == 4 else r
         for r in rank_records(sizes=[DOFS])
@@ -114,7 +114,7 @@ def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
     )
 
 
-def test_records_that_do_not_say_what_was_sent_have_no_model():
+def test_records_without_message_counts_have_no_model():
     silent = (r.replace(rank_counts={}) for r in rank_records(sizes=[DOFS]))
     (series,) = strong_series(evidence(silent))
     assert series.model is None
@@ -129,14 +129,14 @@ def test_records_that_do_not_say_what_was_sent_have_no_model():
         {"solve_seconds": None},
     ],
 )
-def test_records_with_other_entries_have_no_model_either(change):
+def test_records_with_invalid_entries_have_no_model(change):
     records = [r.replace(**change) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
     assert series.model is None
     assert ranks(Analysis(evidence(records))).name == "ranks"
 
 
-def test_a_network_may_be_told_of_more_than_the_model_takes():
+def test_further_network_data_are_ignored():
     records = [
         r.replace(rank_network={**r.rank_network, "hops": (1.0, 1.0)})
         if r.ranks > 1
@@ -147,7 +147,7 @@ def test_a_network_may_be_told_of_more_than_the_model_takes():
     assert series.model.work == pytest.approx(WORK * DOFS)
 
 
-def test_memory_that_is_no_number_is_not_known():
+def test_memory_that_is_not_a_number_is_unknown():
     words = {"rank_peak_mib_mean": "much", "rank_peak_mib_largest": "more"}
     records = [r.replace(reported=words) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
@@ -169,7 +169,7 @@ def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(manufactured):
     assert of.value == pytest.approx(copies_seconds(50_000) / solve_seconds(200_000, 4))
 
 
-def test_cases_of_other_sizes_are_no_weak_scaling():
+def test_cases_of_other_sizes_are_not_weak_scaling():
     found = weak_series(evidence(rank_records(sizes=[50_000, 120_000, 150_000])))
     assert found == []
 
@@ -193,12 +193,12 @@ def test_parts_are_medians_of_means_and_of_the_largest(strong):
     assert rank_memory(strong.answers[1]) is None
 
 
-def test_copies_are_no_solver_of_a_series_of_sizes(manufactured):
+def test_copies_do_not_appear_in_series_of_sizes(manufactured):
     (series,) = size_series(manufactured)
     assert not any("copies" in solver for solver in series.solvers)
 
 
-def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
+def test_the_section_separates_model_and_measurements(
     manufactured,
 ):
     section = ranks(Analysis(manufactured))
@@ -221,8 +221,8 @@ def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
     assert all("not measured" in caption for caption in told)
 
 
-def test_a_model_that_does_not_fit_is_not_asked_about_more_ranks():
-    worse = (  # slower on two ranks than the model can be on any
+def test_a_model_with_a_large_misfit_makes_no_predictions():
+    worse = (  # slower on two ranks than any time of the model
         r.replace(solve_seconds=9 * r.solve_seconds)
         if r.ranks == 2 and not r.role
         else r
@@ -238,7 +238,7 @@ def test_no_more_ranks_than_subdomains_are_predicted(strong):
     assert predicted(strong) == (8, 16, 32, 64)
 
 
-def test_a_report_without_ranks_says_what_they_need(manufactured):
+def test_a_report_without_ranks_states_the_requirements(manufactured):
     alone = evidence(r for r in manufactured.records if r.ranks == 1)
     page = compose(alone)
     assert "ranks" not in [s.name for s in page.sections]

@@ -1,4 +1,4 @@
-"""Reports open with the best way from the mesh, over all forms, dualising charged."""
+"""Opening of reports: fastest combination of solver and form, with dualisation."""
 
 import re
 from functools import partial
@@ -17,7 +17,7 @@ from mortarbench.reports.data.ways import compare_ways
 from mortarbench.reports.folder import compose
 from tests.support.box_records import box_record
 
-DUALISING = 1e-3  #: s on the smallest problem
+DUALISING = 1e-3  #: time of dualisation on the smallest problem, s
 
 
 @pytest.fixture
@@ -34,9 +34,9 @@ def evidence(tmp_path):
 
 
 def problems(record, count=8, repeats=1, scatter=0.02, seed=1, **ways):
-    """Measure ways "solver_form" on problems of growing size.
+    """Return records of the combinations "solver_form" on problems of growing size.
 
-    A way is given by its seconds on the smallest problem, without dualising.
+    ways : time of each combination on the smallest problem without dualisation, s
     """
     rng = np.random.default_rng(seed)
     for way, seconds in ways.items():
@@ -51,9 +51,10 @@ def problems(record, count=8, repeats=1, scatter=0.02, seed=1, **ways):
 
 
 def four_ways(record, **more):
-    """The fastest solver alone is fast on the dual form, and slow with dualising.
+    """Return records of four combinations of solver and form.
 
-    From the mesh: a on dual 1.5 ms, b on dual 1.8 ms, b on primal 3 ms, a on primal 6.
+    The times with dualisation are 1.5 ms (a on dual), 1.8 ms (b on dual), 3 ms (b on
+    primal) and 6 ms (a on primal).
     """
     ways = dict(a_dual=5e-4, b_dual=8e-4, b_primal=3e-3, a_primal=6e-3)
     return list(problems(record, **(ways | more)))
@@ -68,9 +69,7 @@ def ratio_after(words, text):
     return tuple(map(float, found.groups()))
 
 
-def test_the_first_sentence_names_the_planted_way_and_the_planted_ratios(
-    record, evidence
-):
+def test_the_first_sentence_contains_the_planted_winner_and_ratios(record, evidence):
     claim = first_sentence(evidence(four_ways(record)))
     assert claim.startswith(
         "From the mesh to a verified answer, including dualisation: a on the dual form "
@@ -84,15 +83,15 @@ def test_the_first_sentence_names_the_planted_way_and_the_planted_ratios(
         assert high / low < 1.2
 
 
-def test_a_form_that_has_to_be_dualised_loses_to_one_that_has_not(record, evidence):
-    """Alone, a on dual is six times as fast; with dualising, it takes 1.5 to 1.2 ms."""
+def test_dualisation_may_make_the_primal_form_the_fastest(record, evidence):
+    """Without dualisation, a on dual is five times as fast as b on primal."""
     records = list(problems(record, a_dual=2e-4, b_primal=1e-3, c_dual=4e-4))
     claim = first_sentence(evidence(records))
     assert "dualisation: b on the primal form was the fastest" in claim
     assert ratio_after("form, took", claim)[0] == pytest.approx(1.2, rel=0.03)
 
 
-def test_solvers_alone_follow_form_by_form_and_are_marked_so(record, evidence):
+def test_comparisons_of_solvers_by_form_follow_with_a_title(record, evidence):
     page = compose(evidence(four_ways(record)))
     first, second = page.sections[:2]
     assert [s.subject for s in first.statements] == ["all forms"]
@@ -121,7 +120,7 @@ def test_each_point_of_the_first_figure_has_its_measurements_and_its_solver(
     assert "all forms, tol 1e-6, 8 problems of box" in panel.title
 
 
-def test_equal_ways_are_a_tie_with_its_interval_and_the_remedy(record, evidence):
+def test_equal_combinations_tie_with_interval_and_advice(record, evidence):
     records = list(problems(record, a_dual=1e-3, b_primal=2e-3, c_primal=9e-3))
     made = evidence(records)
     claim = first_sentence(made)
@@ -135,8 +134,8 @@ def test_equal_ways_are_a_tie_with_its_interval_and_the_remedy(record, evidence)
     assert ratio_after("c on the primal form, took", claim)[0] > 4
 
 
-def test_no_tie_has_an_interval_beside_it_that_excludes_1(record, evidence):
-    """Nor is any way called slower by an interval that holds 1."""
+def test_intervals_of_ties_contain_one(record, evidence):
+    """Intervals of combinations that are called slower do not contain 1."""
     rng = np.random.default_rng(3)
     for count in (6, 7, 9):
         for seed in range(25):
@@ -150,7 +149,9 @@ def test_no_tie_has_an_interval_beside_it_that_excludes_1(record, evidence):
                 assert c.slower is (c.ratio.low > 1)
 
 
-def test_where_problems_decide_differently_more_repeats_are_no_remedy(record, evidence):
+def test_more_repeats_are_not_advised_if_the_order_depends_on_the_case(
+    record, evidence
+):
     records = [
         r for k in range(8) for solver, turn in (("a", 1), ("b", -1))
         for i in range(4)
@@ -173,7 +174,7 @@ def test_few_problems_are_compared_within_blocks(record, evidence):
     assert "Dualisation is measured once per build" in picture.caption
 
 
-def test_where_each_way_has_its_problem_the_first_sentence_says_which(record, evidence):
+def test_different_winners_are_counted_by_problem(record, evidence):
     def measured(k, **ways):
         return [
             r.replace(
@@ -194,9 +195,7 @@ def test_where_each_way_has_its_problem_the_first_sentence_says_which(record, ev
     )
 
 
-def test_single_repeats_of_few_problems_name_nobody_but_compare_all_forms(
-    record, evidence
-):
+def test_single_repeats_of_few_problems_name_no_winner(record, evidence):
     claim = first_sentence(evidence(four_ways(record, count=2)))
     assert "a on the dual form had the smallest mean time over 2 problems" in claim
     assert "(next: b on the dual form, about 1.2 times as long; " in claim
@@ -204,7 +203,7 @@ def test_single_repeats_of_few_problems_name_nobody_but_compare_all_forms(
     assert "an interval needs at least two blocks of repeats (--repeats 9)" in claim
 
 
-def test_a_form_that_nobody_solves_everywhere_is_named(record, evidence):
+def test_a_form_that_no_solver_solves_completely_is_named(record, evidence):
     records = [
         r.replace(verdict=Verdict.WRONG)
         if r.form == "primal" and r.params["n"] == 3
@@ -215,10 +214,8 @@ def test_a_form_that_nobody_solves_everywhere_is_named(record, evidence):
     assert claim.endswith("; no solver was verified on every case in the primal form.")
 
 
-def test_problems_without_seconds_of_dualising_are_left_out_and_counted(
-    record, evidence
-):
-    """Folders of older versions lack the seconds of dualising."""
+def test_problems_without_time_of_dualisation_are_left_out(record, evidence):
+    """Records of older versions lack the time of dualisation."""
     known = four_ways(record, count=9)
     old = [r.replace(dualise_seconds=None) if r.params["n"] == 0 else r for r in known]
     page = compose(evidence(old))
@@ -233,24 +230,24 @@ def test_problems_without_seconds_of_dualising_are_left_out_and_counted(
     assert "not compared on 9 problems" in page.sections[0].prose[0]
 
 
-def test_a_single_dual_form_is_charged_for_dualising(record, evidence):
+def test_a_single_dual_form_includes_dualisation(record, evidence):
     records = list(problems(record, a_dual=1e-4, b_dual=1e-3))
     claim = first_sentence(evidence(records))
     assert ratio_after("form, took", claim)[0] == pytest.approx(2 / 1.1, rel=0.03)
 
 
-def test_a_single_primal_form_needs_no_comparison_of_ways(record, evidence):
+def test_a_single_primal_form_is_compared_by_solver(record, evidence):
     made = evidence(list(problems(record, a_primal=1e-4, b_primal=1e-3)))
     assert compare_ways(made).comparisons == ()
     assert first_sentence(made).startswith("a was the fastest over 8 cases")
 
 
-def test_a_single_way_is_compared_with_nothing(record, evidence):
+def test_a_single_combination_is_not_compared(record, evidence):
     made = evidence(list(problems(record, a_dual=1e-4)))
     assert compare_ways(made).comparisons == ()
 
 
-def test_tolerances_are_compared_apart_the_tightest_first(record, evidence):
+def test_tolerances_are_compared_separately_tightest_first(record, evidence):
     loose = [
         r.replace(tol=1e-3, run_id=f"{r.run_id} loose")
         for r in problems(record, a_dual=4e-3, b_dual=3e-3, b_primal=1e-3, a_primal=9.0)
@@ -262,9 +259,7 @@ def test_tolerances_are_compared_apart_the_tightest_first(record, evidence):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_the_command_report_prints_the_first_sentence_and_nothing_else_of_it(
-    record, tmp_path, capsys
-):
+def test_the_command_report_prints_only_the_first_sentence(record, tmp_path, capsys):
     with Journal(tmp_path, "test") as journal:
         for r in four_ways(record):
             journal.append(r)

@@ -1,4 +1,4 @@
-"""records.parquet is the journal: a row per line, a type per field."""
+"""records.parquet contains the journal: one row per line, one type per field."""
 
 import json
 from dataclasses import fields
@@ -51,13 +51,13 @@ def test_every_line_is_a_row_and_every_field_a_column(folder):
     assert path.name == "records.parquet"
     assert list(frame.columns) == list(record(session="a").to_dict())
     assert list(frame.run_id) == ["r1", "r0", "r2"]  # in the order of the journal
-    assert list(frame.solver) == ["a"] * 3  # as the journal has it, not as pages do
+    assert list(frame.solver) == ["a"] * 3  # the label of the journal, not of pages
     assert frame.total_seconds.sum() == 0.75
     assert frame.iterations[0] == 7
     assert pd.isna(frame.iterations[2])
 
 
-def test_what_is_nested_is_json(folder):
+def test_nested_values_are_json(folder):
     _, frame = read(folder("a", record()))
 
     assert json.loads(frame.quantities[0]) == {"tip": [0.1, -0.2], "σ": 1.5}
@@ -65,8 +65,8 @@ def test_what_is_nested_is_json(folder):
         assert isinstance(json.loads(frame[name][0]), dict)
 
 
-def test_types_are_those_of_the_fields_whatever_the_values(folder):
-    """A column of missing values, or of whole ones, is typed like any other."""
+def test_column_types_do_not_depend_on_the_values(folder):
+    """Columns of missing values or of integers have the type of their field."""
     nothing = record(iterations=None, total_seconds=None, claimed=None)
     one = pq.read_schema(read(folder("a", record(tol=1)))[0])
     two = pq.read_schema(read(folder("b", nothing))[0])

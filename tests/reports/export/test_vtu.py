@@ -45,7 +45,7 @@ def test_points_and_vectors_have_three_components(grid):
         assert not vectors[:, 2].any()
 
 
-def test_cells_know_their_body(grid):
+def test_cell_data_contain_the_body(grid):
     (block,) = grid.cells
 
     assert block.type == "quad"
@@ -53,7 +53,7 @@ def test_cells_know_their_body(grid):
     np.testing.assert_array_equal(grid.cell_data["body"][0], [0, 1])
 
 
-def test_cells_of_torn_bodies_know_their_subdomain_and_others_have_none(grid, tmp_path):
+def test_cell_data_of_decomposed_bodies_contain_the_subdomain(grid, tmp_path):
     assert set(grid.cell_data) == {"body"}
     cells = np.array([[0, 1, 2, 3], [4, 5, 6, 6], [4, 6, 7, 7]])
     torn = replace(
@@ -85,9 +85,9 @@ def test_a_family_states_the_subdomain_of_every_cell(name, is_torn, tmp_path):
     assert np.unique(fields.subdomains).size == subdomains
     assert fields.subdomains.shape == (len(fields.cells),)
     np.testing.assert_array_equal(stored.subdomains, fields.subdomains)
-    for number in np.unique(fields.subdomains):  # none reaches over two bodies
+    for number in np.unique(fields.subdomains):  # each subdomain is part of one body
         assert np.unique(fields.bodies[fields.subdomains == number]).size == 1
-        assert np.bincount(fields.subdomains)[number] <= 9  # 3 cells a side
+        assert np.bincount(fields.subdomains)[number] <= 9  # 3 cells per side
 
 
 def test_triangles_are_triangles_with_their_bodies(tmp_path):
@@ -107,7 +107,7 @@ def test_contact_is_a_force_and_a_flag_without_gaps_elsewhere(grid):
     force, flag = grid.point_data["contact_force"], grid.point_data["in_contact"]
 
     np.testing.assert_array_equal(force[:, 1], [0, 0, -0.1, -3e5, 0, 0, 0, 0])
-    assert flag.dtype.kind == "i"  # the second force is rounding next to the first
+    assert flag.dtype.kind == "i"  # relative to the first force, the second is rounding
     np.testing.assert_array_equal(flag, [0, 0, 0, 1, 0, 0, 0, 0])
     np.testing.assert_array_equal(
         grid.point_data["von_mises"], FIELDS.nodal["von_mises"]
@@ -140,7 +140,7 @@ def test_a_solved_case_is_written_without_nan_and_its_contact_balances(tmp_path)
     assert data["pressure"].max() == found["largest_pressure"]
     assert data["gap"][side].min() == found["smallest_gap"]
     assert data["in_contact"].sum() == case.quantities(s)["active"]
-    # on the ring, so opposite to what the beam gets
+    # the force on the ring is opposite to the force on the beam
     on_beam = case.quantities(s)["contact_force"]
     np.testing.assert_allclose(
         data["contact_force"].sum(axis=0)[:2], np.negative(on_beam)
@@ -155,7 +155,7 @@ SIDE = ContactSide(
 )  # fmt: skip
 
 
-def test_each_contact_is_a_table_beside_the_grid(tmp_path):
+def test_each_contact_has_a_csv_table(tmp_path):
     written = write_vtu(replace(FIELDS, contacts=(SIDE,)), tmp_path / "a.vtu")
     table = pd.read_csv(tmp_path / "a-disc-on-a-b-2.csv")
 
@@ -205,7 +205,7 @@ def test_a_node_of_two_contacts_has_the_larger_pressure_and_the_smaller_gap(tmp_
     assert np.isnan(data["gap"]).sum() == 6
 
 
-def test_of_friction_grid_and_table_tell_shear_and_what_sticks(tmp_path):
+def test_grid_and_table_contain_shear_and_friction_states(tmp_path):
     rough = replace(
         SIDE, shear=np.array([1e5, -0.5, 0.0]),
         friction=np.array(["slip", "stick", "open"]),
@@ -223,7 +223,7 @@ def test_of_friction_grid_and_table_tell_shear_and_what_sticks(tmp_path):
     assert "friction" not in meshio.read(tmp_path / "b.vtu").point_data
 
 
-def test_sliding_without_contact_is_a_state_of_its_own_that_contact_overrules(tmp_path):
+def test_contact_takes_precedence_over_sliding_without_contact(tmp_path):
     def rough(*states):
         return replace(SIDE, shear=np.ones(3), friction=np.array(states))
 
@@ -241,7 +241,7 @@ def test_sliding_without_contact_is_a_state_of_its_own_that_contact_overrules(tm
     assert both["in_contact"][SIDE.nodes].tolist() == [0, 1, 1]
 
 
-def test_friction_on_open_nodes_is_no_contact(tmp_path):
+def test_friction_on_open_nodes_does_not_count_as_contact(tmp_path):
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=2, steps=1, friction="tresca", bound=1e8))
     case = family.build("dual-bounds", params, reference_solution)
@@ -284,7 +284,7 @@ def test_solve_writes_the_deformed_state(solve):
     assert "von_mises" in meshio.read(path).point_data
 
 
-def test_solve_refuses_what_it_cannot_write(solve, manufactured, tmp_path):
+def test_solve_refuses_unsupported_cases_and_formats(solve, manufactured, tmp_path):
     save_qp(tmp_path / "a.npz", manufactured("box")[0], {})
     code, err, path = solve(f"file:{tmp_path / 'a.npz'}")
 
@@ -295,7 +295,7 @@ def test_solve_refuses_what_it_cannot_write(solve, manufactured, tmp_path):
     assert err.endswith("a.vtk: unknown format '.vtk'; expected .vtu or .pvd\n")
 
 
-def test_a_series_names_its_files_and_times_next_to_it(tmp_path):
+def test_a_series_lists_its_files_and_times(tmp_path):
     path = tmp_path / "a & b.pvd"
     written = write_series([(0.5, FIELDS), (1.0, FIELDS)], path)
     sets = ElementTree.parse(path).getroot().findall("Collection/DataSet")
@@ -315,7 +315,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
         write_series([], tmp_path / "no" / "a.pvd")
 
 
-def test_a_series_holds_every_load_step_up_to_the_one_asked_for(solve, tmp_path):
+def test_a_series_contains_all_load_steps_up_to_the_requested_one(solve, tmp_path):
     code, _, path = solve("beam-ring/Nr=2/Nh=2/steps=4/step=3/dual-bounds", "a.pvd")
     series = ElementTree.parse(path).getroot().findall("Collection/DataSet")
     tips = [
@@ -328,7 +328,7 @@ def test_a_series_holds_every_load_step_up_to_the_one_asked_for(solve, tmp_path)
     assert tips[0] > tips[1] > tips[2]  # ever lower
 
 
-def test_solids_are_written_by_kinds_with_forces_in_newtons(tmp_path):
+def test_solids_are_written_by_cell_type_with_forces_in_newtons(tmp_path):
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
     tetra = [0, 4, 6, 7, 7, 7, 7, 7]  # in a table of hexahedra
     touching = ContactSide(

@@ -1,4 +1,4 @@
-"""Figures of reports: solvers and measurements behind their points."""
+"""Figures of reports: solver and measurements of every point."""
 
 import pickle
 import subprocess
@@ -95,7 +95,7 @@ def test_every_mark_of_accuracy_names_the_measurements_of_its_cell(campaign):
     }
 
 
-def test_verified_marks_are_filled_and_the_others_hollow(campaign):
+def test_markers_are_filled_if_the_answer_is_verified(campaign):
     verified = {i for o in campaign.flat if o.verified for i in o.run_ids}
     for one in series(accuracy_figure(campaign)):
         filled = one.look.fill == ""
@@ -127,8 +127,8 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
 
 
 @pytest.mark.parametrize("spread", [1.0, 1 + 1e-9, 1.02, 1.5, 4.0, 1e6])
-def test_guides_leave_the_axes_their_room_however_little_times_differ(spread):
-    """A guide of slope 3/2 rises by a factor of seven over sizes of 1 to 100."""
+def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):
+    """For sizes from n to 100n, the guide of slope 3/2 rises by a factor of seven."""
     grown = [
         r.replace(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
               form="dual", params={"n": n}, sizes={"variables": n},
@@ -154,7 +154,7 @@ def test_guides_leave_the_axes_their_room_however_little_times_differ(spread):
 
 
 @pytest.mark.parametrize("place", [(1.0, 1e9), (1e-9, 1.0), (1e9, 1e-9)])
-def test_a_remark_beside_the_axes_takes_no_room(place):
+def test_a_text_beside_the_axes_does_not_change_their_limits(place):
     def room(*texts):
         axis = Axis(log=True, low=0.1, high=10.0)
         panel = Panel(x=axis, y=axis, texts=texts)
@@ -165,7 +165,7 @@ def test_a_remark_beside_the_axes_takes_no_room(place):
     assert room(Text(text="far away", place=place)) == room()
 
 
-def test_answers_out_of_all_bounds_have_their_place_in_the_figure_of_accuracy():
+def test_extreme_answers_appear_in_the_figure_of_accuracy():
     answers = [
         r.replace(primal=worst, dual=0.0, complementarity=0.0, gap=0.0)
         for worst, r in zip((0.0, 1e-9, 1e290), records(1, 3, 1), strict=True)
@@ -234,8 +234,8 @@ def test_all_figures_of_a_report_are_plain_data(campaign):
     assert figures == same == pickle.loads(pickle.dumps(figures))
 
 
-def test_what_is_drawn_of_a_solver_bears_its_name(campaign):
-    """A page hides a solver by its name: curves, bands and error bars alike."""
+def test_all_marks_of_a_solver_carry_its_label(campaign):
+    """A page hides the curves, bands and error bars of a solver by its label."""
     for section in compose(campaign).sections:
         for picture in section.pictures:
             for panel in picture.figure.panels:
@@ -244,8 +244,8 @@ def test_what_is_drawn_of_a_solver_bears_its_name(campaign):
                     assert guide or mark.solver in campaign.solvers
 
 
-def test_putting_a_report_together_loads_no_matplotlib():
-    """Its import takes a second and is needed for drawing only."""
+def test_composing_a_report_does_not_import_matplotlib():
+    """The import takes a second and is needed only for drawing."""
     code = (
         "import sys; from mortarbench.reports import folder; "
         "from mortarbench.reports.paper import report; "

@@ -20,7 +20,8 @@ from mortarbench.reports.figures.style import COLOURS, look
 from mortarbench.reports.render.drawing import draw_curves
 from mortarbench.reports.render.plots import panels
 
-#: Machado, Oliveira, Fernandes 2009, severity 1, on linear RGB
+#: colour blindness: matrices on linear RGB of Machado, Oliveira, Fernandes 2009,
+#: severity 1
 SIGHTS = {
     "normal": np.eye(3),
     "deuteranopia": np.array([[0.367322, 0.860646, -0.227968],
@@ -67,7 +68,7 @@ def test_the_first_eight_colours_differ_for_colour_blind_readers(sight):
 
 
 @pytest.mark.parametrize("paper", ["#fffefb", "#15181c"])
-def test_all_colours_stand_out_from_both_pages(paper):
+def test_all_colours_contrast_with_light_and_dark_pages(paper):
     def luminance(colour):
         return np.array([0.2126, 0.7152, 0.0722]) @ linear(colour) + 0.05
 
@@ -75,7 +76,7 @@ def test_all_colours_stand_out_from_both_pages(paper):
     assert min(max(r, 1 / r) for r in ratios) > 2.3
 
 
-def test_neighbours_differ_in_marker_and_dashes_as_well():
+def test_neighbouring_solvers_also_differ_in_marker_and_dashes():
     looks = [look(i) for i in range(40)]
     for a, b in pairwise(looks):
         assert a.marker != b.marker
@@ -93,8 +94,8 @@ def test_a_logarithmic_axis_spans_a_decade_at_least_and_all_points(values):
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_a_legend_within_a_panel_hides_no_curve(log):
-    """The highest point of each curve lies at the left, where the legend is."""
+def test_a_legend_within_a_panel_does_not_hide_curves(log):
+    """The highest point of each curve is on the left, like the legend."""
     series = [Series(x=(1, 2, 3), y=(10.0**k, 3, 2), look=look(k)) for k in range(1, 5)]
     keys = tuple(Key(label=f"curve {k}", look=look(k)) for k in range(1, 5))
     panel = Panel(

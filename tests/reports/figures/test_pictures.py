@@ -1,4 +1,4 @@
-"""Pictures of two rectangles, compared with their fields."""
+"""Pictures of two rectangles, compared with the fields that they show."""
 
 import re
 from dataclasses import replace
@@ -86,7 +86,7 @@ def test_the_outline_of_a_strip_is_one_closed_loop_through_its_boundary():
     assert list(np.roll(loop[:-1], -start)) == [0, 1, 2, 5, 4, 3]  # counter-clockwise
 
 
-def test_every_body_and_every_hole_has_a_loop_of_its_own(bodies):
+def test_every_body_and_every_hole_has_a_separate_loop(bodies):
     assert sorted(len(loop) - 1 for loop in outlines(bodies.cells)) == [8, 14]
     i = np.arange(6)  # an annulus of six cells
     annulus = np.column_stack([i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6])
@@ -99,7 +99,7 @@ def test_cells_that_meet_in_one_node_only_keep_their_sides():
     assert len(sides) == 8
 
 
-def test_bodies_are_drawn_where_the_displacement_puts_them(bodies):
+def test_bodies_are_drawn_at_their_displaced_positions(bodies):
     axes = draw(deformed_figure(bodies)).axes[0]
     moved = bodies.points + bodies.displacement
     for mesh, nodes in zip(artists(axes, TriMesh), (8, 14), strict=True):
@@ -117,7 +117,7 @@ def test_bodies_are_drawn_where_the_displacement_puts_them(bodies):
 
 def test_two_triangles_cover_each_quadrilateral(bodies):
     meshes = artists(draw(deformed_figure(bodies)).axes[0], TriMesh)
-    # The shear by −0.05 x keeps areas and takes the centre (1, y) to (1, y − 0.05).
+    # The shear by −0.05 x preserves areas and moves the centre (1, y) to (1, y − 0.05).
     for mesh, area, middle in zip(meshes, (0.8, 0.6), (0.15, 0.55), strict=True):
         t = mesh._triangulation
         corners = np.column_stack([t.x, t.y])[t.triangles]
@@ -129,7 +129,7 @@ def test_two_triangles_cover_each_quadrilateral(bodies):
         np.testing.assert_allclose(centre, [1, middle])
 
 
-def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
+def test_all_bodies_share_one_scale_despite_a_singularity(bodies):
     calm = bodies.nodal["von_mises"].copy()
     many = np.concatenate([calm, np.full(600, 2e9)])  # one node in 600 is singular
     points = np.vstack([bodies.points, np.zeros((600, 2))])
@@ -142,11 +142,11 @@ def test_all_bodies_share_one_scale_that_a_singularity_does_not_spoil(bodies):
     assert len(limits) == 1
     low, high = limits.pop()
     assert low == 0
-    assert 1e9 < high <= 4e9  # Pa, though the singularity has 1000 GPa
-    assert meshes[0].get_array().max() == 1000e9  # clipped in colour, not in value
+    assert 1e9 < high <= 4e9  # Pa, although the singularity has 1000 GPa
+    assert meshes[0].get_array().max() == 1000e9  # only the colour is clipped
 
 
-def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
+def test_arrows_end_at_loaded_nodes_in_the_direction_of_the_force(bodies):
     overview, zoom = draw(deformed_figure(bodies)).axes[:2]
     assert not artists(overview, Quiver)
     (arrows,) = artists(zoom, Quiver)
@@ -165,7 +165,7 @@ def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
 
 
 def side(name, nodes, forces):
-    """Return one contact under the given load."""
+    """Return a contact side with the given nodal forces."""
     forces = np.array(forces, dtype=float)
     ones = np.ones(len(forces))
     return ContactSide(
@@ -174,7 +174,7 @@ def side(name, nodes, forces):
     )  # fmt: skip
 
 
-def test_each_contact_that_carries_load_has_a_window_with_its_own_forces(bodies):
+def test_each_loaded_contact_has_an_enlargement_with_its_forces(bodies):
     pairs = (
         side("up on low", [4, 5], [[0, 0], [0, -3e6]]),
         side("idle", [8, 9], [[0, 0], [0, 0]]),
@@ -199,7 +199,7 @@ def test_each_contact_that_carries_load_has_a_window_with_its_own_forces(bodies)
         assert (tips <= panel.high).all()
 
 
-def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
+def test_forces_of_sticking_and_slipping_nodes_differ_in_colour(bodies):
     pair = side("up on low", [4, 5, 0, 1], [[1, -3], [0, -2], [1, -1], [0, 0]])
     states = np.array(["slip", "stick", "slip", "open"])
     rough = replace(pair, shear=pair.gap, friction=states)
@@ -215,12 +215,10 @@ def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
     ("state", "key"),
     [
         ("sliding without contact", "sliding without contact: orange (2)"),
-        ("open", "open: grey (2)"),  # forces of neighbours, in older results
+        ("open", "open: grey (2)"),  # older results: shares of forces on neighbours
     ],
 )
-def test_nodes_with_shear_alone_neither_widen_the_window_nor_hide_contact(
-    bodies, state, key
-):
+def test_nodes_with_shear_only_do_not_change_the_enlargement(bodies, state, key):
     pair = side("up on low", [4, 5, 0, 1], [[1, -3], [1, -2], [1, 0], [1, 0]])
     states = np.array(["slip", "stick", state, state])
     rough = replace(pair, shear=pair.gap, friction=states)
@@ -241,7 +239,7 @@ def test_nodes_with_shear_alone_neither_widen_the_window_nor_hide_contact(
     assert all(width < min(wide) for width in thin)
 
 
-def test_a_side_that_slides_without_contact_is_coloured_to_the_middle_of_its_nodes(
+def test_sliding_without_contact_is_coloured_up_to_half_edges(
     bodies,
 ):
     """Two of four nodes slide without contact, in overview and enlargement."""
@@ -314,8 +312,8 @@ def test_the_scale_is_that_of_the_displacement(bodies):
     assert "displacement × 4;" in there.title
 
 
-def test_contacts_are_enlarged_as_they_are_whatever_the_scale_of_the_whole(bodies):
-    """Bodies in contact overlap if displacements are multiplied."""
+def test_enlarged_contacts_are_not_magnified(bodies):
+    """Bodies in contact would overlap if displacements were magnified."""
     one, four = (deformed_figure(bodies, scale).panels[1] for scale in (1.0, 4.0))
 
     assert (one.low, one.high) == (four.low, four.high)
@@ -328,7 +326,7 @@ def test_contacts_are_enlarged_as_they_are_whatever_the_scale_of_the_whole(bodie
     ("size", "unit", "name"),
     [(1.0, 1.0, "m"), (0.05, 1e-3, "mm"), (5e-5, 1e-6, "µm"), (1e-9, 1e-6, "µm")],
 )
-def test_axes_number_lengths_in_a_unit_of_their_size(bodies, size, unit, name):
+def test_axes_use_a_unit_that_fits_their_size(bodies, size, unit, name):
     small = replace(
         bodies, points=size * bodies.points / 2, displacement=0 * bodies.displacement
     )
@@ -338,7 +336,7 @@ def test_axes_number_lengths_in_a_unit_of_their_size(bodies, size, unit, name):
     assert panel.xlabel == f"$x$ in {name}"
 
 
-def test_triangles_are_drawn_once_and_without_sides_of_no_length():
+def test_triangles_are_drawn_once_without_degenerate_edges():
     cells = np.array([[0, 1, 2, 2], [0, 2, 3, 3], [3, 2, 4, 5]])
 
     assert sorted(map(sorted, triangles(cells).tolist())) == [
@@ -355,7 +353,7 @@ def test_without_contact_forces_there_is_one_panel(bodies):
     assert "displacement × 1" in figure.axes[0].get_title(loc="left")
 
 
-def test_without_stress_the_bodies_are_drawn_plain(bodies):
+def test_without_stress_bodies_have_a_uniform_colour(bodies):
     fields = Fields(**{**vars(unloaded(bodies)), "nodal": {}})
     figure = draw(deformed_figure(fields))
     assert len(figure.axes) == 1
@@ -365,7 +363,7 @@ def test_without_stress_the_bodies_are_drawn_plain(bodies):
 @pytest.mark.parametrize(
     ("ending", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")]
 )
-def test_a_picture_is_the_same_bytes_every_time(bodies, tmp_path, ending, start):
+def test_pictures_have_reproducible_bytes(bodies, tmp_path, ending, start):
     first, second = tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"
     save(deformed_figure(unloaded(bodies)), first)
     save(deformed_figure(unloaded(bodies)), second)
@@ -373,12 +371,12 @@ def test_a_picture_is_the_same_bytes_every_time(bodies, tmp_path, ending, start)
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_an_unknown_kind_of_picture_is_bad_input(bodies, tmp_path):
+def test_an_unknown_picture_format_is_refused(bodies, tmp_path):
     with pytest.raises(InputError, match=r"'\.gif'.*known: \.pdf, \.png, \.svg$"):
         save(deformed_figure(bodies), tmp_path / "a.gif")
 
 
-def test_a_state_without_numbers_is_not_drawn(bodies):
+def test_states_with_nan_are_not_drawn(bodies):
     broken = Fields(**{**vars(bodies), "displacement": bodies.displacement * np.nan})
     with pytest.raises(InputError, match="NaN"):
         deformed_figure(broken)
@@ -405,9 +403,7 @@ def a_line():
     return Figure(rows=(Row(panels=(panel,)),), height=3)
 
 
-def test_a_figure_is_drawn_once_per_format_and_never_to_be_laid_out(
-    tmp_path, monkeypatch
-):
+def test_a_figure_is_laid_out_only_once(tmp_path, monkeypatch):
     drawings = []
     draw = Canvas.draw
     monkeypatch.setattr(Canvas, "draw", lambda *a: (drawings.append(1), draw(*a)))

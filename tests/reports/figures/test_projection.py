@@ -64,7 +64,7 @@ def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
 
     assert (face_normals(CUBE.points, facets) @ camera.towards > 0).sum() == 12
     tiles = (~outlines).sum() / 12  # of the 24 faces
-    # outlines consist of straight pieces, as long as the edges of the faces in all
+    # the total length of the pieces of outlines is the length of all face edges
     pieces = faces.corners[outlines]
     assert len(pieces) == 12 * 4 * np.sqrt(tiles)
     assert (pieces[:, 0] == pieces[:, 3]).all()
@@ -77,14 +77,14 @@ def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
     area = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1) / 2
     assert (area > 0).all()
     assert area.sum() == pytest.approx(camera.towards @ [1, -1, 1])
-    # the values on the top are 1, and elsewhere below it
+    # the value is 1 on the top and smaller elsewhere
     assert np.nanmax(faces.values) == pytest.approx(1)
     tops = (faces.values[~outlines] > 1 - 1e-9).sum()
     assert tops == 4 * tiles
 
 
 def test_a_large_face_is_not_drawn_over_a_small_body_on_it():
-    """The middle of the table is nearer to the camera than the back of the block."""
+    """The centre of the table is nearer to the camera than the back of the block."""
     table, block = box((-9, -1, -1), (20, 9, 1), (1, 1, 1)), box((0, 5, 0), (1, 1, 1),
                                                                  (1, 1, 1))  # fmt: skip
     mesh, _ = join((table, block))
@@ -188,7 +188,7 @@ def test_bodies_without_contact_have_one_panel():
 
 
 def test_faces_between_cells_of_different_kinds_are_inside():
-    """Two wedges beside a hexahedron."""
+    """The mesh consists of two wedges and an adjacent hexahedron."""
     pair = box((0.0, 0.0, 0.0), (2.0, 1.0, 1.0), (2, 1, 1))
     first = Mesh(pair.points, pair.cells[:1], {})
     cells = np.vstack([degenerate(divided(first, WEDGES)).cells, pair.cells[1:]])

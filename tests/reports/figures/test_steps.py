@@ -12,11 +12,11 @@ from mortarbench.reports.figures.scaling import steps_figure, subdomain_figure
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.scaling import steps
 
-SIZES = (1_000, 16_000, 81_000, 256_000)  # fourth powers are whole numbers
+SIZES = (1_000, 16_000, 81_000, 256_000)  # n/1000 are fourth powers of integers
 
 
 def records(**but):
-    """Yield answers with CG steps of order n^¼, other counts constant, and κ."""
+    """Yield answers with CG steps of order n^¼, other constant counts, and κ."""
     for n in SIZES:
         yield Record(
             run_id=f"{n:012d}", case=f"plate/Sx={n}/dual", family="plate",
@@ -44,7 +44,7 @@ def figure():
 def test_counts_and_condition_numbers_have_a_panel_each(figure):
     titles = [panel.title for panel in figure.panels]
     assert titles == ["products", "steps", "condition number"]
-    # a number that is zero somewhere is drawn, on axes that begin at zero
+    # counts that are zero at some size are also drawn, since the axes begin at zero
     assert all(panel.y.low == 0 and not panel.y.log for panel in figure.panels)
 
 
@@ -59,15 +59,15 @@ def test_points_are_the_counts_of_the_measurements_behind_them(figure):
     assert cg.runs == tuple((f"{n:012d}",) for n in SIZES)
 
 
-def test_legends_tell_the_exponent_and_its_interval(figure):
+def test_legends_contain_the_exponent_and_its_interval(figure):
     labels = {key.label for key in figure.legend.keys}
     assert "cg,  p = 0.25 [0.25, 0.25]" in labels
     assert "P products,  p = 0.00 [0.00, 0.00]" in labels
-    assert "proportioning" in labels  # no power law goes through zero
+    assert "proportioning" in labels  # without an exponent, because a count is zero
     assert {r"$\kappa$", r"$\kappa$ lumped"} <= labels
 
 
-def test_a_fit_is_a_curve_through_what_it_is_fitted_to(figure):
+def test_a_fitted_curve_passes_through_its_points(figure):
     fits = [m for m in figure.panels[1].marks if isinstance(m, Series) and not m.runs]
     cg = fits[0]
     assert (cg.x[0], cg.x[-1]) == pytest.approx((SIZES[0], SIZES[-1]))
@@ -90,7 +90,7 @@ def test_counts_against_cells_of_a_subdomain_have_their_values_as_ticks():
     assert [p.name for p in section.pictures] == ["steps-1"]
 
 
-def test_a_solver_that_counts_nothing_has_no_figure():
+def test_a_solver_without_counts_has_no_figure():
     bare = (
         r.replace(counts={}, quantities={"dofs": r.params["Sx"]}) for r in records()
     )

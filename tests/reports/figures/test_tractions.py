@@ -30,7 +30,7 @@ SHEARED = dict(n=8, m=8, load=0.1, friction="coulomb", mu=0.4, Q=0.6)
      ("hertz-plane", dict(n=6, load=0.1))],
 )  # fmt: skip
 def test_the_nodes_lie_along_the_exact_curves(family, given):
-    """Exact tractions have vertical tangents at the edges, which are left out."""
+    """Edges are left out, because exact tractions have vertical tangents there."""
     fields = solved(family, **given)
     (side,) = fields.contacts
     at, half = places(fields, side), side.exact[side.exact[:, 1] > 0, 0].max()
@@ -43,7 +43,7 @@ def test_the_nodes_lie_along_the_exact_curves(family, given):
         assert off < 0.05 * np.linalg.norm(side.pressure[inside])
 
 
-def test_marks_tell_stick_and_slip_and_lie_over_the_exact_line():
+def test_markers_show_stick_and_slip_above_the_exact_line():
     fields = solved("hertz-cylinder", **SHEARED)
     figure = traction_figure(fields)
     (side,) = fields.contacts
@@ -81,7 +81,7 @@ def test_nodes_that_slide_without_contact_have_shear_and_no_pressure():
 
 
 def point_contact(**given):
-    """Return the deformed state of half-spaces, of the spectral projected gradient."""
+    """Return the deformed state of half-spaces, solved by the projected gradient."""
     family = PROBLEMS["half-space"]
     case = family.build("dual", family.complete(given), reference_solution)
     return case.fields(ProjectedGradient().prepare(case.qp, 1e-8)())
@@ -102,7 +102,7 @@ def test_maps_show_pressure_shear_and_the_direction_of_slip():
     kinds = names[raster.values[np.isfinite(raster.values)].astype(int)]
     assert (kinds == "stick").sum() == (side.friction == "stick").sum()
     assert (kinds == "slip").sum() == (side.friction == "slip").sum()
-    # the upper body slips along +x, at cells that slip, evenly about the middle
+    # slipping cells are symmetric about the middle, and the upper body slips along +x
     assert (arrows.vectors[:, 0] > 0).all()
     assert abs(arrows.vectors[:, 1]).max() < 1e-9 * arrows.vectors.max()
     middles = arrows.feet + arrows.vectors / 2

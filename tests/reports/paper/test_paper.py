@@ -43,14 +43,14 @@ from mortarbench.reports.render.saving import save_all
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import PAPER, SMALBE
 
-#: it measures and draws once: one process has all of it
+#: one process runs the module, so that measurements and drawings are made only once
 pytestmark = pytest.mark.together
 
 FIGURES = [
     *(f"figure{i}" for i in range(1, 8)),
     "zoom", "pressure", "verification", "stepping", "fleet", "totals", "certified",
 ]  # fmt: skip
-SORTS = ("figure1", "verification", "fleet")  #: a mesh, curves, solvers
+SORTS = ("figure1", "verification", "fleet")  #: figures of a mesh, curves and solvers
 TWICE = Rounds(most=2, least=2)
 LITTLE = replace(
     QUICK,
@@ -80,7 +80,7 @@ def experiment():
 
 @pytest.fixture(scope="module")
 def data(experiment, tmp_path_factory):
-    """Return a folder of measurements only."""
+    """Return a folder that contains only measurements."""
     path = tmp_path_factory.mktemp("paper") / "measured"
     save_experiment(experiment, path / "data")
     for name, records in synthetic().items():
@@ -110,7 +110,7 @@ def all_formats(data):
 
 @pytest.fixture(scope="module")
 def sorts(data):
-    """Return a figure of each sort in all formats, drawn from stored data."""
+    """Return the figures of `SORTS` in all formats, drawn from stored data."""
     suites = {n: read_evidence(data / "data" / n) for n in synthetic()}
     page = compose(load_experiment(data / "data"), suites)
     pictures = {p.name: p for s in page.sections for p in s.pictures}
@@ -121,7 +121,7 @@ def sorts(data):
     return path
 
 
-#: m and n of the planted cases
+#: m → n of the planted cases
 SIZES = {50: 500, 100: 2000, 200: 8000}
 
 
@@ -139,7 +139,10 @@ def record(solver, form, m, seconds, repeat, **changes):
 
 
 def synthetic():
-    """Return times of 1e-6·m² s; `lazy` is wrong at the largest size, after 1 ns."""
+    """Return records with times of 1e-6·m² s.
+
+    At the largest size, `lazy` returns a wrong answer after 1 ns.
+    """
     fleet = [
         record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
                **(wrong if solver == "lazy" and m == 200 else {}))
@@ -189,7 +192,7 @@ def assert_three_formats(figures, name):
     assert elements(figures / f"{name}.svg") > 30
 
 
-def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
+def test_the_page_is_complete_and_escapes_foreign_text(folder):
     page = (folder / "index.html").read_text()
 
     assert page.count("<svg") == page.count("<b>Figure ") == 14
@@ -200,7 +203,7 @@ def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
 
 
 @pytest.mark.slow
-def test_all_of_the_same_data_is_drawn_to_the_same_bytes(all_formats, data, tmp_path):
+def test_all_figures_have_reproducible_bytes(all_formats, data, tmp_path):
     """The page is drawn from the files in data/ without new measurements."""
     shutil.copytree(data / "data", tmp_path / "data")
     save_experiment(load_experiment(data / "data"), tmp_path / "data")
@@ -212,8 +215,8 @@ def test_all_of_the_same_data_is_drawn_to_the_same_bytes(all_formats, data, tmp_
         assert path.read_bytes() == first.read_bytes()
 
 
-def test_the_same_data_are_drawn_to_the_same_bytes(folder, data, sorts, tmp_path):
-    """Stored data and a figure of each sort are equal, byte by byte, in two runs."""
+def test_equal_data_give_equal_bytes(folder, data, sorts, tmp_path):
+    """Stored data and the figures of `SORTS` have identical bytes in two runs."""
     save_experiment(load_experiment(data / "data"), tmp_path / "data")
     stored = [*(tmp_path / "data").glob("*.csv")]
     assert stored
@@ -224,7 +227,7 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, data, sorts, tmp_path
         assert one.read_bytes() == two.read_bytes()
 
 
-def test_table_1_counts_as_the_papers_formulas_do(experiment):
+def test_table_1_satisfies_the_formulas_of_the_paper(experiment):
     """The beam has (8Nr + 1)(Nr + 1) nodes and 8Nr² elements.
 
     The ring has (12Nh + 1)(2Nh + 1) nodes and 24Nh² elements.
@@ -249,7 +252,7 @@ def test_the_dual_has_the_sizes_of_the_papers_formulas(experiment, Nr):
 
 
 def test_figure_2_is_drawn_with_both_rules_for_the_ring(experiment, folder):
-    """Erratum: 313 nodes need Nh layers; the rule of the text, 2·Nh, has 424."""
+    """Erratum: Nh layers have 313 nodes; 2·Nh layers, as in the text, have 424."""
     nodes = [
         len(experiment.states[s].points) for s in ("example-Nh", "example-2Nh")
     ]  # fmt: skip
@@ -258,14 +261,14 @@ def test_figure_2_is_drawn_with_both_rules_for_the_ring(experiment, folder):
     assert "313 nodes" in (folder / "index.html").read_text()
 
 
-def test_figure_1_reads_the_papers_dimensions_off_the_mesh(experiment):
+def test_figure_1_has_the_dimensions_of_the_paper(experiment):
     d = dimensions(experiment.states["example-2Nh"])
 
     assert (d.l, d.h, d.a) == pytest.approx((2, 0.25, 0.5))
     assert (*d.centre, d.r1, d.r2) == pytest.approx((1, 0, 0.3, 0.49))
 
 
-def test_both_ways_through_the_load_steps_end_in_the_same_displacement():
+def test_both_methods_give_the_same_final_displacement():
     one, other = (
         analyse(
             2, 2, solve=lambda qp: SMALBE().prepare(qp, 1e-11)(), condense=c, steps=3
@@ -280,14 +283,16 @@ def test_both_ways_through_the_load_steps_end_in_the_same_displacement():
 
 
 @pytest.mark.parametrize(("way", "solves"), [("per-row", 3), ("condensed", 0)])
-def test_only_the_papers_way_solves_for_all_rows_in_each_step(way, solves, monkeypatch):
+def test_only_the_papers_method_solves_for_all_rows_in_each_step(
+    way, solves, monkeypatch
+):
     calls, congruence = [], CholeskyInverse.congruence
     monkeypatch.setattr(
         CholeskyInverse, "congruence", lambda s, B: calls.append(B) or congruence(s, B)
     )
     done = analyse(1, 1, solve=solve, condense=WAYS[way], steps=3)
 
-    assert len(calls) == (solves + 1 if solves else 0)  # one more to recover u
+    assert len(calls) == (solves + 1 if solves else 0)  # one more solve to recover u
     assert all(B.shape[0] == done.dual.q.size for B in calls)
 
 
@@ -303,7 +308,7 @@ def test_an_analysis_solves_the_problem_of_its_last_step():
     assert s.z.max() > 0.1
 
 
-def test_an_unsolved_qp_is_not_timed_in_silence():
+def test_an_unsolved_qp_raises_an_error():
     def lost(qp):
         return SMALBE(max_steps=1).prepare(qp, 1e-8)()
 
@@ -311,7 +316,7 @@ def test_an_unsolved_qp_is_not_timed_in_silence():
         analyse(1, 1, solve=lost, condense=True, steps=1)
 
 
-def test_what_was_not_measured_says_so(folder):
+def test_fitted_times_are_marked_as_fitted(folder):
     """Rows beyond the largest dense size are c·n³ and c·n², marked as fitted."""
     rows = [r for r in rows_of(folder / "tables" / "figure5.csv")
             if r["method"] == "pinv"]  # fmt: skip
@@ -338,7 +343,7 @@ def test_a_fit_of_cubes_returns_their_factor():
     assert (law.since, law.until) == (40, 80)
 
 
-def test_the_band_of_a_fit_holds_the_factors_of_the_sizes_it_rests_on():
+def test_the_band_of_a_fit_contains_the_factors_of_all_fitted_sizes():
     law = fit(times(cubes(10, 20, 40, 80, factor=lambda n: n * 1e-9), "n"), 3)
 
     assert (law.low, law.high) == pytest.approx((44e-9, 88e-9))
@@ -346,7 +351,7 @@ def test_the_band_of_a_fit_holds_the_factors_of_the_sizes_it_rests_on():
 
 
 def test_parts_are_summed_within_each_repeat_before_the_median_is_taken():
-    """Repeats take 1 + 9, 2 + 2 and 3 + 3: the median of sums is 6, not 2 + 3."""
+    """The parts of the repeats take 1 + 9, 2 + 2 and 3 + 3; the median sum is 6."""
     seconds = {"a": (1, 2, 3), "b": (9, 2, 3)}
     rows = [
         {"n": 5, "part": part, "repeat": k, "seconds": s}
@@ -359,7 +364,7 @@ def test_parts_are_summed_within_each_repeat_before_the_median_is_taken():
 
 
 def test_published_times_are_compared_at_the_published_size_only(experiment):
-    """A ratio of a smaller problem's time to the paper's would mislead."""
+    """The time of a smaller problem is not compared with the published time."""
 
     def ratios(experiment):
         final = next(s for s in compose(experiment).sections if s.name == "results")
@@ -379,7 +384,7 @@ def test_published_times_are_compared_at_the_published_size_only(experiment):
     )
     assert float(compared[-1].split()[0]) == pytest.approx(29.99 / total, rel=0.01)
     assert float(compared[4].split()[0]) == pytest.approx(26.764 / set_up, rel=0.01)
-    assert compared[6] == "–"  # the paper says nothing of recovery
+    assert compared[6] == "–"  # the paper does not state the time of recovery
 
 
 def with_orders(p):
@@ -440,7 +445,7 @@ def evidence(name):
 
 
 def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
-    """The wrong answer of `lazy` after 1 ns is a cross and does not affect the axis."""
+    """The wrong answer of `lazy` after 1 ns is drawn as a cross outside the axes."""
     figure = fleet_figure(evidence("paper-fleet"))
     upper, strips = (row.panels for row in figure.rows)
 
@@ -463,7 +468,7 @@ def test_a_planted_growth_is_tabulated_and_failures_as_such():
     assert smalbe["p [95 %]"].value == pytest.approx(2)
     assert smalbe["m = 200"].value == pytest.approx(0.0404)
     assert lazy["m = 200"].text.startswith("wrong")
-    assert lazy["p [95 %]"].value is None  # of two sizes
+    assert lazy["p [95 %]"].value is None  # only two sizes are verified
 
 
 def test_dual_totals_include_the_dualisation():
@@ -507,7 +512,7 @@ def test_triplets_give_the_same_matrix_as_the_compiled_loops():
     assert abs(K - stiffness_by_triplets(mesh, D)).max() <= 1e-13 * abs(K).max()
 
 
-def test_contestants_take_turns_and_every_lap_is_a_row():
+def test_methods_are_interleaved_with_one_row_per_measurement():
     calls = []
     entrants = {
         name: timed_as_one(lambda name=name: calls.append(name)) for name in "ab"
@@ -521,7 +526,7 @@ def test_contestants_take_turns_and_every_lap_is_a_row():
     assert all(r["seconds"] >= 0 and r["part"] == "all" for r in rows)
 
 
-def test_rounds_end_when_time_is_spent_but_not_before_the_least():
+def test_repeats_end_at_the_time_limit_after_the_minimum_number():
     calls = []
     entrant = {"a": timed_as_one(lambda: calls.append(1))}
     race(entrant, Rounds(most=9, least=4, seconds=-1), warm=False)
@@ -529,7 +534,7 @@ def test_rounds_end_when_time_is_spent_but_not_before_the_least():
     assert len(calls) == 4
 
 
-def test_a_stopwatch_sums_the_laps_of_a_part(monkeypatch):
+def test_a_stopwatch_sums_the_times_of_a_part(monkeypatch):
     times = iter([0.0, 1.0, 3.0, 6.0])
     monkeypatch.setattr(
         "mortarbench.problems.experiments.clock.perf_counter", lambda: next(times)
@@ -541,7 +546,7 @@ def test_a_stopwatch_sums_the_laps_of_a_part(monkeypatch):
     assert watch.laps == {"a": 4.0, "b": 2.0}
 
 
-def test_an_experiment_survives_its_files_to_the_last_digit(tmp_path):
+def test_an_experiment_is_read_back_exactly(tmp_path):
     rows = [{"n": 3, "method": "a, \"b\"", "seconds": 0.1 + 0.2},
             {"n": 4, "method": "c", "seconds": 1e-17}]  # fmt: skip
     given = Experiment(setting={"λ": [1, None]}, tables={"t": rows}, states={})
@@ -566,7 +571,7 @@ def test_damaged_data_are_named(tmp_path, file, text):
 
 
 @pytest.mark.slow
-def test_the_command_writes_it_all(tmp_path):
+def test_the_command_writes_all_files(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "harness", "paper", "--quick", "--out", tmp_path],
         capture_output=True, text=True, timeout=1200, check=True,

@@ -1,4 +1,4 @@
-"""Formulas of prose arrive whole in every format."""
+"""Formulas in prose are complete in every format."""
 
 import re
 from types import SimpleNamespace

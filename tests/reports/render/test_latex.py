@@ -1,4 +1,4 @@
-"""LaTeX tables: labels, tables of many pages, and what TeX says of all of them."""
+"""LaTeX tables: labels, tables of many pages, and compilation of all tables."""
 
 import re
 import shutil
@@ -23,7 +23,7 @@ def table(rows, caption="Times."):
 
 
 def compiled(folder, body):
-    """Run pdflatex on a document; return the pages, or fail with what TeX said."""
+    """Run pdflatex on a document; return the number of pages, or fail with its log."""
     source = folder / "main.tex"
     source.write_text(
         "\\documentclass{article}\n\\usepackage[utf8]{inputenc}\n"
@@ -32,7 +32,7 @@ def compiled(folder, body):
         "utf-8",
     )
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", source.name]
-    for _ in range(2):  # longtable and \ref read what the first run wrote
+    for _ in range(2):  # longtable and \ref need two runs
         done = subprocess.run(
             command, cwd=folder, capture_output=True, timeout=300, check=False
         )
@@ -42,19 +42,19 @@ def compiled(folder, body):
     return int(re.search(r"Output written on .*?\((\d+) page", log, re.DOTALL)[1])
 
 
-def test_every_table_of_a_section_has_a_label_of_its_own():
+def test_every_table_of_a_section_has_its_own_label():
     text = latex((table(2), table(3)), name="times")
     assert re.findall(r"\\label\{(.*?)\}", text) == ["tab:times-1", "tab:times-2"]
     assert r"\caption{Times.}\label{tab:times}" in latex((table(2),), name="times")
 
 
-def test_a_table_beyond_one_page_is_a_longtable_and_says_so():
+def test_a_long_table_is_a_longtable():
     short, long = latex((table(ROWS),), name="a"), latex((table(ROWS + 1),), name="a")
     assert r"\begin{table}" in short
     assert short.startswith("% \\usepackage{booktabs}\n")
     assert r"\begin{longtable}{lr}" in long
     assert long.startswith("% \\usepackage{booktabs,longtable}\n")
-    assert long.count(r"\toprule") == 2  # on the first page, and on all others
+    assert long.count(r"\toprule") == 2  # for the first page, and for the other pages
     assert r"\begin{table}" not in long
     assert len(re.findall(r"case \d+ &", long)) == ROWS + 1
 

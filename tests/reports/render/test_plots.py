@@ -1,4 +1,4 @@
-"""Points in files and on the page, compared with those of the figure's value."""
+"""Points of figures in files and on the page, compared with the data."""
 
 import json
 import pickle
@@ -66,7 +66,7 @@ def drawn(*marks, **panel):
     return axes
 
 
-def test_a_line_has_its_look_its_axes_its_solver_and_its_runs():
+def test_a_line_has_look_axes_solver_and_runs():
     size = Axis(label="size $n$", log=True, low=1, high=100)
     panel = shown(TIMES, x=size, y=Axis(label="time in s"))
     trace, *_ = panel["traces"]
@@ -105,7 +105,7 @@ def test_files_and_the_page_show_the_same_points_error_bars_and_ends_of_axes(log
         assert panel[direction]["log"] is log
 
 
-def test_error_bars_along_x_lie_along_x():
+def test_horizontal_error_bars_are_horizontal():
     series = Series(
         x=(1,), y=(5,), look=look(0),
         intervals=Intervals(low=(0.5,), high=(3,), along="x"),
@@ -118,10 +118,10 @@ def test_error_bars_along_x_lie_along_x():
     np.testing.assert_allclose(segments.get_segments(), [[(0.5, 5), (3, 5)]])
 
 
-def test_axes_hold_all_points_and_the_ends_of_their_error_bars_with_a_margin():
-    """A margin is a twentieth of a logarithmic axis that spans a decade or more.
+def test_axes_contain_all_points_and_error_bars_with_a_margin():
+    """The margin is 5 % of a logarithmic axis that spans a decade or more.
 
-    From 0.5 to 4 there is less: the axis spans one decade, and the points its middle.
+    For points from 0.5 to 4, the axis spans one decade with the points in its middle.
     """
     (panel,) = fitted(figure(TIMES, x=LOG, y=LOG)).panels
 
@@ -135,7 +135,7 @@ def test_axes_hold_all_points_and_the_ends_of_their_error_bars_with_a_margin():
 
 @pytest.mark.parametrize("log", [False, True])
 @pytest.mark.parametrize("values", [(), (3.0,), (0.0, 0.0), (np.nan, np.inf), (-1.0,)])
-def test_any_points_make_an_axis_that_has_two_ends(values, log):
+def test_axes_of_any_points_have_two_ends(values, log):
     series = Series(x=values, y=values, look=look(0))
     (panel,) = fitted(figure(series, x=Axis(log=log), y=Axis(log=log))).panels
 
@@ -145,7 +145,7 @@ def test_any_points_make_an_axis_that_has_two_ends(values, log):
     drawn(series, x=Axis(log=log), y=Axis(log=log))
 
 
-def test_axes_of_one_name_have_the_same_ends_and_others_their_own():
+def test_axes_with_the_same_name_share_their_ends():
     shared, own = Axis(shared="n"), Axis()
     near, far = (Series(x=(0, at), y=(0, at), look=look(0)) for at in (1, 9))
     both = [Panel(x=shared, y=own, marks=(one,)) for one in (near, far)]
@@ -168,7 +168,7 @@ def test_an_axis_of_categories_has_their_names_from_top_to_bottom():
     assert axes.get_ylim() == (-1.6, 0.6)
 
 
-def test_a_key_acts_for_the_solver_that_it_names():
+def test_a_legend_key_refers_to_its_solver():
     keys = tuple(Key(label=legible(s), look=look(i), solver=s)
                  for s, i in SOLVERS.items())  # fmt: skip
     bound = Key(label="bound", look=Look(colour="#000000"))
@@ -186,7 +186,7 @@ def test_a_key_acts_for_the_solver_that_it_names():
     ]
 
 
-def test_legends_of_rows_are_keys_of_the_whole():
+def test_legends_of_rows_are_keys_of_the_whole_figure():
     rows = tuple(
         Row(
             panels=figure(TIMES).panels,
@@ -218,8 +218,8 @@ def test_the_colours_of_a_bar_are_keys_on_the_page():
     ]  # fmt: skip
 
 
-def test_a_band_of_steps_goes_around_what_lies_between():
-    """1 to 2 until x = 1, 0 to 3 until x = 2: area 1 + 3."""
+def test_the_outline_of_a_stepped_band_encloses_its_area():
+    """The band from 1 to 2 until x = 1 and from 0 to 3 until x = 2 has area 1 + 3."""
     band = Area(
         x=(0, 1, 2), low=(1, 0, 0), high=(2, 3, 3), colour="#112233", opacity=0.25,
         step=True, solver="b2",
@@ -253,7 +253,7 @@ def test_segments_rules_and_texts_are_where_they_are():
     ]  # fmt: skip
     axes = drawn(strokes, rules=(rule,), texts=(text,))
     assert [list(one.get_ydata()) for one in axes.lines] == [[10, 10]]
-    assert axes.get_ylim()[1] > 10  # a rule is seen
+    assert axes.get_ylim()[1] > 10  # the axis contains the rule
 
 
 def test_a_long_line_keeps_its_ends_and_its_extremes_on_the_page_and_all_in_files():
@@ -268,7 +268,7 @@ def test_a_long_line_keeps_its_ends_and_its_extremes_on_the_page_and_all_in_file
     assert len(drawn(line).lines[0].get_xdata()) == 50_000
 
 
-def test_a_line_whose_points_have_runs_of_their_own_keeps_all_of_them():
+def test_a_line_with_runs_per_point_keeps_all_points():
     n = MOST + 100
     runs = tuple((f"r{i}",) for i in range(n))
     line = Series(x=tuple(range(n)), y=(1.0,) * n, look=look(0), runs=runs)
@@ -277,7 +277,7 @@ def test_a_line_whose_points_have_runs_of_their_own_keeps_all_of_them():
     assert len(trace["x"]) == len(trace["runs"]) == n
 
 
-def test_a_figure_is_plain_data_that_can_be_compared_and_sent_to_a_process():
+def test_figures_can_be_compared_and_pickled():
     one = figure(TIMES, x=LOG, y=categories(["a"]))
 
     assert pickle.loads(pickle.dumps(one)) == one
@@ -293,7 +293,7 @@ def test_a_figure_is_plain_data_that_can_be_compared_and_sent_to_a_process():
         {"intervals": Intervals(low=(1,), high=(2,))},
     ],
 )
-def test_points_whose_numbers_do_not_fit_are_refused(broken):
+def test_points_of_inconsistent_length_are_refused(broken):
     with pytest.raises(ValueError, match=r"differ in length|lists of runs"):
         Series(**{"x": (1, 2, 3), "y": (1, 2, 3), "look": look(0), **broken})
 
@@ -305,14 +305,14 @@ def test_formulas_read_as_text():
     assert plain(legible("$x_1$ and _y")) == "$x_1$ and _y"
 
 
-def test_json_of_the_page_ends_no_script():
+def test_json_of_the_page_cannot_end_the_script():
     text = script({"a": "</script><!-- \u2028 & \ud800", "b": float("nan")})
     assert not set("<>&") & set(text)
     assert text.isascii()
     assert json.loads(text) == {"a": "</script><!-- \u2028 & \ud800", "b": None}
 
 
-def test_measurements_behind_a_cell_are_packed_as_stretches():
+def test_measurements_behind_a_cell_are_packed_as_ranges():
     rows = rows_of([record(f"r{i}") for i in range(9)])
     assert spans(["r2", "r3", "r4", "r8", "r0", "gone"], rows) == [2, 3, 8, 1, 0, 1]
     assert cell(Cell(text="7", value=7.0, title="run r2, r3"), rows) == [
@@ -321,14 +321,14 @@ def test_measurements_behind_a_cell_are_packed_as_stretches():
     assert cell(Cell(text="case"), rows) == "case"
 
 
-def test_only_what_a_cell_says_last_names_its_measurements():
+def test_only_run_ids_at_the_end_of_a_title_count():
     assert named("run a, b") == ["a", "b"]
     assert named("ended · run a") == ["a"]
     assert named("not run") == []
     assert named("overrun a") == []
 
 
-def test_a_table_tells_its_solver_and_its_columns_of_words():
+def test_table_data_contain_solver_and_text_columns():
     made = Table(caption="", columns=("case",), rows=((Cell(text="x"),),), solver="b")
     assert table(made, {}) == {
         "columns": ["case"], "words": 1, "solver": "b", "rows": [["x"]],

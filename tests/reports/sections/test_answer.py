@@ -1,4 +1,4 @@
-"""The report opens with who was fastest: no more than the measurements bear out."""
+"""Opening of the report: the fastest solver, if the measurements support the claim."""
 
 import re
 from functools import partial
@@ -38,7 +38,7 @@ def evidence(tmp_path):
 
 @pytest.fixture
 def opened(evidence):
-    """Factory: statements of the report's first sections, by their subjects."""
+    """Return a function from records to the opening statements, by subject."""
 
     def make(records):
         first, second = compose(evidence(records)).sections[:2]
@@ -54,7 +54,7 @@ def found(evidence):
 
 
 def one_case(record, seed=1, blocks=6, case=0, **factors):
-    """Measure one case: what slows a block down slows all solvers down."""
+    """Return records of one case, in which slowdowns of blocks affect all solvers."""
     rng = np.random.default_rng(seed)
     slow = rng.lognormal(0, 0.3, blocks)
     return [
@@ -65,7 +65,7 @@ def one_case(record, seed=1, blocks=6, case=0, **factors):
 
 
 def many_cases(record, cases=8, seed=1, scatter=0.05, **factors):
-    """Measure cases of very different sizes, once each."""
+    """Return records of cases of very different sizes, measured once each."""
     rng = np.random.default_rng(seed)
     return [
         record(s, k, 1e-3 * 2.0**k * factor * rng.lognormal(0, scatter))
@@ -75,14 +75,14 @@ def many_cases(record, cases=8, seed=1, scatter=0.05, **factors):
 
 
 def ratio_in(text):
-    """Read the first ratio and its interval."""
+    """Return the first ratio in a text and its interval."""
     value, low, high = re.search(
         r"took (?:at least )?(\S+) \[(\S+), (\S+)\]", text
     ).groups()
     return float(value), float(low), float(high)
 
 
-# ---- who is named
+# ---- the fastest solver
 
 
 @pytest.mark.parametrize("make", [one_case, many_cases])
@@ -98,7 +98,7 @@ def test_a_planted_winner_is_named_with_its_planted_ratio(record, opened, make):
 
 
 @pytest.mark.parametrize("make", [one_case, many_cases])
-def test_equal_solvers_are_a_tie_and_the_next_is_behind_it(record, opened, make):
+def test_equal_solvers_tie_and_the_next_solver_is_named(record, opened, make):
     (claim,) = opened(make(record, a=1.0, b=1.0, slow=3.0))["dual"].claims
     assert claim.startswith("A tie")
     assert re.search(r"\b(a and b|b and a) do not differ significantly", claim)
@@ -110,15 +110,13 @@ def test_equal_solvers_are_a_tie_and_the_next_is_behind_it(record, opened, make)
 @pytest.mark.parametrize(
     ("logs", "why"),
     [
-        # signs of six cases: five of one sign occur by chance in 2 of 2⁵
+        # with one of six signs reversed, the sign-flip test is not significant
         ([0.3, 0.3, 0.3, 0.3, 0.3, -0.01], "b took 1.28 [0.990, 1.46] times as long"),
-        # all of one sign, but the interval of their mean holds 0
+        # all signs agree, but the interval of the mean contains 0
         ([0.01, 0.01, 0.01, 0.01, 0.01, 3.0], "b took 1.66 [0.4"),
     ],
 )
-def test_a_winner_over_cases_takes_both_the_interval_and_the_signs(
-    record, opened, logs, why
-):
+def test_a_winner_needs_both_the_interval_and_the_signs(record, opened, logs, why):
     records = [
         r for k, log in enumerate(logs)
         for r in (record("a", k, 0.01), record("b", k, 0.01 * np.exp(log)))
@@ -129,10 +127,8 @@ def test_a_winner_over_cases_takes_both_the_interval_and_the_signs(
     assert "more repeats may separate them (--repeats 9)" in claim
 
 
-def test_where_few_of_many_cases_were_solved_no_ratio_over_cases_is_told(
-    record, opened
-):
-    """An example is a sequence that was asked for more steps than it has."""
+def test_few_solved_cases_have_no_ratio_over_cases(record, opened):
+    """This occurs, for example, if more steps are requested than a sequence has."""
     records = [
         record(s, k, 0.01, **({} if k < 4 else {"verdict": Verdict.DECLINED}))
         for k in range(9) for s in "ab"
@@ -145,7 +141,7 @@ def test_where_few_of_many_cases_were_solved_no_ratio_over_cases_is_told(
 @pytest.mark.parametrize(
     "cases", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 7))]
 )
-def test_of_equal_solvers_one_is_named_in_one_run_of_twenty_at_most(
+def test_a_winner_among_equal_solvers_is_named_in_five_percent_of_runs(
     record, evidence, cases
 ):
     rng = np.random.default_rng(cases)
@@ -156,13 +152,11 @@ def test_of_equal_solvers_one_is_named_in_one_run_of_twenty_at_most(
             for case in range(cases) for s in "abcd" for i in range(4)
         ]  # fmt: skip
         named += found(evidence(records))[0].finding is Finding.FASTEST
-    assert named <= 10  # 5 expected at most; more than 10 once in a hundred
+    assert named <= 10  # at most 5 are expected; P(more than 10) is about 1 %
 
 
 @pytest.mark.parametrize("make", [one_case, many_cases])
-def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
-    record, opened, make
-):
+def test_a_fast_solver_with_refuted_claims_does_not_win(record, opened, make):
     lies = dict(verdict=Verdict.WRONG, claimed="solved", dual=0.03)
     liar = [r.replace(**lies) for r in make(record, liar=0.01)]
     statement = opened(make(record, honest=1.0, slow=2.0) + liar)["dual"]
@@ -175,7 +169,7 @@ def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
     assert "verdicts" in statement.evidence
 
 
-def test_one_refuted_repeat_is_enough_not_to_compete(record, opened):
+def test_one_refuted_repeat_excludes_a_solver(record, opened):
     records = one_case(record, fast=0.1, honest=1.0, slow=2.0)
     records[3] = records[3].replace(verdict=Verdict.INACCURATE, dual=1e-3)
     statement = opened(records)["dual"]
@@ -185,9 +179,7 @@ def test_one_refuted_repeat_is_enough_not_to_compete(record, opened):
     )
 
 
-def test_a_solver_that_fails_half_of_the_cases_is_not_the_fastest_of_all(
-    record, opened
-):
+def test_a_solver_that_fails_on_half_of_the_cases_is_not_the_fastest(record, opened):
     half = [
         r.replace(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
         if r.params["n"] % 2 else r
@@ -198,23 +190,22 @@ def test_a_solver_that_fails_half_of_the_cases_is_not_the_fastest_of_all(
     assert "half reached the iteration limit on 4 of 8 cases" in statement.remarks[0]
 
 
-def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
-    record, opened
-):
+def test_faster_solvers_that_are_not_always_verified_are_named(record, opened):
     almost = many_cases(record, almost=0.5)
     almost[0] = almost[0].replace(verdict=Verdict.CRASHED)
     statement = opened(many_cases(record, sure=1.0, slow=2.0) + almost)["dual"]
     assert statement.claims[0].startswith("sure was the fastest over 8 cases")
     faster = statement.remarks[0]
     assert faster.startswith(
-        "Faster, but not verified on every case, at tol 1e-6: almost (7 of 8 cases"
+        "Faster, but not verified on every case, at tol 1e-6: almost (verified on 7 of "
+        "8 cases"
     )
     value, low, high = re.search(r"(\S+) \[(\S+), (\S+)\] times", faster).groups()
     assert 0.4 < float(low) <= float(value) <= float(high) < 0.6
     assert float(value) == pytest.approx(0.5, rel=0.1)
 
 
-def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
+def test_no_winner_is_named_if_every_solver_failed_on_some_case(record, opened):
     a, b = many_cases(record, a=1.0), many_cases(record, b=2.0)
     a[0] = a[0].replace(verdict=Verdict.TIME_LIMIT)
     b[5] = b[5].replace(verdict=Verdict.CRASHED, message="signal 11")
@@ -222,12 +213,12 @@ def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "No solver is named the fastest over 8 cases at tol 1e-6: no solver was "
-        "verified on all of them; a was verified on most (7).",
+        "verified on all cases; a was verified on most cases (7).",
     )
     assert "b crashed on 2 of 8 cases (signal 11)" in statement.remarks[0]
 
 
-def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, opened):
+def test_a_case_that_no_solver_solved_is_counted_separately(record, opened):
     records = [
         r.replace(verdict=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
         for r in many_cases(record, fast=1.0, slow=3.0)
@@ -237,13 +228,13 @@ def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, ope
     assert "No solver solved 1 further case." in statement.remarks
 
 
-def test_a_single_solver_has_nobody_to_be_faster_than(record, opened):
+def test_a_single_solver_is_not_compared(record, opened):
     (claim,) = opened(one_case(record, lonely=1.0))["dual"].claims
     assert claim.startswith("Only lonely was measured on the only case at tol 1e-6:")
     assert claim.endswith("there is no other solver to compare with.")
 
 
-def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
+def test_the_only_verified_solver_is_not_named_the_fastest(record, opened):
     failed = [r.replace(verdict=Verdict.FAILED, message="gave up")
               for r in one_case(record, other=0.5)]  # fmt: skip
     (claim,) = opened(one_case(record, lonely=1.0) + failed)["dual"].claims
@@ -251,7 +242,7 @@ def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
     assert claim.endswith(": only lonely was verified.")
 
 
-def test_a_form_without_a_verified_answer_says_so(record, opened):
+def test_a_form_without_verified_answers_is_reported(record, opened):
     records = [
         r.replace(verdict=Verdict.ITERATION_LIMIT)
         for r in one_case(record, a=1.0, b=2.0)
@@ -259,7 +250,7 @@ def test_a_form_without_a_verified_answer_says_so(record, opened):
     assert opened(records)["dual"].claims == ("No answer was verified at tol 1e-6.",)
 
 
-def test_one_repeat_of_a_case_gives_no_winner_and_says_what_is_missing(record, opened):
+def test_one_repeat_gives_advice_but_no_winner(record, opened):
     statement = opened(one_case(record, blocks=1, fast=1.0, slow=9.0))["dual"]
     (claim,) = statement.claims
     assert claim.startswith("fast had the smallest time on the only case at tol 1e-6")
@@ -269,7 +260,7 @@ def test_one_repeat_of_a_case_gives_no_winner_and_says_what_is_missing(record, o
     assert "two blocks of repeats (--repeats 9)" in claim
 
 
-def test_a_few_cases_are_told_one_by_one_and_say_nothing_of_others(record, opened):
+def test_results_on_few_cases_do_not_extend_to_other_cases(record, opened):
     records = [
         r for case in range(3)
         for r in one_case(record, seed=case, case=case, fast=1.0, slow=2.0 + case)
@@ -285,7 +276,7 @@ def test_a_few_cases_are_told_one_by_one_and_say_nothing_of_others(record, opene
     )
 
 
-def test_where_each_has_its_case_nobody_is_fastest(record, opened):
+def test_different_winners_by_case_give_no_fastest_solver(record, opened):
     records = [
         *one_case(record, case=0, a=1.0, b=2.0),
         *one_case(record, case=1, a=2.0, b=1.0),
@@ -297,10 +288,10 @@ def test_where_each_has_its_case_nobody_is_fastest(record, opened):
     )
 
 
-# ---- what is not mixed
+# ---- separate comparisons
 
 
-def test_forms_and_tolerances_have_answers_of_their_own(record, opened):
+def test_forms_and_tolerances_have_separate_statements(record, opened):
     def measured(form, tol, **factors):
         return [
             r.replace(form=form, tol=tol, case=f"box/n=0/{form}",
@@ -320,7 +311,7 @@ def test_forms_and_tolerances_have_answers_of_their_own(record, opened):
     assert told["primal"].claims[0].startswith("a was the fastest")
 
 
-def test_many_tolerances_are_no_wall_of_text(record, opened):
+def test_only_a_few_of_many_tolerances_are_described(record, opened):
     tols = [10.0**-k for k in range(2, 10)]
     records = [
         r.replace(tol=tol, run_id=f"{r.run_id}-{tol}")
@@ -333,7 +324,7 @@ def test_many_tolerances_are_no_wall_of_text(record, opened):
     assert "5 more tolerances are in the sections below." in statement.remarks
 
 
-def test_a_null_arm_is_nobodys_rival(record, opened):
+def test_a_null_arm_does_not_compete(record, opened):
     records = one_case(record, a=1.0, b=2.0)
     null = [r.replace(solver="a (null)", role="null", run_id=f"{r.run_id}-null")
             for r in one_case(record, seed=2, a=1.0)]  # fmt: skip
@@ -356,9 +347,7 @@ def test_sequences_are_compared_with_sequences(record, opened):
     assert told["dual, sequence"].claims[0].startswith("b (sequence) was the fastest")
 
 
-def test_of_a_sweep_the_cheapest_verified_answers_compete_at_one_accuracy(
-    record, opened
-):
+def test_the_fastest_verified_answers_of_sweeps_are_compared(record, opened):
     def swept(solver, tol, seconds, verdict=Verdict.VERIFIED):
         return [
             record(solver, 0, seconds * (1 + i / 100), i, tol=tol, accuracy=1e-6,
@@ -376,8 +365,8 @@ def test_of_a_sweep_the_cheapest_verified_answers_compete_at_one_accuracy(
     assert not any(text.startswith("Failed") for text in statement.remarks)
 
 
-def test_equal_certified_errors_are_compared_where_there_are_any(record, opened):
-    """Both ask for the same; b hands over what is a hundred times more accurate."""
+def test_times_at_equal_certified_error_are_compared(record, opened):
+    """At equal tolerances, the answers of b are a hundred times more accurate."""
     records = [
         record(s, 0, factor * (8 - np.log10(tol)) * 1e-3 * (1 + i / 1000), i, tol=tol,
                energy_bound=tol / better)
@@ -391,7 +380,7 @@ def test_equal_certified_errors_are_compared_where_there_are_any(record, opened)
     assert "accuracy" in statement.evidence
 
 
-def test_times_of_different_environments_name_nobody(record, opened):
+def test_times_of_different_environments_give_no_winner(record, opened):
     records = [
         r.replace(environment="other" if r.solver == "new" else "abc")
         for r in one_case(record, old=1.0, new=0.5)
@@ -405,7 +394,7 @@ def test_times_of_different_environments_name_nobody(record, opened):
     assert opened(nodes)["dual"].claims[0].startswith("a was the fastest")
 
 
-def test_who_declined_is_told_apart_from_who_failed(record, opened):
+def test_declined_cases_are_reported_separately_from_failures(record, opened):
     shy = record(
         "shy", 0, None, verdict=Verdict.DECLINED, claimed="", message="too large"
     )
@@ -425,7 +414,7 @@ def test_many_failures_are_counted_not_listed(record, opened):
     assert "and 23 more" in failed
 
 
-# ---- as it is read
+# ---- rendering
 
 
 def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
@@ -452,7 +441,7 @@ def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_plain_sentences_are_those_of_the_report(record, tmp_path):
+def test_plain_sentences_equal_the_sentences_of_the_report(record, tmp_path):
     with Journal(tmp_path, "test") as journal:
         for r in one_case(record, fast=1.0, slow=2.0):
             journal.append(r)
@@ -511,7 +500,7 @@ def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
     assert shown == own
 
 
-def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence):
+def test_unverified_answers_are_at_the_edge_with_their_verdict(record, evidence):
     lost = [r.replace(verdict=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
     made = evidence(one_case(record, a=1.0, b=2.0) + lost)
     (panel,) = fastest_figure(found(made), made.solvers).panels

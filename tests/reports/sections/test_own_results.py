@@ -1,4 +1,4 @@
-"""A suite of one solver opens with its own result, not with a race against nobody."""
+"""Opening of the report on a single solver: growth, condition numbers, failures."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ def record():
 
 
 def sized(record, iterations, solver="a", **changes):
-    """One answer per size; the k-th has 100·4ᵏ degrees of freedom."""
+    """Return one answer per size; the k-th size has 100·4ᵏ degrees of freedom."""
     return [
         record(solver, 4**k - 1, 1e-3 * 4**k, iterations=its, **changes)
         for k, its in enumerate(iterations)
@@ -62,7 +62,7 @@ def test_the_first_figure_shows_iterations_from_zero_on(record, page):
     assert {run for runs in series.runs for run in runs} == {r.run_id for r in records}
 
 
-def test_condition_numbers_have_a_range_of_their_own(record, page):
+def test_condition_numbers_have_separate_ranges(record, page):
     records = [
         r.replace(quantities={**r.quantities, "kappa": 3.0 + k, "kappa_lumped": 2.0})
         for k, r in enumerate(sized(record, [9, 9, 9, 9]))
@@ -73,7 +73,7 @@ def test_condition_numbers_have_a_range_of_their_own(record, page):
     )
 
 
-def test_failures_of_the_only_solver_are_told_beside_its_result(record, page):
+def test_failures_of_the_only_solver_are_reported(record, page):
     records = sized(record, [9, 9, 9, 9, 9])
     records[2] = records[2].replace(verdict=Verdict.WRONG, dual=0.03)
     own, dual = page(records).sections[0].statements
@@ -81,7 +81,7 @@ def test_failures_of_the_only_solver_are_told_beside_its_result(record, page):
     assert "a claimed success but was wrong on 1 of 5 cases" in dual.remarks[0]
 
 
-def test_two_solvers_are_compared_and_nothing_else_comes_first(record, page):
+def test_a_report_on_two_solvers_opens_with_their_comparison(record, page):
     records = sized(record, [9] * 6) + sized(record, [9] * 6, solver="b")
     statements = page(records).sections[0].statements
     assert [s.subject for s in statements] == ["dual"]

@@ -1,4 +1,4 @@
-"""Sections register themselves, with their places and what they need."""
+"""Registration of sections with positions and required measurements."""
 
 from pathlib import Path
 
@@ -14,12 +14,12 @@ FOLDER = Path(__file__).parents[2] / "data" / "results-e247e1f-smoke"
 
 @pytest.fixture
 def analysis(monkeypatch):
-    """Return an analysis; what a test registers is gone after it."""
+    """Return an analysis; sections that a test registers are removed after the test."""
     monkeypatch.setattr(sections, "_ENTRIES", sections._entries())
     return Analysis(read_evidence(FOLDER))
 
 
-def test_a_section_has_its_place_and_its_parts_are_sorted_by_type(analysis):
+def test_a_section_has_a_position_and_sorts_its_parts_by_type(analysis):
     table = Table.of("T", [1, 2], [("n", Cell.number)])
     said = Statement(subject="x", claims=("yes",))
 
@@ -37,7 +37,7 @@ def test_a_section_has_its_place_and_its_parts_are_sorted_by_type(analysis):
     assert [row[0].value for row in table.rows] == [1, 2]
 
 
-def test_a_section_without_parts_is_listed_with_what_it_needs(analysis):
+def test_a_section_without_parts_is_listed_with_its_requirements(analysis):
     @section(13, "extra", "Extra", "Extra: it needs a moon.")
     def extra(_):
         yield from ()

@@ -1,4 +1,4 @@
-"""The model of a solve on ranks, against times that were made by known parameters."""
+"""Cost model of a solve on ranks, fitted to times with known parameters."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ SENT = Communication(
 
 
 def sent_on(N):
-    """Send the same on more ranks: deeper trees, more neighbours."""
+    """Return the communication on N ranks, with a deeper tree and more neighbours."""
     depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
     return replace(
         SENT, ranks=N, reduction_seconds=5e-6 * depth, messages=120 * neighbours
@@ -22,7 +22,7 @@ def sent_on(N):
 
 
 def modelled(N, work=2.0, repeated=0.1, slowdown=1.0, sent=SENT):
-    """Evaluate the model by hand."""
+    """Evaluate the formula of the model directly."""
     depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
     waits = 300 * 5e-6 * depth + 120 * 2e-6 * neighbours + (N > 1) * 4e6 / 2e9
     return (slowdown if N > 1 else 1.0) * (work / N + repeated) + waits
@@ -37,7 +37,7 @@ def test_known_work_is_recovered_and_predicted_beyond(ranks):
     assert found.speed_up(64).value == pytest.approx(2.1 / modelled(64))
 
 
-def test_ranks_that_slow_one_another_down_are_told_by_copies():
+def test_copies_reveal_the_slowdown_of_ranks():
     times = {N: [modelled(N, slowdown=1.25)] * 3 for N in (1, 2, 4)}
     copies = {N: [1.25 * 2.1] * 3 for N in (2, 4)}
     found = cost_model(times, copies, [sent_on(4)])
@@ -47,8 +47,8 @@ def test_ranks_that_slow_one_another_down_are_told_by_copies():
 
 
 @pytest.mark.parametrize("copies", [1.3, 1.6, 4.0])
-def test_copies_that_disturb_one_another_more_than_ranks_do_are_no_measure(copies):
-    """Ranks that slow each other down by 1.25, C = 0: no larger s leaves C ≥ 0."""
+def test_the_slowdown_of_copies_is_limited_by_nonnegative_c(copies):
+    """The ranks have a slowdown of 1.25 and C = 0, so that C ≥ 0 implies s ≤ 1.25."""
     times = {N: [modelled(N, repeated=0.0, slowdown=1.25)] * 3 for N in (1, 2)}
     found = cost_model(times, {2: [copies * 2.0] * 3}, [SENT])
     assert (found.slowdown, found.work) == pytest.approx((1.25, 2.0))
@@ -56,11 +56,11 @@ def test_copies_that_disturb_one_another_more_than_ranks_do_are_no_measure(copie
     assert found.misfit < 1e-12
 
 
-def test_communication_is_what_was_counted_times_what_it_takes():
+def test_communication_time_is_count_times_unit_cost():
     assert SENT.seconds == pytest.approx([300 * 5e-6, 120 * 2e-6, 4e6 / 2e9])
     assert (growth(1, 2) == 0).all()
     assert (growth(2, 2) == 1).all()
-    # a tree of depth six, six neighbours instead of one, and as many bytes
+    # a tree of depth six, six neighbours instead of one, and equally many bytes
     assert growth(64, 2) == pytest.approx([6, 6, 1])
 
 
@@ -71,21 +71,21 @@ def test_a_network_whose_speed_is_not_known_widens_the_band():
     assert at.high > 1.2 * at.low
 
 
-def test_what_was_sent_on_other_ranks_is_no_basis():
+def test_communication_on_other_numbers_of_ranks_is_refused():
     with pytest.raises(ValueError, match="the communication on 4 ranks"):
         cost_model({N: [modelled(N)] for N in (1, 2, 4)}, {}, [SENT])
 
 
-def test_better_than_shared_work_is_never_negative_work():
+def test_superlinear_speed_up_gives_no_negative_work():
     faster = cost_model({1: [1.0] * 2, 2: [0.3] * 2}, {}, [SENT])  # super-linear
     assert faster.repeated == 0
-    assert faster.misfit > 0.2  # so it is not asked about more ranks
+    assert faster.misfit > 0.2  # too large for predictions
     slower = cost_model({1: [1.0] * 2, 2: [3.0] * 2}, {}, [SENT])
     assert slower.work == 0
     assert slower.speed_up(16).value < 1
 
 
-def test_the_band_of_equal_times_holds_the_fit_and_of_noisy_ones_the_truth():
+def test_the_band_contains_the_true_speed_up():
     rng = np.random.default_rng(3)
     held = 0
     for _ in range(100):
@@ -96,13 +96,13 @@ def test_the_band_of_equal_times_holds_the_fit_and_of_noisy_ones_the_truth():
     assert held >= 85  # 95 % of a hundred
 
 
-def test_one_run_each_has_no_band():
+def test_single_runs_have_no_band():
     found = cost_model({1: [2.0], 2: [1.2]}, {}, [SENT]).speed_up(8)
     assert found.low == found.value == found.high
     assert found.samples == 1
 
 
-def test_half_of_the_ranks_are_lost_where_what_is_alike_takes_as_long():
+def test_the_largest_number_of_ranks_at_half_efficiency():
     free = Communication(
         ranks=2, reductions=0, messages=0, sent=0, reduction_seconds=1e-6,
         message_seconds=1e-6, seconds_per_byte=1e-9,
@@ -113,6 +113,6 @@ def test_half_of_the_ranks_are_lost_where_what_is_alike_takes_as_long():
 
 
 @pytest.mark.parametrize("ranks", [(1,), (2, 4), ()])
-def test_it_takes_one_rank_and_several(ranks):
+def test_a_model_needs_times_on_one_and_several_ranks(ranks):
     with pytest.raises(ValueError, match="one rank and on several"):
         cost_model({N: [1.0] for N in ranks}, {}, [SENT])

@@ -1,4 +1,4 @@
-"""The interval of a median and the exponent of a power law against known truths."""
+"""The interval of a median and the exponent of a power law, for known distributions."""
 
 import numpy as np
 import pytest
@@ -17,14 +17,14 @@ from mortarbench.reports.statistics.intervals import median_interval, power_law
         (9, 2, 8, 1 - 2 * 10 / 512),  # P(X < 2) = (1 + 9)/2⁹
     ],
 )
-def test_the_interval_runs_between_the_right_order_statistics(n, low, high, coverage):
+def test_the_interval_ends_at_the_correct_order_statistics(n, low, high, coverage):
     shuffled = np.random.default_rng(86).permutation(np.arange(1, n + 1))
     interval = median_interval(shuffled)
     assert interval == ((n + 1) / 2, low, high, pytest.approx(coverage), n)
 
 
 @pytest.mark.parametrize("n", [3, 5, 9])
-def test_the_interval_covers_the_median_of_a_skewed_law_as_often_as_it_says(n):
+def test_the_interval_has_its_coverage_for_a_skewed_law(n):
     samples = np.random.default_rng(4711).exponential(size=(4000, n))
     intervals = [median_interval(s) for s in samples]
     hits = np.mean([i.low <= np.log(2) <= i.high for i in intervals])
@@ -40,8 +40,8 @@ def test_a_power_law_without_noise_is_recovered():
     assert fit.high == pytest.approx(1.4)
 
 
-def test_a_law_of_sizes_that_hardly_differ_is_one_though_its_factor_is_no_double():
-    """A factor of e within a hundredth of a per cent: p = 10⁴, c = e^−138155."""
+def test_sizes_that_hardly_differ_give_a_law_with_infinite_factor():
+    """Values grow by a factor e while sizes grow by 0.01 %: p = 10⁴, c = e^−138155."""
     n = 1e6 * np.array([1, 1 + 5e-5, 1 + 1e-4])
     for sign in (1, -1):
         t = 7.0 * (n / n[0]) ** (sign * 1e4)
@@ -75,6 +75,6 @@ def test_the_interval_of_the_exponent_covers_at_its_nominal_rate(sizes):
         ([0, 2, 3], [1, 1, 2]),
     ],
 )
-def test_what_does_not_determine_a_power_law_is_refused(n, t):
+def test_data_that_do_not_determine_a_power_law_are_refused(n, t):
     with pytest.raises(ValueError, match="three different sizes"):
         power_law(n, t)

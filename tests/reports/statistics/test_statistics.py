@@ -1,4 +1,4 @@
-"""Means, ranks and shares over cases, against truths known without the code."""
+"""Means, ranks and shares over cases, compared with independently known values."""
 
 from math import comb
 
@@ -67,7 +67,7 @@ def test_a_convention_changes_the_shift_by_a_factor():
     assert found == pytest.approx([(11 * 13 * 17) ** (1 / 3) - 10, 1])
 
 
-def test_a_failure_is_charged_so_many_limits():
+def test_a_failure_is_charged_multiples_of_the_limit():
     found = group([[1, 1], [1, 1], [INF, 1]], limit=5)
     assert geometric_means(found, Convention(penalty=3.0))[0] == pytest.approx(3)
     one = geometric_means(found, Convention(penalty=1.0))[0]
@@ -137,7 +137,7 @@ def test_intervals_of_a_mean_cover_at_their_nominal_rate(cases):
 
 
 def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate():
-    """Times far above the shift: the ratio of means is that of the medians."""
+    """For times far above the shift, the ratio of means equals the ratio of medians."""
     rng = np.random.default_rng(16)
     hits = []
     for _ in range(300):
@@ -158,7 +158,7 @@ def test_a_constant_ratio_has_no_uncertainty():
     assert found.first.tolist() == [1, 0]
 
 
-def test_the_same_cases_are_drawn_alike():
+def test_equal_cases_give_equal_draws():
     names = ["a", "b", "c", "d", "e"]
     assert (weights(names) == weights(names)).all()
     assert not (weights(names) == weights(names[::-1])).all()
@@ -173,7 +173,7 @@ def test_the_same_cases_are_drawn_alike():
     [(6, 3), pytest.param(12, 20, marks=pytest.mark.slow), (30, 8)],
 )
 @pytest.mark.parametrize("failing", [0.0, 0.1])
-def test_equal_solvers_are_told_apart_once_in_twenty_sets_at_most(
+def test_equal_solvers_differ_significantly_in_at_most_five_percent(
     cases, solvers, failing
 ):
     rng = np.random.default_rng(17)
@@ -186,7 +186,7 @@ def test_equal_solvers_are_told_apart_once_in_twenty_sets_at_most(
     assert found / 250 <= 0.05 + 3 * (0.05 * 0.95 / 250) ** 0.5
 
 
-def test_five_cases_tell_nobody_apart_and_six_do():
+def test_significance_needs_six_cases():
     logs = np.log([[1.0, 100.0]] * 6)
     assert not significantly_faster(logs[:5], list("abcde")).any()
     assert significantly_faster(logs, list("abcdef")).tolist() == [
@@ -195,7 +195,7 @@ def test_five_cases_tell_nobody_apart_and_six_do():
     ]
 
 
-def test_two_failures_do_not_hide_who_is_slower_on_all_cases():
+def test_two_failures_do_not_hide_a_consistently_slower_solver():
     rng = np.random.default_rng(27)
     logs = rng.normal(0, 1, (12, 1)) + rng.normal(0, 0.3, (12, 8))
     logs[:, 3] += 1.5
@@ -205,8 +205,8 @@ def test_two_failures_do_not_hide_who_is_slower_on_all_cases():
     assert faster.sum() == 7
 
 
-def test_who_fails_twice_is_not_told_to_be_slower_if_faster_otherwise():
-    """The mean says slower, 18 of 20 cases say faster."""
+def test_two_failures_do_not_make_a_faster_solver_slower():
+    """The mean is larger, but the solver is faster on 18 of 20 cases."""
     rng = np.random.default_rng(28)
     logs = rng.normal(0, 0.2, (20, 2))
     logs[:, 1] -= 0.7
@@ -225,7 +225,7 @@ def test_equal_solvers_share_one_tier_and_every_rank():
     assert not panel(found.group).turned.any()
 
 
-def test_a_faster_pair_makes_a_tier_of_its_own():
+def test_a_faster_pair_forms_a_separate_tier():
     rng = np.random.default_rng(19)
     times = rng.lognormal(0, 2, (40, 1)) * rng.lognormal(0, 0.1, (40, 4))
     found = ranking_of(group(times * [1, 1, 3, 3]))
@@ -253,7 +253,7 @@ def test_there_is_a_convention_for_each_shift_penalty_and_gate():
     assert USUAL in EVERY
 
 
-def test_a_liar_ranks_first_only_if_it_is_believed():
+def test_a_solver_with_false_claims_is_first_only_if_claims_count():
     honest = np.full(8, 1.0)
     times = np.column_stack([honest, np.full(8, INF)])
     claimed = np.column_stack([honest, np.full(8, 0.01)])
@@ -264,8 +264,8 @@ def test_a_liar_ranks_first_only_if_it_is_believed():
     assert not found.single["10 limits"].turned.any()
 
 
-def test_a_penalty_that_turns_two_solvers_is_found():
-    """One fails once and is fast otherwise: three limits or ten decide."""
+def test_a_penalty_that_reverses_two_solvers_is_found():
+    """One solver fails once and is otherwise fast; the penalty decides its rank."""
     fast = np.full(5, 1.0)
     fast[0] = INF
     steady = np.full(5, 4.0)
@@ -276,7 +276,7 @@ def test_a_penalty_that_turns_two_solvers_is_found():
     assert found.turned[1, 0]
 
 
-def test_ranks_leave_out_what_is_not_compared():
+def test_ranks_are_nan_for_solvers_that_are_not_compared():
     np.testing.assert_array_equal(ranks(np.array([2.0, np.nan, 1.0])), [2, np.nan, 1])
 
 
@@ -300,8 +300,8 @@ def test_a_data_profile_by_hand():
     assert found.share.value.tolist() == [0, 0.25, 0.5, 0.5]
 
 
-def test_a_failure_is_never_counted_as_solved_whatever_the_factor():
-    """Charged 1000 s it would be, from τ = 1000/0.1 on."""
+def test_a_failure_never_counts_as_solved():
+    """With a finite charge of 1000 s, it would count from τ = 1000/0.1 on."""
     times = np.array([[0.1, INF]] * 4 + [[0.1, 0.1]])
     ratios = performance_ratios(times)
     anywhere = np.concatenate([np.geomspace(1, 1e300, 50), [np.finfo(float).max]])
@@ -309,7 +309,7 @@ def test_a_failure_is_never_counted_as_solved_whatever_the_factor():
     assert curve(ratios[:, 1], 1, 1e300).share.value.max() == 0.2
 
 
-def test_profiles_of_many_cases_are_thinned_not_changed():
+def test_profiles_of_many_cases_are_sampled_exactly():
     values = np.random.default_rng(20).lognormal(3, 1, 5000)
     thin = curve(values, values.min(), values.max())
     assert thin.at.size == 200
@@ -317,8 +317,8 @@ def test_profiles_of_many_cases_are_thinned_not_changed():
     assert thin.share.value == pytest.approx(exact)
 
 
-def test_a_further_solver_may_turn_two_profiles():
-    """Gould and Scott: why pairs are drawn as pairs."""
+def test_a_further_solver_may_swap_two_profiles():
+    """This effect (Gould and Scott) is the reason for profiles of two solvers."""
     a, b, third = [1, 1, 9, 9, 9], [3, 3, 3, 3, 3], [9, 9, 2, 2, 2]
     two = performance_ratios(np.column_stack([a, b]))
     three = performance_ratios(np.column_stack([a, b, third]))
@@ -327,7 +327,7 @@ def test_a_further_solver_may_turn_two_profiles():
 
 
 @pytest.mark.parametrize("cases", [5, 23])
-def test_bands_of_shares_cover_at_least_at_their_rate(cases):
+def test_bands_of_shares_have_at_least_nominal_coverage(cases):
     counts = np.arange(cases + 1)
     found = share(counts, cases)
     for p in (0.01, 0.2, 0.5, 0.83, 0.99):
@@ -336,7 +336,7 @@ def test_bands_of_shares_cover_at_least_at_their_rate(cases):
         assert np.array(rate)[held].sum() >= 0.95
 
 
-def test_a_share_of_all_is_not_certain():
+def test_the_interval_of_a_full_share_has_positive_width():
     found = share([0, 12], 12)
     assert found.high[0] == pytest.approx(1 - 0.025 ** (1 / 12))
     assert found.low[1] == pytest.approx(0.025 ** (1 / 12))
@@ -347,7 +347,7 @@ def test_a_share_of_all_is_not_certain():
 
 
 def test_the_restricted_mean_by_hand():
-    """S is 3/4 from 1 to 3, where one of two is left, 3/8 to 4, then 0."""
+    """S = 3/4 from 1 to 3, S = 3/8 from 3 (with two cases at risk) to 4, then S = 0."""
     nan = np.nan
     found = restricted_mean(
         np.array([1, INF, 3, 4.0]), np.array([nan, 2, nan, nan]), 5.0
@@ -356,24 +356,24 @@ def test_the_restricted_mean_by_hand():
     assert (found.solved, found.stopped, found.never) == (3, 1, 0)
 
 
-def test_without_early_censoring_it_is_the_mean_of_times_cut_at_the_limit():
+def test_without_early_censoring_times_are_truncated_at_the_limit():
     times = np.random.default_rng(21).exponential(2, 30)
     late = times > 4
     stopped = np.where(late, 4.0, np.nan)
     found = restricted_mean(np.where(late, INF, times), stopped, 4.0)
     cut = np.minimum(times, 4)
-    half = 2.045 * cut.std(ddof=1) / np.sqrt(30)  # Student's, 29 degrees of freedom
+    half = 2.045 * cut.std(ddof=1) / np.sqrt(30)  # Student, 29 degrees of freedom
     assert found.mean.value == pytest.approx(cut.mean())
     assert found.mean.high - found.mean.value == pytest.approx(half, rel=1e-3)
     assert late.sum() == found.stopped > 0
 
 
-def test_a_refuted_answer_is_never_solved_and_a_late_one_may_be():
+def test_refuted_answers_count_as_unsolved_and_late_ones_as_censored():
     times, nan = np.array([1, 1, 1, INF, 5.0]), np.nan
     refuted = restricted_mean(times, np.full(5, nan), 10.0).mean.value
     late = restricted_mean(times, np.array([nan, nan, nan, 2, nan]), 10.0).mean.value
     assert refuted == pytest.approx((1 + 1 + 1 + 10 + 5) / 5)
-    assert late == pytest.approx(1 + 4 * 2 / 5)  # the late one weighs with the last
+    assert late == pytest.approx(1 + 4 * 2 / 5)  # the last case takes the late weight
 
 
 def test_the_restricted_mean_covers_the_truth_under_early_censoring():
@@ -390,7 +390,7 @@ def test_the_restricted_mean_covers_the_truth_under_early_censoring():
 
 
 @pytest.mark.parametrize("cases", [6, 9, 30])
-def test_the_interval_of_flipped_signs_covers_whatever_the_tails(cases):
+def test_the_sign_flip_interval_covers_for_heavy_tails(cases):
     rng = np.random.default_rng(29)
     names = [str(i) for i in range(cases)]
     drawn = 3 + rng.standard_cauchy((400, cases))
@@ -399,7 +399,7 @@ def test_the_interval_of_flipped_signs_covers_whatever_the_tails(cases):
 
 
 def test_six_values_have_the_interval_from_the_least_to_the_largest():
-    """All signs agree in 2 of 64 patterns, five of six in 12 more: above 5 %."""
+    """All signs agree in 2 of 64 patterns; with five of six, the share exceeds 5 %."""
     names = [str(i) for i in range(6)]
     values = np.array([0.3, -0.01, 5.0, 1.0, 2.0, 4.0])
     assert symmetric_interval(values, names) == (-0.01, 5.0)
@@ -409,8 +409,8 @@ def test_six_values_have_the_interval_from_the_least_to_the_largest():
 # ---- growth
 
 
-def test_growth_at_the_practical_limit_is_called_growing_once_in_forty():
-    """The interval covers 95 %; where p is at the limit, 2.5 % of it lie above."""
+def test_growth_at_the_practical_limit_is_detected_in_two_percent():
+    """For p at the limit, 2.5 % of the 95 % intervals lie entirely above the limit."""
     rng = np.random.default_rng(23)
     n = np.geomspace(100, 1e5, 6)
     for limit, called in ((1.1, Trend.GROWS), (0.9, Trend.FALLS)):
@@ -429,7 +429,7 @@ def test_growth_at_the_practical_limit_is_called_growing_once_in_forty():
         ),  # the smallest size is a little cheaper
         ([19, 22, 22, 22, 22, 22, 22, 22, 22, 22], Trend.FLAT),
         ([22, 22, 22, 22, 22], Trend.FLAT),
-        ([1000, 1010, 1020, 1030, 1040], Trend.FLAT),  # growth for sure, but of 2 %
+        ([1000, 1010, 1020, 1030, 1040], Trend.FLAT),  # significant growth of only 2 %
         ([20, 24, 29, 35, 42], Trend.GROWS),
         ([42, 35, 29, 24, 20], Trend.FALLS),
         ([20, 40, 20, 40, 20], Trend.UNDECIDED),
@@ -449,7 +449,7 @@ def test_planted_growth_is_detected_and_bounded():
 
 
 def test_the_interval_of_growth_is_students_of_two_degrees_of_freedom():
-    """Logarithms of n: −3, −1, 1, 3; those of v are off a line of slope ½ by ±s."""
+    """log n = −3, −1, 1, 3, and log v deviates by ±s from a line of slope ½."""
     n, s = np.exp([-3.0, -1.0, 1.0, 3.0]), 0.1
     found = growth_of(n, np.sqrt(n) * np.exp([s, -s, -s, s]))
 
@@ -460,7 +460,7 @@ def test_the_interval_of_growth_is_students_of_two_degrees_of_freedom():
     assert found.scatter == pytest.approx(np.sqrt(2) * s)
 
 
-def test_constant_counts_do_not_grow_for_sure():
+def test_constant_counts_are_flat():
     found = growth_of([100, 400, 1600, 6400], [13, 13, 13, 13])
     assert (found.low, found.exponent, found.high) == (0, 0, 0)
     assert found.at(1000) == (pytest.approx(13),) * 3 + (0.95, 4)
@@ -472,7 +472,7 @@ def test_falling_counts_do_not_grow():
     assert found.low < found.exponent < found.high < 0
 
 
-def test_three_sizes_make_no_test():
+def test_three_sizes_are_refused():
     with pytest.raises(ValueError, match="four different sizes"):
         growth_of([1, 2, 3, 3], [1, 2, 3, 3])
 
@@ -494,10 +494,11 @@ def test_nothing_is_predicted_beyond_the_measured_sizes():
             found.at(outside)
 
 
-def test_a_prediction_is_that_of_the_textbook():
-    """Half width of log v at x: t σ̂ √(1 + xᵀ(XᵀX)⁻¹x); x and rows of X are (1, log n).
+def test_predictions_equal_the_textbook_formula():
+    """The half-width of log v at x is t σ̂ √(1 + xᵀ(XᵀX)⁻¹x).
 
-    Draper and Smith, Applied Regression Analysis, §3.1 in matrices.
+    x and the rows of X are (1, log n); see Draper and Smith, Applied Regression
+    Analysis, §3.1.
     """
     n, v = np.array([100, 200, 800, 1600.0]), np.array([3, 4, 4, 7.0])
     X = np.column_stack([np.ones(4), np.log(n)])

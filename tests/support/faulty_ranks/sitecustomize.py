@@ -1,10 +1,14 @@
-"""Makes one rank fail in one stage of a measurement, as FAULT_… of the environment say.
+"""Faults of ranks in one stage of a measurement, selected by environment variables.
 
-Python imports this module when it starts, where its folder is on PYTHONPATH: the ranks
-of tests/harness/processes/test_rank_faults.py are those of users but for what is
-planted here. FAULT_RANK: which of them, or "all". FAULT_STAGE: one of `STAGES`.
-FAULT_KIND: killed, prints (what could pass for our own words, and is killed), exits
-(with 0), hangs, raises (while others go on), raises-after (when all are through).
+Python imports this module at start if its folder is on PYTHONPATH. The ranks of
+tests/harness/processes/test_rank_faults.py are therefore ordinary ranks, except for the
+faults below.
+
+- FAULT_RANK: the failing rank, or "all";
+- FAULT_STAGE: one of `STAGES`;
+- FAULT_KIND: "killed"; "prints" (a line that resembles our messages, then is killed);
+  "exits" (with code 0); "hangs"; "raises" (while the other ranks continue); or
+  "raises-after" (after the stage is complete).
 """
 
 import os
@@ -13,7 +17,7 @@ import sys
 import time
 from importlib.machinery import PathFinder
 
-#: module and name of what fails; of a class, its method
+#: stage → module, and function or method that fails
 STAGES = {
     "emission": ("mortarbench.problems.feti.distributed_dual", "distributed_qp"),
     "prepare": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
@@ -47,7 +51,7 @@ def failing(work):
 
 
 def in_stage(work):
-    """Return a function that fails in the stage, except in the solver's warm-up."""
+    """Return a function that fails in the stage, except during the warm-up."""
     if STAGE not in ("prepare", "solve"):
         return failing(work)
 
@@ -62,7 +66,7 @@ def in_stage(work):
 
 
 class Planter:
-    """Finds the module where something is to fail, and plants that when it is there."""
+    """Import hook that replaces the function of the stage in its module."""
 
     def find_spec(self, name, path=None, target=None):
         module, _, of = STAGES[STAGE][0], *STAGES[STAGE]

@@ -1,1 +1,1 @@
-"""Textbook versions of SMALBE and MPRGP in NumPy, as oracles of tests."""
+"""Textbook versions of SMALBE and MPRGP in NumPy, with which tests compare results."""

@@ -1,4 +1,4 @@
-"""Incomplete Cholesky factorisation on the pattern of a matrix, as it is written."""
+"""Incomplete Cholesky factorisation on the pattern of a matrix, in textbook form."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ Mask = NDArray[np.bool_]
 
 
 def order_of_elimination(P: Array) -> NDArray[np.intp]:
-    """Return the order (n,): from both ends to the middle, if entries reach so little.
+    """Return the order of elimination (n,).
 
-    Each end has half of the components. There is one end only where an entry is farther
-    than n/4 from the diagonal.
+    If all entries are within n/4 of the diagonal, elimination proceeds from both ends
+    to the middle, with half of the components on either side. Otherwise it proceeds
+    from one end.
     """
     n = len(P)
     i, j = np.nonzero(P)
@@ -25,7 +26,7 @@ def order_of_elimination(P: Array) -> NDArray[np.intp]:
 
 
 def incomplete_inverse(P: Array, free: Mask, keep: float) -> Array:
-    """Return M⁻¹ (n, n) of M ≈ P_FF, zero where a row or column is not free."""
+    """Return M⁻¹ (n, n) for M ≈ P_FF, with zero rows and columns off the free set."""
     order = order_of_elimination(P)
     order = order[free[order]]
     L, D = incomplete_cholesky(P[np.ix_(order, order)], keep)
@@ -35,10 +36,10 @@ def incomplete_inverse(P: Array, free: Mask, keep: float) -> Array:
 
 
 def incomplete_cholesky(A: Array, keep: float) -> tuple[Array, Vector]:
-    """Factorise A ≈ LDLᵀ (n, n) with L zero where A is; returns L and D.
+    """Factorise A ≈ LDLᵀ (n, n), where L has the pattern of A; return L and D.
 
-    What elimination would put elsewhere goes to the diagonal entries of its row and its
-    column, times `keep`.
+    Fill-in outside the pattern is multiplied by `keep` and added to the diagonal
+    entries of its row and its column.
     """
     n = len(A)
     S, L, D = A.astype(float).copy(), np.eye(n), np.zeros(n)

@@ -1,6 +1,6 @@
 """The vector operations of an MPRGP step.
 
-Few components of a dual have a bound, or are on one: only of these is asked where.
+Few components of a dual have a bound, so bounds are evaluated for these only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations
 def inner_products(
     *pairs: tuple[Vector, Vector], least: Vector | None = None
 ) -> tuple[float, ...]:
-    """Return xᵀy of each pair, and the least component of a vector, inf without any."""
+    """Return xᵀy of each pair; if `least` is given, append its least component.
+
+    The least component of an empty vector is inf.
+    """
     products = [float(x @ y) for x, y in pairs]
     return (*products, *([] if least is None else [float(least.min(initial=np.inf))]))
 
@@ -28,9 +31,9 @@ def inner_products(
 def lengths(
     x: Vector, g: Vector, p: Vector, Hp: Vector, lower: Vector, upper: Vector
 ) -> tuple[float, float]:
-    """Return of steps x − αp the minimising α, and the largest that is feasible.
+    """Return the minimising α and the largest feasible α of the step x − αp.
 
-    The first is inf along a direction without curvature.
+    The minimising α is inf along a direction without curvature.
     """
     curvature, slope, feasible = inner_products(
         (p, Hp), (g, p), least=_to_bounds(x, p, lower, upper)
@@ -39,7 +42,7 @@ def lengths(
 
 
 def _to_bounds(x: Vector, p: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return, of components that move to a bound, the α at which they are there."""
+    """Return the α at which each component that moves towards a bound reaches it."""
     bound = np.where(p > 0, lower, upper)
     at = np.flatnonzero(np.isfinite(bound) & (p != 0))
     found: Vector = (x[at] - bound[at]) / p[at]
@@ -52,8 +55,8 @@ def moved(
 ) -> tuple[Vector, Vector]:  # fmt: skip
     """Return x − αp and its gradient.
 
-    What is beyond a bound, or nearer to it than rounding can tell, is on the bound: a
-    step as far as it is feasible must not stop short of the face.
+    Components that are beyond a bound, or within rounding error of it, are set to the
+    bound. Otherwise the largest feasible step could end just before the face.
     """
     new = x - alpha * p
     at = np.flatnonzero((lower > -np.inf) | (upper < np.inf))
@@ -66,7 +69,7 @@ def moved(
 
 
 def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return x + s, in the box up to rounding, on the bounds that it reaches."""
+    """Return x + s, which is in the box up to rounding, moved exactly onto bounds."""
     to, noise = x + s, ROUNDING * (np.abs(x) + np.abs(s))
     down, up = to - lower <= noise, upper - to <= noise
     return np.where(down, lower, np.where(up, upper, to))
@@ -96,7 +99,7 @@ def _parted(
 def reduced(
     x: Vector, phi: Vector, alpha: float, lower: Vector, upper: Vector
 ) -> Vector:
-    """Return φ̃: the free gradient, cut so that x − ᾱφ̃ is feasible."""
+    """Return φ̃: the free gradient, reduced so that x − ᾱφ̃ is feasible."""
     cut: Vector = np.minimum(np.maximum(phi, (x - upper) / alpha), (x - lower) / alpha)
     return cut
 
@@ -124,9 +127,10 @@ def scaled(s: float, v: Vector) -> Vector:
 def tilted_step(
     x: Vector, g: Vector, tau: float, lower: Vector, upper: Vector
 ) -> tuple[Vector, NDArray[np.int8]]:
-    """Minimise gᵀs + τ/2‖s‖² over the box: s, and its piece.
+    """Return the minimiser s of gᵀs + τ/2‖s‖² over the box, and its piece.
 
-    The piece is −1 where s ends at the lower bound, 1 at the upper, 0 between.
+    The piece is −1 where x + s is at the lower bound, 1 at the upper bound, and 0
+    between the bounds.
     """
     target, piece = x - g / tau, np.zeros(x.size, dtype=np.int8)
     ends = np.flatnonzero((target <= lower) | (target >= upper))
@@ -137,7 +141,7 @@ def tilted_step(
 
 
 def weighted_difference(v: Vector, w: Vector, weights: Vector) -> Vector:
-    """Return vᵢ − wᵢ times a weight."""
+    """Return weightsᵢ·(vᵢ − wᵢ)."""
     found: Vector = v - w
     found *= weights
     return found

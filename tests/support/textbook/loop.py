@@ -105,7 +105,7 @@ def _face(
 def face_preconditioner(
     problem: Projected, qp: QP, kind: Preconditioner
 ) -> Callable[[float], Precondition | None]:
-    """Return a function from ρ to the preconditioner that `mprgp` takes."""
+    """Return a function that maps ρ to the preconditioner of `mprgp`."""
     if kind == "none":
         return lambda rho: None
     if kind == "model":

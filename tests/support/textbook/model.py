@@ -2,12 +2,13 @@
 
     B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
 
-U holds the directions in which H is large, with w + τ their eigenvalues, and τ stands
-for H on all others. Where B is above H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimum
-of the right side over the box is a gradient projection step in the metric of B. Without
-U it is the ordinary one, x ← P(x − g/τ), whose length is dictated by ‖H‖; with a few
-directions taken out, by the rest of the spectrum. That B is above H is tested by the
-product that each step needs anyway: where it is not, τ is raised.
+The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
+replaces H on the orthogonal complement. If B ≥ H, then
+f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimiser of the right-hand side over the box is
+a gradient projection step in the metric of B. Without U it is the ordinary step
+x ← P(x − g/τ), whose length is limited by ‖H‖. With U, the length is limited only by
+the rest of the spectrum. The product with H that each step needs also tests B ≥ H
+along the step; if the inequality is violated, τ is raised.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ class BoxModel(Protocol):
 
 
 class Tilted(NamedTuple):
-    """The minimiser s(y) at some y."""
+    """The minimiser s(y) for a multiplier y, on the evaluated components."""
 
-    s: Vector  #: of the components that are looked at
-    piece: NDArray[np.int8]  #: at which bounds x + s is, of these
-    slope: Vector  #: of the function of y
+    s: Vector  #: minimiser on the evaluated components
+    piece: NDArray[np.int8]  #: bounds that x + s reaches: −1 lower, 1 upper, 0 none
+    slope: Vector  #: gradient of the dual function with respect to y
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class Model:
 
     @property
     def has_directions(self) -> bool:
-        """Return True if the model has directions besides the norm of H."""
+        """Return True if the model contains directions in addition to the norm of H."""
         return bool(len(self.U))
 
     def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
@@ -92,7 +93,7 @@ class Model:
         return found[1].s
 
     def raised(self, s: Vector, sHs: float) -> Model:
-        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is."""
+        """Raise τ, at most tenfold, until sᵀBs ≥ sᵀHs, with constant w + τ."""
         Us = self.U @ s
         rest = float(s @ s - Us @ Us)
         missing = sHs - self.tau * float(s @ s) - float((self.w * Us) @ Us)
@@ -100,12 +101,12 @@ class Model:
         return self.with_tail(min(max(tau, self.tau), 10 * self.tau))
 
     def with_tail(self, tau: float) -> Model:
-        """Change τ and leave w + τ as it is, where that is above τ."""
+        """Return the model with another τ and the same w + τ where w + τ exceeds τ."""
         w = self.w + self.tau - tau
         return Model(tau, self.U[w > 0], w[w > 0])
 
     def relaxed(self, factor: float) -> Model:
-        """Divide τ."""
+        """Return the model with τ divided by a factor."""
         return Model(self.tau / factor, self.U, self.w)
 
     def core_in(self, free: Mask) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -128,7 +129,7 @@ class Model:
 
 
 def _core(U_f: NDArray[np.float64], root: Vector, tau: float) -> NDArray[np.float64]:
-    """Return τI + W¹ᐟ²U_F U_FᵀW¹ᐟ²: not below τI, however large W is."""
+    """Return τI + W¹ᐟ²U_F U_FᵀW¹ᐟ², which is at least τI for any W."""
     S = root[:, None] * U_f
     return np.asarray(S @ S.T + tau * np.eye(root.size))
 
@@ -138,10 +139,10 @@ def minimised(
     newton: Callable[[Vector, Mask], Vector],
     k: int,
 ) -> tuple[Vector, Tilted] | None:
-    """Maximise the dual function of k multipliers y; None where that is not found.
+    """Maximise the dual function of k multipliers y; return None without a maximiser.
 
-    at : what s(y) is; of components that have bounds at least
-    newton : the step dy for a slope, where the free components are those
+    at : function that returns s(y), at least on the components with bounds
+    newton : function that returns the step dy for a slope and the free components
     """
     y: Vector = np.zeros(k)
     here = at(y)
@@ -165,17 +166,17 @@ def _searched(
     there: Tilted,
     slopes: tuple[float, float],
 ) -> tuple[float, Tilted]:
-    """Go to y + t dy, t ≤ 1, where the slope is at most a tenth of that at t = 0.
+    """Return y + t dy, t ≤ 1, at which the slope is at most a tenth of that at t = 0.
 
     there : s(y + dy)
-    slopes : at t = 0 and at t = 1
+    slopes : slopes at t = 0 and at t = 1
     """
     first, slope = slopes
     low, high, at_low, at_high, t = 0.0, 1.0, first, slope, 1.0
     for _ in range(SEARCH_STEPS):
         if abs(slope) <= 0.1 * first or (slope > 0 and t == 1) or at_low <= at_high:
             break
-        share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+        share = at_low / (at_low - at_high)  # regula falsi, limited away from the ends
         t = low + (high - low) * min(max(share, 0.05), 0.95)
         there = at(y + t * dy)
         slope = float(there.slope @ dy)
@@ -187,5 +188,5 @@ def _searched(
 
 
 def _equal(one: NDArray[np.int8], other: NDArray[np.int8]) -> Vector:
-    """Return 1 where two pieces are the same, else 0."""
+    """Return 1 where two pieces are equal, else 0."""
     return np.where(one == other, 1.0, 0.0)

@@ -5,25 +5,26 @@ Dostál and Schöberl 2005). With the gradient g = Hx − b, the free gradient �
 is off its bounds), the chopped gradient β (the part of g on the bounds that leads
 inside) and the projected gradient g^P = φ + β, each step is one of
 
-* c, conjugate gradient: minimise along p on the face, if that stays feasible; p is made
-  conjugate to all `Directions` taken on the face, not to the last alone
-* b, beyond: conjugate gradients on the face as if it had no bounds, for the expansion
-* e, expansion of the active set, by one of the `EXPANSIONS`
-* f, fallback: an expansion that gained too little, done anew in the safe way
-* p, proportioning: free components, by one of the `PROPORTIONINGS`
+* c, conjugate gradient: minimise along p on the face, if the minimiser is feasible; p
+  is conjugate to all stored `Directions` of the face, not only to the last one
+* b, beyond: conjugate gradients on the face without its bounds, before an expansion
+* e, expansion of the active set by the rule `Expansion`
+* f, fallback: repetition of an expansion with too small a gain, in the safe way
+* p, proportioning: free components by the rule `Proportioning`
 
-Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step of
-length ᾱ takes beyond a bound.
+A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  where φ̃ is the reduced free gradient:
+a step of length ᾱ along −φ̃ does not leave the box.
 
-A run ends, too, when it *stagnates*: over as many steps as it took before these (at
-least `FIRST_LOOK`), the least ‖g^P‖ was not halved and the cost fell by no more than
-the rounding of its terms. Rounding then leaves no direction that is conjugate to those
-before and along which the cost falls.
+A run also ends if it *stagnates*. This is tested after `FIRST_LOOK` steps, and then
+each time the number of steps has doubled. A run stagnates if, since the previous test,
+the least ‖g^P‖ was not halved and the decrease of the cost is within the rounding error
+of its terms. Rounding then leaves no descent direction that is conjugate to the
+previous ones.
 
-Every step but projcg's lessens the cost, and by the model τI as much as the rate of the
-book needs. Expansion never frees a component that the
-half step left at a bound, but for the first expansion by a model of directions: from
-one proportioning to the next the active set only grows. See docs/smalbe-theory.md.
+Every step except projcg reduces the cost; with the model τI, the reduction is
+sufficient for the convergence rate of the book. Expansion never frees a component that
+the half step left at a bound, except in the first expansion by a model with directions.
+Between two proportioning steps, the active set only grows. See docs/smalbe-theory.md.
 """
 
 from __future__ import annotations
@@ -41,25 +42,28 @@ from tests.support.textbook.kernels import Mask, inner_products
 from tests.support.textbook.model import BoxModel
 
 Operator = Callable[[Vector], Vector]
-Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner
+#: function from the mask of free components to their preconditioner
+Precondition = Callable[[Mask], Operator]
 
-#: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
-#: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
-#: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
-#: model: where CG leads, projected in the metric of the model (ours; 2 products, 1
-#: where the CG step as far as it is feasible was all; one for each step beyond the box,
-#: one more where it gained less than gradient projection must)
+#: Rules of expansion:
+#: std: the largest feasible CG step, then x ← x − ᾱφ̃ (the book; 2 products)
+#: projcg: x ← P(x − α_cg p), even if the cost increases (PERMON; 2 products)
+#: mixed: projcg or, if it increases the cost, std (ESPRESO; 2 or 3 products)
+#: model: the CG point, projected in the metric of the model (2 products, or 1 if only
+#: the largest feasible CG step is taken; a product for each step beyond the box; and
+#: one more if the gain is below that of gradient projection)
 Expansion = Literal["std", "projcg", "mixed", "model"]
-#: cg: minimise along −β, as far as feasible (the book's; 1 product)
-#: model: a `Model.step`; for B = I/ᾱ a projected gradient step (1 product); else cg
-#: where from one to the next `MOST_IDLE` times in a row ‖β‖² was not halved
+#: Rules of proportioning:
+#: cg: minimise along −β within the box (the book; 1 product)
+#: model: a `Model.step`, which for B = I/ᾱ is a projected gradient step (1 product);
+#: after `MOST_IDLE` successive proportionings that did not halve ‖β‖², cg is used
 Proportioning = Literal["cg", "model"]
 MOST_IDLE = 2
-FIRST_LOOK = 500  #: steps of a run after which its progress is looked at first
-#: slope along p relative to that of z, below which the gradient has drifted back along
-#: the directions that were taken
+FIRST_LOOK = 500  #: number of steps after which the progress of a run is first tested
+#: ratio of the slopes along p and along z, below which the gradient has drifted back
+#: into the span of the previous directions
 DRIFT = 0.5
-NOISE = 1e-13  #: part of the terms of a cost that is taken for rounding
+NOISE = 1e-13  #: fraction of the terms of a cost that is attributed to rounding
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
 
@@ -70,9 +74,10 @@ class Rules:
     Gamma: float = 1.0  #: proportioning constant Γ > 0
     expansion: Expansion = "model"
     proportioning: Proportioning = "model"
-    reduced: bool = True  #: compare β with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
-    relaxation: float = 1.9  #: of expansions by the model, ᾱ‖H‖ of gradient projection
-    kept: int = 0  #: most directions of CG that are kept on a face
+    reduced: bool = True  #: compare ‖β‖² with φ̃ᵀφ (the book), not with φᵀφ (PERMON)
+    #: divisor of τ in expansions by the model; ᾱ‖H‖ in gradient projection
+    relaxation: float = 1.9
+    kept: int = 0  #: maximum number of CG directions stored on a face
 
 
 class Point(NamedTuple):
@@ -99,13 +104,14 @@ class Face(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """The last conjugate directions that CG took on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
+    """The last k conjugate directions of CG on a face, scaled such that pᵢᵀHpⱼ = δᵢⱼ.
 
-    In exact arithmetic CG is conjugate to all k of them through the last. Rounding
-    undoes that after some dozens of steps, and a new right-hand side on the same face
-    (a multiplier step's) at once. With all of them at hand neither does, for two passes
-    over k vectors a step (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech. Engrg.
-    117, 1994, 195-209).
+    In exact arithmetic, conjugacy to the last direction implies conjugacy to all k.
+    Rounding destroys this after some dozens of steps, and a new right-hand side on the
+    same face (after a multiplier step) destroys it immediately. Explicit
+    orthogonalisation against all k directions avoids both, at the cost of two passes
+    over k vectors per step (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech.
+    Engrg. 117, 1994, 195-209).
     """
 
     free: Mask
@@ -115,9 +121,10 @@ class Directions:
     def next(
         self, z: Vector, p: Vector, Hp: Vector, most: int
     ) -> tuple[Directions, Vector]:
-        """Add p, and make z conjugate to it and to the others; over ranks, at once.
+        """Append p, and return z made conjugate to all directions.
 
-        Of more than `most` directions the first is left out.
+        If there are more than `most` directions, the oldest one is dropped. On several
+        ranks, all inner products share one reduction.
         """
         curvature, along, *others = inner_products(
             (p, Hp), (z, Hp), *((z, Hq) for Hq in self.Hp)
@@ -134,40 +141,41 @@ class Directions:
         return kept, new
 
     def conjugate(self, p: Vector) -> Vector:
-        """Return p without its part along them."""
+        """Return p made conjugate to the stored directions."""
         if not self.p:
             return p
         along = inner_products(*((p, Hq) for Hq in self.Hp))
         return kernels.less(p, along, *self.p)
 
     def minimising(self, g: Vector) -> tuple[Vector, Vector]:
-        """Return s and Hs, for which x − s minimises the cost along all of them."""
+        """Return s and Hs such that x − s minimises the cost over the directions."""
         shares = inner_products(*((g, q) for q in self.p))
         back, none = [-share for share in shares], np.zeros_like(g)
         return kernels.less(none, back, *self.p), kernels.less(none, back, *self.Hp)
 
 
 class Progress(NamedTuple):
-    """Progress of a run since it was last looked at, to notice stagnation."""
+    """Progress of a run since the last test for stagnation."""
 
-    least: float = math.inf  #: ‖g^P‖² since then
-    before: float = math.inf  #: the least until then
-    cost: float = math.inf  #: twice the cost then
+    least: float = math.inf  #: least ‖g^P‖² since the last test
+    before: float = math.inf  #: least ‖g^P‖² before the last test
+    cost: float = math.inf  #: twice the cost at the last test
 
     def with_gradient(self, square: float) -> Progress:
-        """Add ‖g^P‖² at one more point."""
+        """Return the progress with ‖g^P‖² of a further point."""
         return self._replace(least=min(self.least, square))
 
     def stagnates(self, cost: float, terms: float) -> bool:
-        """Return whether neither the gradient nor the cost, twice, has come down.
+        """Return whether neither the gradient nor the cost has decreased enough.
 
-        terms : sum of the absolute terms of the cost
+        cost : twice the cost
+        terms : sum of the absolute values of the terms of the cost
         """
         falls = self.cost - cost > NOISE * terms
         return not falls and 4 * self.least > self.before
 
     def from_here(self, cost: float) -> Progress:
-        """Return the progress restarted at this cost."""
+        """Return the progress restarted at this value of twice the cost."""
         return Progress(before=min(self.least, self.before), cost=cost)
 
 
@@ -177,32 +185,32 @@ class Minimum(NamedTuple):
     x: Vector
     g: Vector  #: Hx − b
     face: Face
-    stopped: bool  #: by `stop`; not at the step limit, nor where no step leads on
+    stopped: bool  #: True if `stop` ended the run, False for a step limit or stagnation
     trace: str  #: one letter per step: c, b, e, f, p
-    directions: Directions  #: of the last face
+    directions: Directions  #: directions on the last face
 
 
-#: told after each step but those beyond the box: letter, where
+#: observer called after each step within the box: letter, new point and its face
 Watch = Callable[[str, Point, Face], None]
-#: letters, the last of the step itself; where, model; None where the cost falls
-#: without end
+#: letters (the last is that of the step itself), new point and model; None if the cost
+#: is unbounded below
 Step = tuple[str, Point, BoxModel] | None
 
 
 class _Line(NamedTuple):
-    """Along a direction of conjugate gradients."""
+    """A direction of conjugate gradients and its step lengths."""
 
     p: Vector
     Hp: Vector
-    cg: float  #: α_cg, minimises the cost at x − αp; inf without curvature
-    feasible: float  #: the largest α that is
+    cg: float  #: α_cg, which minimises the cost at x − αp; inf without curvature
+    feasible: float  #: largest feasible α
 
 
 class _Stay(NamedTuple):
-    """On a face."""
+    """The CG steps on one face."""
 
-    inside: int  #: CG steps taken there
-    began: float  #: ‖φ‖² at the first
+    inside: int  #: number of CG steps on the face
+    began: float  #: ‖φ‖² at the first of these steps
 
 
 class _Task(NamedTuple):
@@ -234,11 +242,12 @@ def mprgp(
     bounds : l and u (n,), possibly infinite
     start : a feasible x (n,) and its gradient Hx − b
     B : a model of H; ᾱ = 1/τ is the length of plain gradient projection steps
-    stop : says from the point and its face whether to stop; asked before every step
-    precondition : makes the preconditioner of the CG steps in a face
-    watch : told the letter of each step, the new point and its face
-    directions : of a run before with the same H: where it ended on the face of the
-        start, the cost is minimised along them first, without a product
+    stop : function of point and face that returns whether to stop, called before
+        every step
+    precondition : function that returns the preconditioner of the CG steps in a face
+    watch : observer of each step, called with its letter, the new point and its face
+    directions : directions of an earlier run with the same H. If that run ended on the
+        face of the start, the cost is first minimised over them, without a product
 
     """
     task = _Task(H, b, bounds, rules)
@@ -248,8 +257,8 @@ def mprgp(
     z_of = precondition(face.free)
     z = z_of(face.phi)
     p, stay = known.conjugate(z), _Stay(0, face.phi_square)
-    at_drift = math.inf  # ‖φ‖² when rounding along directions was taken out last
-    idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
+    at_drift = math.inf  # ‖φ‖² at the last removal of rounding along the directions
+    idle, chopped = 0, math.inf  # number of idle proportionings, and the last ‖β‖²
     progress, look = Progress(), FIRST_LOOK
     while not (done := stop(at, face)) and len(trace) < max_steps:
         progress = progress.with_gradient(face.phi_square + face.beta_square)
@@ -303,9 +312,9 @@ def mprgp(
 def _minimised_along(
     task: _Task, at: Point, known: Directions | None
 ) -> tuple[Point, Face, Directions]:
-    """Minimise along known directions of this face, as far as is feasible.
+    """Minimise over known directions of this face, as far as the step is feasible.
 
-    Where that leads to a bound, the face is another one, and they are forgotten.
+    If the step reaches a bound, the face changes and the directions are discarded.
     """
     face = split(at, task.bounds)
     if known is None or not known.p or not (known.free == face.free).all():
@@ -325,7 +334,7 @@ def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
 
 
 def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
-    """Return True if ‖β‖ is large relative to ‖φ‖: the face is to be left."""
+    """Return True if ‖β‖ is large relative to ‖φ‖, so that the face should be left."""
     if face.beta_square == 0:
         return False
     free_square = face.phi_square
@@ -338,7 +347,7 @@ def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
 def _proportion(
     task: _Task, at: Point, face: Face, B: BoxModel, *, by_model: bool
 ) -> Step:
-    """Take a step that frees components; never beyond an opposite bound."""
+    """Take a step that frees components, within the opposite bounds."""
     if by_model and task.rules.proportioning == "model":
         return _model_step(task, at, B)
     p = face.beta
@@ -351,7 +360,7 @@ def _minimise_or_expand(
     task: _Task, at: Point, face: Face, p: Vector, Hp: Vector, B: BoxModel,
     *, stay: _Stay, first: bool, uphill: bool,
 ) -> Step:  # fmt: skip
-    """Take the CG step, where it is feasible, but not uphill; else expand."""
+    """Take the CG step if it is feasible and reduces the cost; else expand."""
     H, b, bounds, rules = task
     cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
     if math.isinf(min(cg, feasible)):
@@ -373,13 +382,13 @@ def _minimise_or_expand(
 
 
 def _model_step(task: _Task, at: Point, B: BoxModel) -> Step:
-    """Minimise the model over the box, then the cost along that step.
+    """Minimise the model over the box, then the cost along the resulting step.
 
-    Above H, the model makes the minimising length at least 1. Where the product shows
-    that it is not above, it is raised; the line search lessens the cost anyway.
+    If B ≥ H, the minimising length is at least 1. If the product shows that B < H along
+    the step, the model is raised; the line search reduces the cost in either case.
     """
     s = B.step(at.x, at.g, task.bounds)
-    if not s.any():  # in rounding, nothing is left to gain
+    if not s.any():  # no further decrease is possible within rounding
         return None
     Hs = task.H(s)
     cost, feasible = kernels.lengths(*at, -s, -Hs, *task.bounds)
@@ -394,21 +403,21 @@ def _model_expansion(
     task: _Task, at: Point, face: Face, half: Point, line: _Line, B: BoxModel,
     *, stay: _Stay, first: bool,
 ) -> Step:  # fmt: skip
-    """Project z, where CG leads beyond the box, on it in the metric of the model.
+    """Project the infeasible CG point z onto the box in the metric of the model.
 
-    z is x − α_cg p, and in a flat spectrum, where active sets change least in a step,
-    what CG makes of it on the face without bounds. The cost is known at z and beyond it
-    bounded by the model where that is above H,
+    z is x − α_cg p. In a flat spectrum, where a step changes active sets least, z is
+    the result of further CG steps on the face without bounds. The cost at z is known.
+    If B ≥ H, the model bounds the cost at other points,
 
         f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr,
 
-    and z + r is where the right side is least, with the tail of B divided by the
-    relaxation, as gradient projection steps are longer than 1/‖H‖. What the half step
-    left at a bound stays there, unless this is the `first` expansion, before which the
-    active set is a guess, and the model knows more than a norm. From the half step it
-    goes all the way to z + r if the cost ends below that at x, else as far as that
-    lessens the cost. Where B = τI and that is less than φ̃ᵀφ/2τ, by which gradient
-    projection from x lessens the cost where τ ≥ ‖H‖, this is what is done.
+    and z + r minimises the right-hand side over the box. The tail of B is divided by
+    the relaxation, just as gradient projection steps are longer than 1/‖H‖. Components
+    that the half step left at a bound stay there, except in the `first` expansion by a
+    model with directions, because the active set is then only a guess. The step from
+    the half step ends at z + r if the cost there is below the cost at x; otherwise its
+    length minimises the cost. If B = τI and the decrease is less than φ̃ᵀφ/2τ (the
+    decrease by gradient projection from x for τ ≥ ‖H‖), gradient projection is used.
     """
     (p, Hp, cg, feasible), (lower, upper) = line, task.bounds
     release = first and B.has_directions
@@ -448,10 +457,10 @@ def _model_expansion(
 def _beyond(
     task: _Task, z: Point, free: Mask, line: _Line, stay: _Stay
 ) -> tuple[Point, str]:
-    """Go on with CG on the face as if it had no bounds, without a preconditioner.
+    """Continue with CG on the face without its bounds and without a preconditioner.
 
-    Until the free gradient is what it was when the face was entered, and at most for as
-    many steps as were taken inside the box (one, if there were none).
+    Stop if the free gradient is as small as at the start on the face, and at the latest
+    after as many steps as were taken inside the box (at least one).
     """
     p, Hp, letters = line.p, line.Hp, ""
     for _ in range(max(stay.inside, 1)):
@@ -471,7 +480,7 @@ def _beyond(
 def _project_gradient(
     task: _Task, at: Point, face: Face, tau: float, B: BoxModel, letters: str
 ) -> Step:
-    """Go along P(x − φ/τ) − x, as far as that lessens the cost; at least all of it."""
+    """Step along s = P(x − φ/τ) − x to the minimum of the cost within the box."""
     s = np.clip(at.x - face.phi / tau, *task.bounds) - at.x
     if not s.any():
         return None
@@ -485,13 +494,13 @@ def _project_gradient(
 
 
 def _change(along: tuple[float, ...], t: float) -> float:
-    """Return f(x + ts) − f(x), of gᵀs and sᵀHs."""
+    """Return f(x + ts) − f(x), computed from gᵀs and sᵀHs."""
     slope, curvature = along
     return t * (slope + 0.5 * t * curvature)
 
 
 def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:
-    """Go to x − αp; the gradient follows without a product."""
+    """Return x − αp with its gradient, which needs no product with H."""
     return Point(*kernels.moved(*at, alpha, p, Hp, *task.bounds))
 
 

@@ -1,24 +1,26 @@
-"""The outer loop of SMALBE: multipliers of the equality rows, and how precise to be.
+"""The outer loop of SMALBE: multipliers of the equality rows, and inner tolerances.
 
 Minimises ½νᵀHν − bᵀν subject to Cν = 0 and bounds, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
 Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
-Algorithm 6.1; `tests.support.textbook.projected` makes that problem). For k = 0, 1, …:
+Algorithm 6.1; `tests.support.textbook.projected` sets up the problem). For k = 0, 1, …:
 
 1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
 2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖² since the
-   last k: M ← βM, and ρ ← ρ·growth.
-3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed. H is the
-   same, so that on an unchanged face the directions of CG go on to serve.
+   previous k: M ← βM, and ρ ← ρ·growth.
+3. μ ← μ + ρCν; the gradient grows by ρQν, which needs no product with F. H does not
+   change, so that the CG directions can be reused on an unchanged face.
 
-until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖. (Where b
-is zero, it is the gradient at the start, and where e is, ν that Cν is compared with.)
-What the gradient means in the energy norm is estimated, too (`Projected.energy_error`):
-‖b‖ may be the gap of supports, beside which contact is small. It may cost a quarter
-more products, not more: where stiffnesses differ much, rounding can keep it away.
+until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the original rows, ‖Gν‖ ≤ tol‖e‖. (If b is
+zero, the gradient at the start replaces it; if e is zero, Cν is compared with ν.)
+The error in the energy norm is also estimated from the gradient
+(`Projected.energy_error`), because ‖b‖ may be dominated by the gap of supports, which
+is large compared with the contact. The number of products may increase by at most a
+quarter for this purpose, since rounding can prevent an accurate energy if stiffnesses
+differ widely.
 
-Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
-MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10; and CᵀCν
-is tried as proof that there is no feasible point.
+There are two safeguards. If two successive outer iterations do not halve ‖Cν‖, then
+ρ ← 10ρ up to MOST_RHO or, if ‖Cν‖ is small enough and only the gradient is too large,
+M ← M/10. In addition, CᵀCν is tested as a certificate of infeasibility.
 """
 
 from __future__ import annotations
@@ -48,8 +50,8 @@ from tests.support.textbook.projected import Projected
 from tests.support.textbook.rows import met as are_met
 from tests.support.textbook.rows import violation
 
-FOR_ENERGY = 1.25  #: factor of the products spent that its error may still cost
-MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
+FOR_ENERGY = 1.25  #: largest factor of products for the accuracy of the energy
+MOST_RHO = 1e10  #: largest ρ; for larger values, rounding in ρQν dominates
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Constants:
     eta: float
     rho_growth: float
     max_steps: int
-    energy: float = 0.0  #: estimated energy error/tol to reach; 0: none
+    energy: float = 0.0  #: required estimate of energy error/tol; 0 for no requirement
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ class InnerSolver:
     model: Callable[[float], BoxModel]
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
-    """Return the observer of outer iteration k with that right-hand side."""
+    """Return the observer of outer iteration k with the given right-hand side."""
 
 
 class Iterate(NamedTuple):
@@ -85,7 +87,7 @@ class Iterate(NamedTuple):
     rho: float
     outer: tuple[OuterIteration, ...] = ()
     status: Status = Status.ITERATION_LIMIT
-    directions: Directions | None = None  #: of CG with this ρ on the last face
+    directions: Directions | None = None  #: CG directions for this ρ on the last face
 
     @property
     def steps(self) -> str:
@@ -102,9 +104,9 @@ class Iterate(NamedTuple):
 def first_iterate(
     problem: Projected, x: Vector, mu: Vector, *, M: float, rho: float
 ) -> Iterate:
-    """Start from x, moved into the bounds, and μ; one product, none for x = 0.
+    """Return the iterate at x, projected onto the bounds, and μ.
 
-    There 𝒫ν = −𝒫x̃ = 0, and Hν = ρQν.
+    This needs one product with F, except for x = 0, where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.
     """
     C, x_tilde = problem.rows.C, problem.rows.x_tilde
     nu = np.clip(x - x_tilde, *problem.bounds)
@@ -165,7 +167,7 @@ def _accuracy(
     problem: Projected, tol: float, b_size: float, energy: float
 ) -> Callable[[Point, Face], bool]:
     """Return the stopping test of the outer loop."""
-    most = 0  # products, once all but the energy is as accurate as asked for
+    most = 0  # limit of products, set when all criteria except the energy are met
 
     def reached(here: Point, face: Face) -> bool:
         nonlocal most
@@ -219,7 +221,7 @@ def _updated(
 
 
 def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:
-    """Change ρ; the gradient follows without a product."""
+    """Return the iterate with another ρ; its gradient needs no product."""
     Qnu = problem.rows.C.T @ (problem.rows.C @ at.nu)
     return at._replace(rho=rho, g=at.g + (rho - at.rho) * Qnu, directions=None)
 

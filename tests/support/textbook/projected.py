@@ -1,4 +1,4 @@
-"""The projected problem, its operator and models of it, in NumPy."""
+"""The projected problem, its operator, and models of the operator, in NumPy."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tests.support.textbook import kernels
 from tests.support.textbook.model import BoxModel, Model
 from tests.support.textbook.rows import model_of, orthonormal_rows
 
-FEW = 5  #: steps after which a flat spectrum shows
-FLAT = 10.0  #: ratio of Ritz values of one size
-FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
-TAIL = 1e-4  #: least τ of a model, relative to the norm
+FEW = 5  #: number of Lanczos steps after which a flat spectrum is detected
+FLAT = 10.0  #: largest ratio of Ritz values in a spectrum that counts as flat
+FOUND = 1e-3  #: largest residual / value of the first Ritz pair in a decaying spectrum
+TAIL = 1e-4  #: smallest τ of a model, relative to the norm
 
 
 @dataclass(eq=False)
@@ -32,12 +32,12 @@ class Projected(projected.Projected):
     """Steps 1 to 3 of SMALBE: H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and b."""
 
     def energy_error(self, nu: Vector, gradient: Vector) -> float:
-        """Estimate the relative energy error from what is left of the gradient.
+        """Estimate the relative energy error from the residual gradient.
 
-        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, of which every
-        rᵢ²/F_ii is a lower bound. The root of their sum was 0.8 to 8.4 times below the
-        certified error of the contact problems at hand. Gradients that are rounding of
-        q do not count. Zero where F is an operator.
+        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, and every rᵢ²/F_ii
+        is a lower bound. The certified error of the tested contact problems was 0.8 to
+        8.4 times the root of the sum of these bounds. Gradients within the rounding
+        error of q are ignored. The estimate is zero if F is an operator.
         """
         energy = abs(self.q @ (self.rows.x_tilde + nu))
         r = self.spectrum.norm * gradient
@@ -60,18 +60,19 @@ class Projected(projected.Projected):
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.
 
-        The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
-        what the Ritz vectors before it leave (the last, where the process came to its
-        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
-        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
-        a short process finds not even the first eigenvector, and Ritz vectors that are
-        none would slow CG down: then only the norm is used.
+        The last but one Ritz value plus its residual estimates the norm of 𝒫F𝒫 on the
+        complement of the preceding Ritz vectors. (The last Ritz value is used if the
+        process terminated, and the first one whose residual exceeds its value.) ρQ is
+        used exactly. If the estimate is too small, MPRGP raises τ according to its
+        products. In a flat spectrum, a short process does not even find the first
+        eigenvector, and inaccurate Ritz vectors would slow CG down; then only the norm
+        is used.
         """
         above, U, tail = self.upper_end()
         return model_of(self.rows, tail, above, U, rho)
 
     def upper_end(self) -> tuple[Vector, NDArray[np.float64], float]:
-        """Return the Ritz pairs (k,), (k, n) that a model holds, and its τ."""
+        """Return the Ritz values (k,) and vectors (k, n) of a model, and its τ."""
         ritz = self.spectrum.ritz
         if ritz is None:
             raise ValueError("the power method found no Ritz pairs")
@@ -85,11 +86,11 @@ class Projected(projected.Projected):
         return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
 
     def penalty(self, rho: float) -> BoxModel:
-        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        """Model H by I + (ρ − 1)Q, which needs no Ritz pairs."""
         return model_of(self.rows, 1.0, np.zeros(0), np.zeros((0, self.b.size)), rho)
 
     def plain_model(self, rho: float, *, alpha: float) -> Model:
-        """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
+        """Model H only by ‖H‖ = max(1, ρ), with ᾱ = alpha/‖H‖."""
         norm = max(1.0, rho if len(self.rows.C) else 0.0)
         return Model.of_norm(norm / alpha, self.b.size)
 
@@ -97,7 +98,10 @@ class Projected(projected.Projected):
 def projected_problem(
     qp: QP, find: Callable[[Callable[[Vector], Vector], given.Rows], Spectrum]
 ) -> Projected:
-    """Homogenise, project and normalise; one product with F and those of `find`."""
+    """Homogenise, project and normalise the QP.
+
+    This needs one product with F, and the products of `find`.
+    """
     F = Product(qp.P, qp.q.size)
     if is_sparse(qp.A):
         rows = equality_rows(qp.A, qp.b, has_bound(qp))
@@ -112,7 +116,7 @@ def projected_problem(
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     b = rows.project(d) / spectrum.norm
     if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
-        b = np.zeros_like(b)  # nothing but rounding errors is left of d
+        b = np.zeros_like(b)  # b consists only of rounding errors of d
     C = Rows(rows, Reduction())
     return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal)
 
@@ -120,7 +124,7 @@ def projected_problem(
 def by_lanczos(
     PFP: Callable[[Vector], Vector], rows: given.Rows, *, steps: int
 ) -> Spectrum:
-    """Find the norm and the upper Ritz pairs; `steps` products."""
+    """Find the norm and the upper Ritz pairs with `steps` products."""
     start = rows.project(random_start(rows.x_tilde.size))
     steps = min(steps, size(start) - len(rows.C))  # the dimension of the range of 𝒫
     ritz = lanczos(PFP, start, steps)
@@ -128,18 +132,19 @@ def by_lanczos(
 
 
 def size(v: Vector) -> int:
-    """Count the components of a vector; of one over ranks, those of all."""
+    """Return the number of components of a vector, over all ranks."""
     return int((np.zeros_like(v) + 1).sum())
 
 
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
-    """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
+    """Run `steps` Lanczos steps with full reorthogonalisation and one product each.
 
-    What three terms leave is of the size of the next vector, so that one pass over all
-    vectors makes it orthogonal to them to rounding. The residual of the pair (θ, Vᵀs)
-    is |β s_k| with the last off-diagonal entry β. A start vector from an invariant
-    subspace keeps the process there. It ends after FEW steps where all Ritz values are
-    of one size: conjugate gradients need few steps there, and no model.
+    After the three-term recurrence, a single pass over all vectors makes the next
+    vector orthogonal to them up to rounding. The residual of the pair (θ, Vᵀs) is
+    |β s_k| with the last off-diagonal entry β. A start vector in an invariant subspace
+    keeps the process in that subspace. The process ends after FEW steps if all Ritz
+    values are of similar size, because conjugate gradients then need few steps and no
+    model.
     """
     basis = np.zeros((min(steps, size(start)), start.size))
     diagonal: list[float] = []

@@ -1,4 +1,4 @@
-"""Equality rows by a QR factorisation, and models of their penalty."""
+"""Equality rows, orthonormalised by QR, and models of their penalty term."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ from mortarbench.solvers.smalbe.rows import (
 from tests.support.textbook import kernels
 from tests.support.textbook.model import BoxModel, Model, Tilted, minimised
 
-NO_SHIFT = 1e-13  #: x̃ of this size relative to ν is rounding of e = 0
+NO_SHIFT = 1e-13  #: ratio ‖x̃‖/‖ν‖ up to which x̃ is attributed to rounding of e = 0
 
 
 def met(rows: Rows, nu: Vector, tol: float, least: float) -> bool:
     """Return whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
 
-    For e = 0, or x̃ no more than rounding of ν, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
+    If e = 0, or if x̃ is within the rounding error of ν, the criterion is
+    ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
     """
     Cnu, nu_size = rows.C @ nu, float(np.linalg.norm(nu))
     size = float(np.linalg.norm(rows.x_tilde))
@@ -58,12 +59,12 @@ def violation(rows: Rows, nu: Vector) -> float:
 def model_of(
     rows: Rows, tau: float, above: Vector, U: NDArray[np.float64], rho: float
 ) -> BoxModel:
-    """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC, without what is not above τ."""
+    """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC without terms of negative factor."""
     if isinstance(rows, DenseRows):
         w = np.append(above, np.full(len(rows.C), rho))
         return Model(0.0, np.vstack([U, rows.C]), w).with_tail(tau)
     assert isinstance(rows, SparseRows)
-    # many rows come of many subdomains, and there no eigenvalue stands apart
+    # many rows indicate many subdomains; the spectrum then has no isolated eigenvalues
     if rho <= tau:
         return Model.of_norm(tau, rows.x_tilde.size)
     return PenaltyModel(tau, rows, rho - tau)
@@ -82,9 +83,10 @@ class PenaltyModel:
     def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
         """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
 
-        As `Model.step`, with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs: the gradient of
-        the dual function is Gs(y) − GGᵀy/w. Of components without bounds s is
-        −(g + Gᵀy)/τ, so that only those with bounds, b, are looked at for each y:
+        The method is that of `Model.step` with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs:
+        the gradient of the dual function is Gs(y) − GGᵀy/w. On components without
+        bounds, s = −(g + Gᵀy)/τ, so that only the components b with bounds are
+        evaluated for each y:
 
             Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
         """
@@ -114,7 +116,7 @@ class PenaltyModel:
         return s
 
     def raised(self, s: Vector, sHs: float) -> BoxModel:
-        """Raise τ like `Model.raised`."""
+        """Return the model with τ raised as in `Model.raised`."""
         Cs = self.rows.C @ s
         part, square = float(Cs @ Cs), float(s @ s)
         rest = square - part
@@ -127,7 +129,7 @@ class PenaltyModel:
         return PenaltyModel(tau, self.rows, w)
 
     def relaxed(self, factor: float) -> PenaltyModel:
-        """Divide τ like `Model.relaxed`."""
+        """Return the model with τ divided as in `Model.relaxed`."""
         return replace(self, tau=self.tau / factor)
 
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
@@ -146,7 +148,7 @@ class PenaltyModel:
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
-    """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
+    """Compute C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
     dense = as_dense(G)
     size = np.linalg.norm(dense, axis=1)
     size[size == 0] = 1.0
