@@ -27,8 +27,8 @@ HEAD = f"""\
 # Effects of equivalent formulations
 
 **Does the answer of a solver change if the same QP is written in another way?** `make
-weaknesses` measures this and writes this page, with the versions in `constraints.txt`.
-`mortarbench test-solver NAME` measures one solver.
+weaknesses` runs these tests with the versions in `constraints.txt`, and writes this
+page. `mortarbench test-solver NAME` runs them for one solver.
 
 The test problem consists of two strings in contact
 (`harness.conformance.manufactured.strings`). It has three forms: the primal QP with 42
@@ -39,9 +39,9 @@ powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted 
 opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
 verdict nor answer should change.
 
-A change of units multiplies the non-dimensional quantities by the factors below. They
-follow from the load and the length of the paper's benchmark, expressed
-in the new units and rounded to powers of two:
+A change of units multiplies the non-dimensional quantities by the factors in the next
+table. The factors are the load and the length of the paper's benchmark, expressed in
+the new units and rounded to powers of two, and their products and quotients:
 
 """
 
@@ -50,7 +50,7 @@ The entries of the next table have these meanings:
 
 - "·": verdict and answer are the same in every form;
 - ×k: in the worst form, the solver takes k times as many iterations (for k ≥ 2);
-- **form**: verdict or answer change in this form; the evidence is below the table;
+- **form**: verdict or answer change in this form; see the section *Evidence*;
 - (form): the solver declines the changed QP of this form;
 - blank: the change does not apply to any form that the solver solves.
 """

@@ -35,16 +35,16 @@ test of its solver. The claim of a solver is recorded, but verdicts do not rely 
 | your QP | try first |
 | --- | --- |
 | bounds and equality rows only, such as a dual | `smalbe` |
-| the same, dense, with at most a few hundred unknowns | `smalbe-direct` |
+| bounds and equality rows, dense, at most a few hundred unknowns | `smalbe-direct` |
 | inequality rows, such as a primal form | `piqp`, `clarabel` |
 | inequality rows, small and dense | `daqp` |
 | bodies in subdomains (P is an operator) | `smalbe`; without contact `feti` |
 | load steps and other sequences | a solver with *yes* in the column "sequences" |
 
-`mortarbench test-solver NAME` runs the conformance suite on any of them, and on your
-own solver with `--plugin FILE.py`. If the library of a solver is missing, the solver
-declines, and the message names the command that installs the library; `make setup`
-installs all of them (the extra `fleet`).
+`mortarbench test-solver NAME` runs the conformance suite on one of these solvers, or on
+your own solver with `--plugin FILE.py`. If the library of a solver is missing, the
+solver declines, and the message states the command that installs the library; `make
+setup` installs all libraries (the extra `fleet`).
 
 [weaknesses.md](weaknesses.md) shows how the answers change with the units, with the
 order of unknowns and rows, with scaled or repeated rows, and with shifted or mirrored
@@ -163,7 +163,7 @@ def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> lis
     heads = [f"`{name}`" for name in names]
     lines = [
         f"| option | {' | '.join(heads)} | |",
-        f"| --- |{' --- |' * (len(names) + 1)}",
+        f"|---|{'---|' * (len(names) + 1)}",
     ]
     for option in options:
         values = " | ".join(f"{columns[name][option]!r}" for name in names)

@@ -42,18 +42,18 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class Clarabel:
-    """https://clarabel.org, one thread.
+    """https://clarabel.org, with one thread.
 
     Clarabel divides its residuals by max(1, size of their terms), and accepts a gap
     below tol, absolute *or* relative to max(1, |objective|). For a small objective
     these tests are absolute, and tol = 1e-6 loses five digits at an energy of 1e-5.
     With the objective scaled to ‖q‖∞ = 1e4, each test is relative if x is of order one,
-    as in every QP of this project, and tol is passed unchanged. (The steps hardly
-    change, since Clarabel equilibrates the objective.) In units in which x is tiny,
-    Clarabel may stop early.
+    as in every QP of this project, and tol is passed unchanged. (The scaling hardly
+    changes the steps, since Clarabel equilibrates the objective.) In units in which x
+    is tiny, Clarabel may stop early.
 
-    Equalities go to the zero cone; inequalities and finite bounds, one row each, to the
-    nonnegative cone.
+    Equalities are assigned to the zero cone; inequalities and finite bounds, one row
+    each, to the nonnegative cone.
     """
 
     max_iter: int = 200

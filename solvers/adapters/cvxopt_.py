@@ -26,12 +26,12 @@ from mortarbench.solvers.common.conversion import (
 
 @dataclass(frozen=True)
 class CVXOPT:
-    """https://cvxopt.org, dense if P is dense, else sparse.
+    """https://cvxopt.org, with dense matrices if P is dense, else with sparse matrices.
 
     CVXOPT divides the 2-norms of residuals by max(1, ‖q‖) and max(1, norm of the
     right-hand sides), and tests the gap in absolute terms (abstol) or relative to the
-    objective (reltol). So feastol = reltol = tol, abstol is negligible, and the
-    objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
+    objective (reltol). Therefore feastol = reltol = tol, abstol is negligible, and the
+    objective is scaled to ‖q‖∞ = 1e4, so that the maximum with 1 has no effect.
     """
 
     max_iter: int = 200
@@ -46,11 +46,11 @@ class CVXOPT:
         "per iteration",
         phases="preparing converts only; solving does everything else",
         limits=(
-            "Declines dependent equality rows, which end in an error or as 'unknown' "
-            "(conformance, shape 'redundant').",
-            "Bodies supported by equality rows only (an exactly singular P) end as "
-            "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
-            "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
+            "Linearly dependent equality rows are declined, because solves end with an "
+            "error or as 'unknown' (conformance, shape 'redundant').",
+            "For bodies supported by equality rows only (an exactly singular P), "
+            "solves end as 'unknown' after 2 iterations with the default KKT solver, "
+            "'chol2'; with 'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
         ),
     )
 

@@ -78,30 +78,31 @@ CLAIMS = {
 class CVXPY:
     """One backend of cvxpy; compilation is timed as preparing, its setup as solving.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
-    absolute and a relative tolerance, it is the relative one. A backend not listed
-    there runs with cvxpy's defaults. As in the native adapters, the objective is scaled
-    to ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (HIGHS, DAQP). Backends to
-    which cvxpy passes a cone program are declined, and so is ProxQP, because cvxpy
-    cannot enable its gap test.
+    The tolerance is passed in the backend's own keywords (`CALLS`). If a stopping test
+    adds an absolute and a relative tolerance, `tol` is passed as the relative
+    tolerance. A backend without an entry in `CALLS` runs with cvxpy's defaults. As in
+    the native adapters, the objective is scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the
+    backend's test is absolute (HIGHS, DAQP). QPs are declined for backends to which
+    cvxpy passes a cone program, and for ProxQP, because cvxpy cannot enable the test of
+    its duality gap.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME
 
     about: ClassVar[About] = About(
         title="cvxpy",
-        method="that of the backend NAME",
+        method="method of the backend NAME",
         licence="Apache-2.0; backends have their own licences",
         package="cvxpy",
-        linear_solver="the backend's",
+        linear_solver="linear solver of the backend",
         phases="preparing compiles the model to the backend's data; solving is the "
         "backend's setup and solve",
         limits=(
-            "CVXOPT and ECOS are declined: they would receive a cone program, which "
-            "costs half of the digits (dual residuals of 1e-5 at tol 1e-6, by the "
+            "QPs are declined for CVXOPT and ECOS, which would receive a cone program "
+            "and lose half of the digits (dual residuals of 1e-5 at tol 1e-6 in the "
             "conformance suite).",
-            "PROXQP is declined: without its gap test, a claimed solution has a "
-            "complementarity of 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
+            "QPs are declined for PROXQP: without its gap test, a claimed solution has "
+            "a complementarity of 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
         ),
     )
 

@@ -50,12 +50,12 @@ MIN_TOLERANCE = 1e-11
 
 @dataclass(frozen=True)
 class DAQP:
-    """https://darnstrom.github.io/daqp, dense.
+    """https://darnstrom.github.io/daqp, with dense matrices.
 
-    DAQP ends with an active set for which the KKT conditions hold to rounding;
+    DAQP ends with an active set for which the KKT conditions hold up to rounding;
     primal_tol and dual_tol only decide which violations and multiplier signs count.
-    Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are set to
-    tol/1000, but at least 1e-11. Larger values would not save steps.
+    Both tolerances are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are
+    set to tol/1000, but at least 1e-11. Larger values would not save steps.
 
     If the Cholesky factorisation of P breaks down, DAQP runs its own proximal-point
     iterations (eps_prox < 0: automatic).
@@ -72,10 +72,10 @@ class DAQP:
         phases="preparing converts to dense matrices and factorises; solving iterates",
         sequence="`update` of vectors keeps the factors and the active set",
         limits=(
-            "Takes over 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
-            "(suites/fleet.toml).",
-            "With tolerances of 1e-12 its proximal iterations end with residuals of "
-            "7e-7 on singular QPs, so its tolerances are at least 1e-11.",
+            "DAQP takes more than 20 s on the 4420 unknowns of "
+            "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
+            "With tolerances of 1e-12, the proximal iterations of DAQP end with "
+            "residuals of 7e-7 on singular QPs, so the adapter sets at least 1e-11.",
         ),
     )
 

@@ -45,8 +45,9 @@ CLAIM_FACTOR = 10.0
 class ECOS:
     """https://github.com/embotech/ecos.
 
-    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues of P. A gap
-    of tol permits errors of √tol in x, so ECOS is called again for corrections of x.
+    The term ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues
+    and eigenvectors of P. A gap of tol permits errors of √tol in x, so ECOS is called
+    again to compute corrections of x.
     """
 
     max_iter: int = 200
@@ -59,7 +60,7 @@ class ECOS:
         package="ecos",
         linear_solver="sparse LDLᵀ, bundled, one factorisation per iteration",
         phases="preparing computes eigenvalues",
-        limits=("Fails below tol 1e-8.",),
+        limits=("ECOS fails at tolerances below 1e-8.",),
     )
 
     def __post_init__(self) -> None:

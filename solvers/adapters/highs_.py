@@ -40,16 +40,17 @@ MIN_ENTRY = 1e-12  #: smallest value of small_matrix_value that HiGHS accepts
 class HiGHS:
     """https://highs.dev, one thread: active set (qpasm) or interior point (hipo).
 
-    HiGHS tests violations and multiplier signs in absolute terms. So the objective is
-    scaled to ‖q‖∞ = 1, and all tolerances are set to tol/100, but at least 1e-10, the
-    smallest value that HiGHS accepts. An active-set method needs few additional steps
-    for it.
+    HiGHS tests violations and multiplier signs in absolute terms. Therefore the
+    objective is scaled to ‖q‖∞ = 1, and all tolerances are set to tol/100, but at least
+    1e-10, the smallest value that HiGHS accepts. An active-set method needs few
+    additional steps for this accuracy.
 
     The adapter works around three properties of HiGHS. On QPs with bounds only, qpasm
-    claims an optimum after 0 iterations, so a free row is added. HiGHS adds
-    qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which leaves
-    residuals of 1e-6 on a singular QP of order one; it is set to 0. HiGHS drops entries
-    below small_matrix_value (default 1e-9), which is lowered to 1e-12.
+    claims an optimum after 0 iterations, so the adapter adds a free row. HiGHS adds
+    qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which causes
+    residuals of 1e-6 on a singular QP of order one; the adapter sets it to 0.
+    HiGHS drops entries below small_matrix_value (default 1e-9); the adapter lowers this
+    value to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -68,17 +69,17 @@ class HiGHS:
             "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
             "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
             "residuals of 5e-12.",
-            "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
-            "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
-            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
-            "number 260 (suites/friction.toml).",
+            "qpasm ends with kSolveError if lengths of 1e-3 increase the entries of "
+            "the Hessian by a factor of 1e6 (tests/solvers/test_solvers.py), and on "
+            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, where F has the "
+            "condition number 260 (suites/friction.toml).",
             "Without the free row, the result for a membrane of 225 nodes has a "
             "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
             "400 nodes touches').",
-            "Without highspy-extras HiGHS silently runs qpasm in place of hipo; the "
-            "adapter reports a failure.",
-            "qpasm stores a dense Hessian on the null space of active rows; a QP for "
-            "which it would not fit into memory is declined.",
+            "Without highspy-extras, HiGHS silently runs qpasm instead of hipo; the "
+            "adapter then reports a failure.",
+            "qpasm stores a dense Hessian on the null space of active rows; a QP is "
+            "declined if this Hessian would not fit into memory.",
         ),
     )
 

@@ -38,15 +38,15 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class OSQP:
-    """https://osqp.org, with its built-in algebra (QDLDL), one thread.
+    """https://osqp.org, with its built-in linear algebra (QDLDL) and one thread.
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term). With a negligible eps_abs, this is
-    the relative test of the harness, so eps_rel = tol. It is evaluated every 25
+    the relative test of the harness, so eps_rel = tol. OSQP evaluates the test every 25
     iterations. Bounds become rows of the identity, one per bounded variable.
 
     If the dual residual is below 1e-10 (absolute) before polishing, OSQP accepts any
-    dual residual after it. With polishing, the objective is therefore scaled to
+    dual residual after polishing. With polishing, the objective is therefore scaled to
     ‖q‖∞ = 1e4.
     """
 
@@ -62,10 +62,10 @@ class OSQP:
         phases="preparing scales and factorises; solving iterates and polishes",
         sequence="`update` of vectors keeps the factors; starts from the last point",
         limits=(
-            "Polishing made residuals worse on QPs with a small objective: without "
-            "the scaling, a dual residual of 3e-3 at a tolerance of 1e-6 "
-            "(tests/solvers/test_solvers.py, energies of 1e-6), and a gap of 3e-7 at a "
-            "tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
+            "On QPs with a small objective, polishing increases residuals. Without the "
+            "scaling, the dual residual was 3e-3 at a tolerance of 1e-6 "
+            "(tests/solvers/test_solvers.py, energies of 1e-6), and the gap was 3e-7 "
+            "at a tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
         ),
     )
 

@@ -39,8 +39,9 @@ class PIQP:
     """https://predict-epfl.github.io/piqp.
 
     PIQP stops when the max norms of the residuals and the duality gap are below eps_abs
-    *or* below eps_rel·max(1, their largest term). So eps_abs is negligible, eps_rel =
-    tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
+    *or* below eps_rel·max(1, their largest term). Therefore eps_abs is negligible,
+    eps_rel = tol, and the objective is scaled to ‖q‖∞ = 1e4, so that the maximum with 1
+    has no effect.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored

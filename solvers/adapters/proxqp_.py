@@ -45,15 +45,16 @@ class ProxQP:
 
     ProxQP stops when the max norms of the primal and dual residuals are below
     eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The test of the duality gap is off by default and enabled here. ProxQP does
-    not test the signs of multipliers. Its default start, which treats every row as an
-    equality, often passes all tests with negative multipliers (primal forms, tol ≥
-    1e-4). The adapter starts from zero: negative multipliers become rare, and fewer
-    iterations are needed.
+    eps_abs. The adapter enables the test of the duality gap, which is off by default.
+    ProxQP does not test the signs of multipliers. Its default starting point, which
+    treats every row as an equality, often passes all tests with negative multipliers
+    (primal forms, tol ≥ 1e-4). The adapter starts from zero: negative multipliers
+    become rare, and fewer iterations are needed.
 
-    Certificates of infeasibility are tested in absolute terms: at the default 1e-4,
-    feasible QPs with multipliers of that size are claimed infeasible. At 1e-8 they are
-    not, but some infeasible QPs end at the iteration limit.
+    Certificates of infeasibility are tested in absolute terms. With the default
+    tolerance of 1e-4, feasible QPs with multipliers of this size are claimed
+    infeasible. The adapter sets 1e-8, which avoids these claims, but some infeasible
+    QPs then end at the iteration limit.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -71,11 +72,11 @@ class ProxQP:
         "point",
         limits=(
             "The sign of multipliers is not tested.",
-            "At tol 1e-3 it claims points with residuals of 1e-2 to 2e-2 on duals with "
+            "At tol 1e-3, claimed points have residuals of 1e-2 to 2e-2 on duals with "
             "friction (greco/dual-bounds, beam-ring/steps=1/friction=tresca/bound=1e8/"
-            "dual); at 1e-6 and 1e-9 all are verified.",
-            "Has no time limit and does not release Python's GIL: only killing the "
-            "process ends it.",
+            "dual); at 1e-6 and 1e-9 all answers are verified.",
+            "ProxQP has no time limit and does not release Python's GIL, so only "
+            "killing the process ends a solve.",
         ),
     )
 

@@ -35,11 +35,11 @@ class QOCO:
     """https://qoco-org.github.io/qoco.
 
     QOCO stops when the max norms of the residuals are below abstol + reltol·(their
-    largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
-    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
-    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
-    every relative residual is small, and QOCO reports success. A claim with ‖x‖∞ > 1e12
-    therefore counts as failed.
+    largest term) and the gap is below abstol + reltol·max(1, |objective|). Therefore
+    abstol is negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, so
+    that the maximum with 1 has no effect. QOCO computes no certificates: on an
+    unbounded QP its iterates grow until every relative residual is small, and QOCO
+    reports success. A claim with ‖x‖∞ > 1e12 therefore counts as failed.
     """
 
     max_iter: int = 200
@@ -55,8 +55,8 @@ class QOCO:
         sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
         "accepts no starting point",
         limits=(
-            "No certificates of infeasibility (conformance check 'unbounded': claimed "
-            "solved with ‖x‖∞ = 1e16).",
+            "QOCO computes no certificates of infeasibility (in the conformance check "
+            "'unbounded' it claims success with ‖x‖∞ = 1e16).",
         ),
     )
 

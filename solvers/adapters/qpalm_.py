@@ -54,8 +54,8 @@ class QPALM:
         phases="preparing scales; solving does all factorisations",
         sequence="`update` of vectors; starts from the last point",
         limits=(
-            "No duality-gap test: it may stop early if primal and dual residuals "
-            "are small and the gap is not.",
+            "QPALM does not test the duality gap, so it may stop early if the primal "
+            "and dual residuals are small but the gap is large.",
         ),
     )
 

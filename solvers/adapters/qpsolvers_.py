@@ -94,32 +94,33 @@ STATUS_PATTERNS = (
 class QPSolvers:
     """One backend of qpsolvers; all work except the conversion is timed as solving.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
-    absolute and a relative tolerance, it is the relative one. A backend not listed
-    there runs with its defaults. As in the native adapters, the objective is scaled to
-    ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (highs, daqp). Backends that
-    accept both dense and sparse matrices receive dense ones if P is dense. qpsolvers
-    reports iterations only for some backends.
+    The tolerance is passed in the backend's own keywords (`CALLS`). If a stopping test
+    adds an absolute and a relative tolerance, `tol` is passed as the relative
+    tolerance. A backend without an entry in `CALLS` runs with its defaults. As in the
+    native adapters, the objective is scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the
+    backend's test is absolute (highs, daqp). Backends that accept both dense and sparse
+    matrices receive dense matrices if P is dense. qpsolvers reports iterations only for
+    some backends.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME
 
     about: ClassVar[About] = About(
         title="qpsolvers",
-        method="that of the backend NAME",
+        method="method of the backend NAME",
         licence="LGPL-3.0-or-later; backends have their own licences",
         package="qpsolvers",
-        linear_solver="the backend's",
+        linear_solver="linear solver of the backend",
         phases="preparing converts only; the backend's setup and factorisation count "
         "as solving",
         limits=(
-            "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs with its "
-            "own code, which claims that strictly convex ones are unbounded "
-            "(conformance, shape 'unconstrained'); such QPs are declined.",
+            "Unconstrained QPs are declined for clarabel, qtqp and scs, because "
+            "qpsolvers solves them with its own code, which claims that strictly "
+            "convex QPs are unbounded (conformance, shape 'unconstrained').",
             "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
             "ecos attains only half of the requested digits; use our adapter `ecos` "
-            "instead. pyqpmad, which is not installed, returns wrong multipliers for "
-            "fixed variables.",
+            "instead. pyqpmad, which `make setup` does not install, returns wrong "
+            "multipliers for fixed variables.",
         ),
     )
 

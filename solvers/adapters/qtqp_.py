@@ -36,12 +36,13 @@ class QTQP:
     """https://github.com/google-deepmind/qtqp.
 
     QTQP compares its residuals with max(1, size of their terms), and accepts a gap
-    below tol, absolute or relative to max(1, |objective|). So the objective is scaled
-    to ‖q‖∞ = 1e4, where the 1 has no effect, and tol is passed unchanged.
+    below tol, absolute or relative to max(1, |objective|). Therefore the objective is
+    scaled to ‖q‖∞ = 1e4, so that the maximum with 1 has no effect, and tol is passed
+    unchanged.
 
-    In sequences QTQP starts from the last point, shifted into the interior. If the
-    residuals there are too large, it starts cold. The count `accepted_starts` is 1 or 0
-    accordingly.
+    In sequences QTQP starts from the last point, shifted into the interior, if the
+    residuals at this point are small enough; otherwise QTQP uses its default starting
+    point. The count `accepted_starts` is 1 if the last point was used, otherwise 0.
     """
 
     linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"
@@ -56,11 +57,11 @@ class QTQP:
         phases="preparing converts only; solving equilibrates and factorises",
         sequence="starts from the last point if QTQP accepts it",
         limits=(
-            "Needs an inequality row or a bound: without one it divides by zero.",
-            "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
+            "QTQP needs an inequality row or a bound; otherwise it divides by zero.",
+            "At tol 1e-9 QTQP stagnates with a relative gap of 1.1e-9 on beam-ring/"
             "Nr=30/Nh=15/primal and ends at its iteration limit, near the solution; "
             "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
-            "of the claimed point is 2.0e-8, twice the limit of a verified one.",
+            "of the claimed point is 2.0e-8, twice the limit for a verified point.",
             "When its own test is met, the complementarity may exceed 10·tol: on "
             "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
             "and 1.7e-7 at 1e-8 (step 5, cold start).",

@@ -31,12 +31,12 @@ class Quadprog:
     """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
 
     quadprog has no tolerance, so `tol` is not used: after finitely many changes of the
-    active set, the KKT conditions hold to rounding.
+    active set, the KKT conditions hold up to rounding.
 
-    A QP is declined after the factorisation of its Hessian if this is not positive
-    definite or its smallest Cholesky pivot is below 1e-12 of the largest. QPs with
-    dependent equality rows are also declined, because quadprog reports that such rows
-    are inconsistent.
+    The adapter factorises the Hessian of a QP. It declines the QP if the Hessian is not
+    positive definite, or if the smallest Cholesky pivot is below 1e-12 of the largest
+    pivot. QPs with linearly dependent equality rows are also declined, because quadprog
+    reports that such rows are inconsistent.
     """
 
     about: ClassVar[About] = About(
@@ -47,10 +47,11 @@ class Quadprog:
         linear_solver="dense Cholesky (LAPACK), QR of the active rows updated",
         phases="preparing factorises P and inverts the factor; solving iterates",
         limits=(
-            "Strictly convex QPs only: the dual with Dirichlet rows, whose F is "
-            "singular, is declined.",
-            "Declines dependent equality rows, which quadprog claims infeasible even "
-            "if they are consistent (conformance, shape 'redundant').",
+            "quadprog solves strictly convex QPs only: the dual with Dirichlet rows, "
+            "whose F is singular, is declined.",
+            "Linearly dependent equality rows are declined, because quadprog claims "
+            "infeasibility even if they are consistent (conformance, shape "
+            "'redundant').",
         ),
     )
 

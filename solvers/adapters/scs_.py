@@ -39,9 +39,9 @@ class SCS:
 
     SCS stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
-    negligible eps_abs. The test is evaluated every 25 iterations. Equalities go to the
-    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone;
-    discs and cones to second-order cones.
+    negligible eps_abs. The test is evaluated every 25 iterations. Equalities are
+    assigned to the zero cone; inequalities and finite bounds, one row each, to the
+    nonnegative cone; discs and cones to second-order cones.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
@@ -57,7 +57,7 @@ class SCS:
         "of scale",
         phases="preparing equilibrates and factorises; solving iterates",
         sequence="`update` of vectors keeps the factors; starts from the last point",
-        limits=("Needs a row or a bound, because its cone must not be empty.",),
+        limits=("SCS needs a row or a bound, because its cone must not be empty.",),
     )
 
     def __post_init__(self) -> None:

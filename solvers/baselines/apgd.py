@@ -33,9 +33,10 @@ class AcceleratedGradient:
     """In-house accelerated projected gradient method (APGD).
 
     The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
-    residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
-    reported as solved. The start is the feasible point nearest to zero. Iterations are
-    steps; all products with P are counted.
+    residuals at this point exceed 5·tol, the bound is lowered and the iteration
+    continues; only a point with residuals within 5·tol is reported as solved. The
+    starting point is the feasible point nearest to zero. Iterations are steps; all
+    products with P are counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
@@ -51,7 +52,7 @@ class AcceleratedGradient:
         licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
-        phases="preparing does nothing; solving does all the work",
+        phases="preparing takes no work; solving does all computations",
     )
 
     def __post_init__(self) -> None:

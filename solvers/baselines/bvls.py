@@ -34,7 +34,7 @@ CLAIM_FACTOR = (
 
 @dataclass(frozen=True)
 class BVLS:
-    """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") otherwise.
+    """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") for other bounds.
 
     Both routines end with the exact active set. `tol` bounds the optimality test of
     bvls, and a point is reported as solved if its KKT residuals are within 5·tol. Fixed

@@ -68,9 +68,9 @@ class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
     The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If
-    the KKT residuals exceed 5·tol there, this bound is lowered; only a point within
-    5·tol is reported as solved. Iterations are CG steps; all products with P are
-    counted.
+    the KKT residuals at this point exceed 5·tol, the bound is lowered and the iteration
+    continues; only a point with residuals within 5·tol is reported as solved.
+    Iterations are CG steps; all products with P are counted.
     """
 
     preconditioner: Kind = (

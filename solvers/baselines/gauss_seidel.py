@@ -42,9 +42,10 @@ class GaussSeidel:
     """In-house projected Gauss–Seidel method (NSGS).
 
     The iteration stops when the norm of the natural map after a sweep is at most
-    tol·‖q‖. If the KKT residuals exceed 5·tol there, this bound is lowered; only a
-    point within 5·tol is reported as solved. The start is the feasible point nearest to
-    zero. Iterations are sweeps; each costs about as much as one product with P.
+    tol·‖q‖. If the KKT residuals at this point exceed 5·tol, the bound is lowered and
+    the iteration continues; only a point with residuals within 5·tol is reported as
+    solved. The starting point is the feasible point nearest to zero. Iterations are
+    sweeps; a sweep costs about as much as one product with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
@@ -56,8 +57,8 @@ class GaussSeidel:
         licence="BSD-3-Clause",
         method="block Gauss–Seidel over discs, cones and single variables (NSGS)",
         linear_solver="none (columns of P)",
-        phases="preparing does nothing; solving does all the work",
-        limits=("its loop over blocks is in Python: compare sweeps, not times",),
+        phases="preparing takes no work; solving does all computations",
+        limits=("the loop over blocks is in Python: compare sweeps, not times",),
     )
 
     def __post_init__(self) -> None:

@@ -88,13 +88,13 @@ class PDAS:
 
     `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
     rounding prevents further progress, a point with residuals of up to 5·tol is
-    reported as solved. Iterations are linear solves. The counts are: factorisations
+    reported as solved. Iterations are linear solves. The adapter counts factorisations
     (one per face, plus one if unbounded variables are condensed), constraints that
     entered or left the active set, steps that exchanged a single constraint, proximal
     centres, and products with P.
 
-    The start is the point of the box nearest to zero, which means no contact in the
-    primal and in the dual. (On the duals of contact problems, a start with all
+    The starting point is the point of the box nearest to zero: no row is in contact, in
+    the primal and in the dual. (On the duals of contact problems, a start with all
     variables free took from one solve fewer to seven solves more.)
     """
 

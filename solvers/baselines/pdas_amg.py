@@ -47,8 +47,9 @@ class PDASAMG(PDAS):
     """`pdas` with conjugate gradients and algebraic multigrid on the faces.
 
     P must be sparse. The near-kernel consists of the translations if P annihilates
-    them, otherwise of a constant vector. The counts are those of `pdas`, with multigrid
-    set-ups counted as factorisations, and the number of conjugate-gradient steps.
+    them, otherwise of a constant vector. The counts are defined as for `pdas`;
+    multigrid set-ups count as factorisations. The number of conjugate-gradient steps is
+    also counted.
     """
 
     about: ClassVar[About] = About(
@@ -60,9 +61,9 @@ class PDASAMG(PDAS):
         sequence="active set and point",
         package="pyamg",
         limits=(
-            "rotations are missing in the near-kernel: a QP contains no coordinates",
-            "rows that couple several nodes need more steps: 30 to 80 per solve on "
-            "beam-ring, 9 to 22 on cube-wall",
+            "the near-kernel contains no rotations, because a QP has no coordinates",
+            "rows that couple several nodes increase the number of CG steps: 30 to 80 "
+            "per solve on beam-ring, 9 to 22 on cube-wall",
         ),
     )
 

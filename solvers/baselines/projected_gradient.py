@@ -52,10 +52,10 @@ class ProjectedGradient:
     """In-house spectral projected gradient method.
 
     The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
-    residuals exceed 5·tol there, this bound is lowered; only a point within 5·tol is
-    reported as solved. The start is the feasible point nearest to zero, and the first α
-    is that of an exact line search. Iterations are steps; all products with P are
-    counted.
+    residuals at this point exceed 5·tol, the bound is lowered and the iteration
+    continues; only a point with residuals within 5·tol is reported as solved. The
+    starting point is the feasible point nearest to zero, and the first α is computed by
+    an exact line search. Iterations are steps; all products with P are counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
@@ -68,8 +68,10 @@ class ProjectedGradient:
         licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
-        phases="preparing does nothing; solving does all the work",
-        limits=("irregular: the load steps of the benchmark take 45 to 546 products",),
+        phases="preparing takes no work; solving does all computations",
+        limits=(
+            "numbers of products vary: the load steps of the benchmark take 45 to 546",
+        ),
     )
 
     def __post_init__(self) -> None:

@@ -44,22 +44,22 @@ DELTA = 1e-10  #: weight δ of the proximal term
 class Direct:
     """In-house SMALBE for small problems, with updated Cholesky factors of faces.
 
-    The loop ends when the KKT residuals of the QP are within `tol` or no longer
-    decrease. The point is reported as solved if they are within 5·tol.
+    The outer loop ends when the KKT residuals of the QP are within `tol` or no longer
+    decrease. The point is reported as solved if its residuals are within 5·tol.
     """
 
-    max_solves: int = 10_000  #: limit of all solves with factors of faces
+    max_solves: int = 10_000  #: limit of the number of solves with factors of faces
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",
         licence="BSD-3-Clause",
-        method="augmented Lagrangian with an exact active-set method inside",
+        method="augmented Lagrangian with an exact inner active-set method",
         linear_solver="dense Cholesky factor, updated as the active set changes",
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
-            f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P, `smalbe` "
-            "becomes faster between 100 and 200 unknowns",
+            f"QPs with more than {MAX_UNKNOWNS} unknowns are declined; with a sparse "
+            "P, `smalbe` is faster above 100 to 200 unknowns",
         ),
     )
 

@@ -46,13 +46,13 @@ class Options:
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
     #: preconditioner, else 1e4
     rho: float = 0.0
-    rho_growth: float = 1.0  #: factor of ρ when the Lagrangian grows too little
+    rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grows too little
     M: float = 1.0  #: initial M, in units of ‖𝒫F𝒫‖: inner runs end at ‖g^P‖ ≤ M‖Cν‖
-    beta: float = 0.5  #: factor of M when the Lagrangian grows too little
+    beta: float = 0.5  #: factor of M if the Lagrangian grows too little
     eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # for a sparse P, conjugation to all directions would cost more than a product
-    recycle: bool = True  #: conjugate to all CG directions on a face if P is not sparse
+    recycle: bool = True  #: keep CG directions conjugate on a face if P is not sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖

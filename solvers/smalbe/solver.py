@@ -35,7 +35,7 @@ from mortarbench.solvers.smalbe.preconditioner import missing_data
 class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equalities; uses only products with P.
 
-    Discs, such as bounds of friction forces in 3D, are accepted too.
+    Discs are also accepted; in space, they bound friction forces.
 
     `tol` bounds ‖g^P‖/‖b‖, with the projected gradient g^P of the projected problem,
     and ‖Gx − e‖/‖e‖. A point is reported as solved only if the KKT residuals of the
@@ -45,7 +45,7 @@ class SMALBE(Options):
     about: ClassVar[About] = About(
         title="SMALBE (ours)",
         licence="BSD-3-Clause",
-        method="augmented Lagrangian with an active-set method inside (MPRGP)",
+        method="augmented Lagrangian with an inner active-set method (MPRGP)",
         linear_solver="none (products with P, small dense systems of its model, "
         "incomplete factors of a sparse P)",
         phases="preparing orthonormalises rows and runs the Lanczos process",
@@ -53,7 +53,8 @@ class SMALBE(Options):
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
             "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
-            "parallel rows, tolerances to 1e-12) 1 ended as `iteration_limit`",
+            "parallel rows, tolerances down to 1e-12), one solve ended with "
+            "`iteration_limit`",
         ),
     )
 
