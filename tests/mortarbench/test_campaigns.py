@@ -1,4 +1,6 @@
-"""Campaigns that grow, are merged and gate a CI: real runs of toy problems."""
+"""Growth and merging of campaigns and their use as a CI gate, by real runs of toy
+problems.
+"""
 
 import json
 import os
@@ -46,7 +48,7 @@ def _found():
 
 @pytest.fixture
 def environment(_found):
-    """The same, for a test that changes it."""
+    """A constant description of this machine, which a test may change."""
     before = dict(_found["machine"])
     yield _found
     _found["machine"] = before
@@ -54,7 +56,9 @@ def environment(_found):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite, given as for `suite`, into a folder of that name."""
+    """Run a suite, whose arguments are those of `suite`, into a folder with
+    its name.
+    """
 
     def measure(out="out", **asked):
         file = tmp_path / f"{out}.toml"
@@ -66,7 +70,7 @@ def measure(tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Two folders of a campaign, as runs leave them."""
+    """The two folders of a campaign after their runs."""
     where = tmp_path_factory.mktemp("made")
     for name, depths in (("a", "1"), ("b", "2")):
         (where / f"{name}.toml").write_text(suite(depths=depths))
@@ -76,7 +80,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def stored(made, tmp_path):
-    """A copy of these folders."""
+    """A copy of the two folders of the campaign."""
     for name in "ab":
         shutil.copytree(made / name, tmp_path / name)
     return tmp_path / "a", tmp_path / "b"
@@ -92,7 +96,9 @@ GROWN = {
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """The folder `before`, and `grown`, a copy of it whose suite has grown."""
+    """The folder `before`, and a copy named `grown` whose suite has
+    additional cases.
+    """
     where = tmp_path_factory.mktemp("campaign")
     for name, asked in (("before", {"repeats": 2}), ("grown", GROWN)):
         (where / f"{name}.toml").write_text(suite(**asked))
@@ -284,7 +290,7 @@ def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path)
 
 
 def test_a_merge_that_is_killed_anywhere_loses_and_doubles_nothing(stored, tmp_path):
-    """At every file that it puts in place, before and after."""
+    """The merge is killed before and after each file that it writes."""
     a, b = stored
     whole = read_all(mb.merge(a, b, out=tmp_path / "whole"))
     ends = {}
@@ -304,7 +310,7 @@ def test_a_merge_that_is_killed_anywhere_loses_and_doubles_nothing(stored, tmp_p
 
 
 def killed_merge(folders, out, instant):
-    """Merge in a process that is killed as it puts file number `instant` in place."""
+    """Merge in a process that is killed when it writes file number `instant`."""
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     left = iter(range(instant))
@@ -374,7 +380,9 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
 def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):
-    """A solver that sleeps takes ten times as long in b; another one lies in c."""
+    """A solver that sleeps takes ten times as long in folder b; another solver makes a
+    false claim in folder c.
+    """
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
     slow = '{{ name = "slow", label = "{}", options.seconds = {} }}'
     honest, liar = slow.format("old", 0.02), '{ name = "liar", label = "old" }'
@@ -482,7 +490,7 @@ def test_a_value_of_two_dashes_is_refused_in_one_line(cli, stored, tmp_path, com
 def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
     campaign, measure, tmp_path, monkeypatch
 ):
-    """Before its fourth line is written."""
+    """The run is interrupted before it writes its fourth line."""
     shutil.copytree(campaign / "before", tmp_path / "out")
     append, left = Journal.append, iter(range(3))
 
@@ -499,7 +507,7 @@ def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
 
 @pytest.mark.slow
 def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
-    """By SIGKILL, as it is about to write its fourth line."""
+    """SIGKILL ends the run when it is about to write its fourth line."""
     measure(depths="2", repeats=1)
     grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}
     (tmp_path / "grown.toml").write_text(suite(**grown))
@@ -510,7 +518,9 @@ def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_p
 
 
 def check_growth(folder, before, measure, **grown):
-    """Hold three lines more than before, and after a second run all, once."""
+    """Check that three lines were added, and that a second run measures each remaining
+    case once.
+    """
     held = read_journal(folder)
     assert len(held) == before + 3
     whole = measure(**grown).records

@@ -1,4 +1,4 @@
-"""The command line: what it prints where, and with which exit code."""
+"""Output, output streams and exit codes of the command line."""
 
 import io
 import json
@@ -211,7 +211,7 @@ def test_report_names_the_files_that_it_wrote(cli, tmp_path):
     [("md,html,csv", "index.html"), ("csv,md", "index.md"), ("csv,tex", "")],
 )
 def test_report_prints_the_main_path_only(cli, tmp_path, formats, printed):
-    """The page; where there is none, the folder of what was written."""
+    """The path of the page is printed; without a page, the folder of the report."""
     (tmp_path / "folder").mkdir()
     code, out, err = cli("report", "folder", "--format", formats)
 
@@ -801,7 +801,7 @@ def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
 
 @pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
 def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
-    """Also one whose measurements take long, and that goes on with an earlier run."""
+    """The bars include one of long measurements and one of a continued run."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
     now = [0.0]
@@ -882,7 +882,9 @@ def test_a_quiet_run_prints_warnings_and_what_it_could_not_do(
 
 
 def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypatch):
-    """A command can solve the dual of a problem; of a QP in a file there is none."""
+    """The hint is printed for a problem, which has a dual form, but not for a QP from a
+    file.
+    """
     from mortarbench import QP, export
 
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Examples and commands of the documents."""
+"""Examples and commands in the documents."""
 
 import re
 import shlex
@@ -39,7 +39,7 @@ DOCUMENTS = [
 
 
 def test_the_solver_of_the_contributing_guide_solves(tmp_path):
-    """In under 30 lines, and right on a dual with bounds only."""
+    """The solver has fewer than 30 lines and solves a dual with bounds only."""
     _, code = re.findall(
         r"```python\n(.*?)```", (ROOT / "CONTRIBUTING.md").read_text(), re.S
     )
@@ -60,7 +60,9 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
 
 
 def test_the_elastic_family_of_the_plug_in_page_is_one(tmp_path):
-    """The stamp carries its pressure, the same in both forms and contact methods."""
+    """The contact force of the stamp balances its pressure, and is the same in both
+    forms and for all contact methods.
+    """
     page = (ROOT / "docs/plugins.md").read_text("utf-8")
     (code,) = re.findall(r"<!-- file: stamp.py -->\n```python\n(.*?)```", page, re.S)
     path = tmp_path / "stamp.py"
@@ -84,7 +86,9 @@ def test_the_elastic_family_of_the_plug_in_page_is_one(tmp_path):
 
 
 def test_the_steps_that_their_page_shows_solve(tmp_path):
-    """With every damping, from cautious to none, and as an option of a command."""
+    """The steps converge for every damping factor, and also if they are selected by a
+    command-line option.
+    """
     page = (ROOT / "docs/own-steps.md").read_text("utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
     path = tmp_path / "damped.py"
@@ -104,7 +108,7 @@ def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
 
 
 def test_the_pages_of_solvers_are_up_to_date():
-    """`make docs` writes them; together they have every section of the whole."""
+    """The pages equal the output of `make docs` and together contain every section."""
     pages = solvers_pages(SOLVERS)
 
     for name, text in pages.items():
@@ -148,7 +152,9 @@ def test_a_page_has_at_most_2500_words(page):
 
 
 def test_the_start_page_leads_every_kind_of_user_to_a_page_with_commands():
-    """One click: what comes first; there, a command or a session that is executed."""
+    """The first link for each kind of user leads to a page with commands or a session
+    that the tests execute.
+    """
     start = (ROOT / "README.md").read_text("utf-8")
     table = start.partition("## Where to start")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| .*\*\*.*$", table, re.M)
@@ -162,7 +168,9 @@ def test_the_start_page_leads_every_kind_of_user_to_a_page_with_commands():
 
 
 def test_every_file_that_a_page_names_exists():
-    """A path in backquotes or in a link, from the root or from the page's folder."""
+    """Paths in backquotes and links are relative to the root or to the folder of the
+    page.
+    """
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md")]
     rooms = "harness|problems|solvers|reports|mortarbench|tests|suites|benchmarks|docs"
     for page in pages:
@@ -175,7 +183,9 @@ def test_every_file_that_a_page_names_exists():
 
 
 def test_every_page_has_a_place_on_the_site():
-    """`make site` would refuse others; this tells so without building it."""
+    """`make site` fails if a page is missing from the navigation; this test does not
+    have to build the site.
+    """
     nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
     folder = ROOT / "docs"
     found = {p.name for p in folder.glob("*.md")}
@@ -186,7 +196,7 @@ def test_every_page_has_a_place_on_the_site():
 
 
 def workflow():
-    """The commands of the workflow for CI, with the names of its head filled in."""
+    """The commands of the CI workflow, with the variables of its header filled in."""
     whole = yaml.safe_load((ROOT / "docs/ci/mortarbench.yml").read_text("utf-8"))
     steps = [step for job in whole["jobs"].values() for step in job["steps"]]
     for text in (step["run"] for step in steps if "run" in step):
@@ -205,7 +215,7 @@ def test_the_workflow_for_ci_calls_commands_that_there_are():
 
 @pytest.mark.slow
 def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, capsys):
-    """The repository is that of `new solver mine` and `new suite compare`."""
+    """The repository is created by `new solver mine` and `new suite compare`."""
     monkeypatch.chdir(tmp_path)
     for kind, name in (("solver", "mine"), ("suite", "compare")):
         assert main(Registries(), ["new", kind, name]) == 0
@@ -221,7 +231,7 @@ def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, cap
 
 
 def test_the_citation_is_of_this_version_and_names_the_paper():
-    """CITATION.cff, and the BibTeX of the README, which must not disagree."""
+    """CITATION.cff and the BibTeX entry of the README agree."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     bibtex = (ROOT / "README.md").read_text("utf-8").partition("```bibtex\n")[2]
     fields = dict(re.findall(r"^  (\w+) += \{(.*)\},$", bibtex, re.M))
@@ -238,7 +248,7 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
 
 
 def test_the_comparison_policy_agrees_with_the_code():
-    """Its sentences are numbered without gaps, and state the constants of the code."""
+    """The sentences are numbered without gaps and state the constants of the code."""
     page = (ROOT / "docs/fair-play.md").read_text("utf-8")
     sentences = dict(
         re.findall(r"^- <span id=\"s(\d+)\">\*\*\1\.\*\*</span> (.*)", page, re.M)

@@ -1,8 +1,9 @@
-"""Every command that the documents show works, in the order of its page.
+"""Every command in the documents works, in the order of its page.
 
-A page's commands stand in blocks ```sh, or, in the README, in indented lines. Files
-that they need are the blocks after ``<!-- file: NAME -->``. What would take too long is
-run in a shorter form, and what cannot be run here is named with the reason.
+The commands of a page are in blocks ```sh; those of the README are indented lines. The
+files that they need are the blocks after ``<!-- file: NAME -->``. Commands that take
+too long are run in a shorter form, and those that cannot be run here are listed with
+the reason.
 """
 
 import re
@@ -159,7 +160,9 @@ _LAST = re.compile(r"\s+#\s+exit code (\d)$")
 
 
 def parts(text):
-    """Yield what a page says to do: ("file", name, content), ("run", command, code)."""
+    """Yield the instructions of a page: ("file", name, content) or ("run", command,
+    code).
+    """
     fence, name, lines = None, None, []
     for line in text.splitlines():
         if fence is None and (found := re.fullmatch(r"<!-- file: (\S+) -->", line)):
@@ -179,7 +182,7 @@ def parts(text):
 
 
 def command(line):
-    """Split a line into a command and the exit code that is expected of it."""
+    """Split a line into a command and its expected exit code."""
     found = _LAST.search(line)
     bare = " ".join(shlex.quote(w) for w in shlex.split(line, comments=True))
     return bare, int(found[1]) if found else 0
@@ -201,7 +204,9 @@ def test_nothing_is_shortened_or_left_out_that_no_page_shows():
 
 
 def test_a_block_that_shows_a_command_is_one_that_is_run():
-    """Whatever the fence: none of ours may hide in a block of another kind."""
+    """No command of this project is in a block whose fence excludes it from
+    the tests.
+    """
     for page in PAGES:
         blocks = re.findall(
             r"^```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S
@@ -212,7 +217,7 @@ def test_a_block_that_shows_a_command_is_one_that_is_run():
 
 @pytest.fixture
 def execute(tmp_path, monkeypatch, capsys):
-    """Run one command as a reader would, in a folder that has the suites."""
+    """Run one command in a folder that contains the suites, as a reader would."""
     (tmp_path / "suites").symlink_to(ROOT / "suites")
     monkeypatch.chdir(tmp_path)
 
@@ -234,7 +239,9 @@ def execute(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_every_command_of_a_page_works(page, execute, tmp_path):
-    """In its order; what one command writes, the next may read."""
+    """Commands run in the order of the page and may read files that earlier commands
+    wrote.
+    """
     instead, elsewhere = normal(SHORTER), normal(ELSEWHERE)
     for name in SUPPLIED.get(page.stem, ()):
         shutil.copy(ROOT / "tests" / "data" / name, tmp_path)

@@ -1,4 +1,4 @@
-"""The counts of products that the documents show agree with runs."""
+"""Numbers of products in the documents agree with runs."""
 
 import re
 import sys
@@ -32,19 +32,21 @@ def test_the_page_has_measured_tables_of_every_kind():
 
 @pytest.mark.parametrize(("case", "head", "shown"), QUICK)
 def test_a_short_count_is_the_one_shown(case, head, shown):
-    """Up to what another BLAS changes by rounding."""
+    """Counts may differ by the rounding of another BLAS."""
     assert products.products(case, head) == pytest.approx(shown, abs=1, rel=0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "head", "shown"), CELLS)
 def test_a_count_is_the_one_shown(case, head, shown):
-    """Rounding changes long runs by up to a third, and short ones by a few steps."""
+    """Rounding changes the counts of long runs by up to a third, and those of short
+    runs by a few steps.
+    """
     assert products.products(case, head) == pytest.approx(shown, abs=3, rel=0.35)
 
 
 def test_smalbe_needs_at_most_half_of_the_products_of_permon_on_the_benchmark():
-    """The sentence above the first table, read off that table."""
+    """The sentence above the first table agrees with the table."""
     rows = [line.split("|") for line in LINES if line.startswith("| `beam-ring/")][:10]
 
     assert len(rows) == 10

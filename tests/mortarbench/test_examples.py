@@ -1,4 +1,4 @@
-"""Examples in the docstrings of exported functions run and print what they show."""
+"""Examples in the docstrings of exported functions print the output that is shown."""
 
 import doctest
 
@@ -26,7 +26,9 @@ EXAMPLES = {
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsys):
-    """Each in an empty working directory, so that none relies on another."""
+    """Each example runs in an empty working directory, so that it cannot depend on
+    another one.
+    """
     function = EXAMPLES[name]
     monkeypatch.chdir(tmp_path)
     names = {"reference_solution": reference_solution}

@@ -1,4 +1,4 @@
-"""Every family that needs no file, from the command line."""
+"""Every family that needs no file, run from the command line."""
 
 import json
 

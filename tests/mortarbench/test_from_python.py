@@ -1,4 +1,4 @@
-"""The library in a script: QPs and solver objects, answers from elsewhere, refusals."""
+"""Use of the library in a script: QPs, solver objects, stored answers and refusals."""
 
 import json
 import subprocess
@@ -24,7 +24,9 @@ QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
 
 @dataclass(frozen=True)
 class ActiveRow:
-    """Solves the QP above if its row is active; `shift` moves the answer."""
+    """Solves the QP above under the assumption that its row is active; `shift` perturbs
+    the answer.
+    """
 
     shift: float = 0.0
 
@@ -87,7 +89,7 @@ def test_fields_of_a_solver_object_are_its_options():
 
 
 def test_an_option_that_cannot_be_written_down_is_refused(tmp_path):
-    """A default of None accepts every type until a worker is started."""
+    """An option whose default is None accepts every type until a worker is started."""
     file = tmp_path / "free.py"
     file.write_text(
         "from dataclasses import dataclass\n"
@@ -149,7 +151,9 @@ print(*(result.grade for result in found.results.values()))
 
 @pytest.mark.parametrize("threads", [False, True])
 def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
-    """Also where the script has other threads, as a notebook has, so must not fork."""
+    """The class is also copied if the script has other threads, as a notebook has, and
+    must not fork.
+    """
     (tmp_path / "beside.py").write_text(
         "HALF = 0.5\ndef solve(d, q):\n    return -q / d\n"
     )
@@ -169,7 +173,9 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
 
 
 def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_path):
-    """The script's own `solvers.py` and `msgspec.py` come first in the script only."""
+    """The script's own `solvers.py` and `msgspec.py` take precedence in the
+    script only.
+    """
     for name in ("solvers", "msgspec"):
         (tmp_path / f"{name}.py").write_text("raise ImportError('not for workers')\n")
     (tmp_path / "helper.py").write_text(
@@ -197,14 +203,14 @@ def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_pat
 
 
 class _Uncopied(ActiveRow):
-    """Holds what no process can hand to another."""
+    """Contains an object that cannot be sent to another process."""
 
     def __reduce__(self):
         raise TypeError("cannot pickle the handle of a library")
 
 
 class _Unloaded(ActiveRow):
-    """Is copied, and cannot be put together again."""
+    """Can be pickled but not unpickled."""
 
     def __reduce__(self):
         return int, ("not a number",)
@@ -228,7 +234,9 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
 
 
 def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
-    """The series needs the solver once more, by object or from its plug-in."""
+    """The series of load steps requires the solver again, either the object or the
+    plug-in.
+    """
     plugin_file = tmp_path / "clara.py"
     plugin_file.write_text(
         "from solvers import SOLVERS as ALL\nSOLVERS = {'clara': ALL['clarabel']}\n"
@@ -268,7 +276,9 @@ def test_wrong_multipliers_are_refuted_at_the_right_point():
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
 def test_verify_agrees_with_solve(form):
-    """On the point alone, and on the point with the solver's multipliers."""
+    """`verify` is called with the point alone and with the multipliers of
+    the solver.
+    """
     case = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}")
     answer = mb.solve(case, "clarabel")
     s = answer.solution
@@ -285,7 +295,7 @@ def test_verify_agrees_with_solve(form):
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
 def test_sparse_matrices_of_a_case_are_csc_with_narrow_indices(form):
-    """The types that qpsolvers (csc_matrix only) and OSQP (32-bit indices) take."""
+    """qpsolvers requires csc_matrix, and OSQP requires 32-bit indices."""
     qp = mb.build(f"beam-ring/Nr=4/Nh=3/steps=1/{form}").qp
     for M in (qp.P, qp.G, qp.A):
         if not isinstance(M, np.ndarray):
@@ -406,7 +416,9 @@ def test_a_measurement_is_replayed(results):
 
 
 def test_the_name_of_a_function_is_not_taken_by_a_module():
-    """Whatever was imported before: a submodule is an attribute of its package."""
+    """A submodule that was imported earlier is an attribute of its package and must not
+    hide the function.
+    """
     program = (
         "import pkgutil, importlib, mortarbench as mb\n"
         "names = {m.name for m in pkgutil.iter_modules(mb.__path__)} - {'__main__'}\n"
@@ -421,7 +433,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
 
 
 def test_a_solver_object_goes_through_the_conformance_suite():
-    """Every check of a solver for a single QP is declined or fails."""
+    """The solver handles one QP only, so every check is declined or fails."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
 

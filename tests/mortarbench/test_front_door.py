@@ -1,4 +1,4 @@
-"""The library that the command line and notebooks call."""
+"""The library functions that the command line and notebooks call."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def answer():
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """A run of a plug-in's solvers on its family."""
+    """A run of the solvers of a plug-in on its family."""
     folder = tmp_path_factory.mktemp("results")
     (folder / "s.toml").write_text(
         'name = "s"\nsolvers = ["exact", "picky"]\nrepeats = 2\n'
@@ -42,7 +42,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
-    """A run of two of our solvers on a case of ours."""
+    """A run of two built-in solvers on a built-in case."""
     out = tmp_path_factory.mktemp("smoke")
     return mb.run("smoke", out=out, cases=["*/dual"], solvers=["smalbe", "clarabel"])
 
@@ -89,7 +89,9 @@ def test_an_answer_is_judged_certified_and_told(answer):
 
 
 def test_an_answer_says_what_the_mesh_adds_to_its_error():
-    """The patch test's solution is in the space; a cantilever has no finer mesh."""
+    """The finite element space contains the solution of the patch test; a cantilever
+    has no finer mesh.
+    """
     patch, beam = (
         mb.solve(name, "clarabel")
         for name in ("contact-patch/primal", "cantilever/ny=1/primal")
@@ -323,7 +325,7 @@ def test_a_wheel_does_without_the_checkout(tmp_path):
 
 
 class _Display:
-    """Stands for IPython's: keeps what was shown last."""
+    """Replaces IPython's display and stores the last object shown."""
 
     def __init__(self):
         self.shown = ""
@@ -376,7 +378,7 @@ def test_what_is_left_takes_as_long_as_what_was_measured(
 
 
 def in_many_threads(program, folder):
-    """Run a program of the user's own, whose libraries use all cores; what it says."""
+    """Run a user's program whose libraries use all cores; return its output."""
     many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "8")
     return subprocess.run(
         [sys.executable, "-c", program], env=os.environ | many,
@@ -385,7 +387,7 @@ def in_many_threads(program, folder):
 
 
 def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
-    """A digest that differs would leave no answer to judge."""
+    """With a different digest, no stored answer could be verified."""
     program = (
         "import mortarbench as mb\n"
         "from mortarbench.registries import Registries\n"

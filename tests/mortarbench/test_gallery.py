@@ -1,7 +1,7 @@
-"""The notebooks of docs/gallery run as they are, and show what their text says.
+"""The notebooks of docs/gallery run unchanged and show what their text states.
 
-Each runs in a kernel of its own, in an empty folder; of the shortest, the code alone
-runs by default, without a kernel.
+Each notebook runs in its own kernel in an empty folder. Of the shortest notebooks, only
+the code runs by default, without a kernel.
 """
 
 import json
@@ -27,7 +27,7 @@ def read(name):
 
 @pytest.fixture
 def execute(tmp_path, monkeypatch):
-    """Run a notebook; give what expressions are worth at its end."""
+    """Run a notebook; return the values of expressions at its end."""
     for name in ("IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_RUNTIME_DIR"):
         monkeypatch.setenv(name, str(tmp_path / name.lower()))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
@@ -56,7 +56,7 @@ def execute(tmp_path, monkeypatch):
 
 
 def kinds(cells):
-    """Count what cells show, by the richest form."""
+    """Count the outputs of cells by their richest format."""
     outputs = [o for c in cells for o in c.get("outputs", []) if "data" in o]
     return Counter(
         next(
@@ -75,7 +75,9 @@ def test_notebooks_are_stored_without_outputs():
 
 @pytest.mark.slow
 def test_a_first_comparison(execute):
-    """All is verified, and at one tolerance errors differ tenfold, below √tol."""
+    """All answers are verified; at one tolerance the errors differ by a factor of ten
+    and are below √tol.
+    """
     (statuses, spread, worst), shown = execute(
         "first-comparison",
         "sorted(results.df.status.unique())",
@@ -113,7 +115,9 @@ def run_code(tmp_path, monkeypatch):
 
 
 def test_the_code_of_your_own_steps(run_code):
-    """SSOR saves products, a projected step some more, and a bad rule costs some."""
+    """SSOR saves products, an additional projected step saves some more, and a bad rule
+    costs some.
+    """
     found = run_code("own-steps")
     products, counts = found["counts"].P_products, found["counts"]
     bearing, string = found["cases"]
@@ -129,9 +133,10 @@ def test_the_code_of_your_own_steps(run_code):
 
 
 def test_the_code_of_your_own_solver(run_code):
-    """Plain gradients fall by 1 − 1/κ per step; some claims of success are refuted.
+    """The gradient method reduces the error by 1 − 1/κ per step, and some of its claims
+    are refuted.
 
-    Of the three repeats, which verdicts do not depend on, one is measured.
+    Verdicts do not depend on repeats, so only one of the three repeats is measured.
     """
     found = run_code("own-solver", [("repeats = 3", "repeats = 1")])
     plain, moves, df = found["rates"]["plain"], found["moves"], found["results"].df
@@ -145,7 +150,7 @@ def test_the_code_of_your_own_solver(run_code):
 
 @pytest.mark.slow
 def test_your_own_solver(execute):
-    """The same, as a notebook shows it."""
+    """The notebook shows the results of `test_the_code_of_your_own_solver`."""
     (rate, expected, refuted, grades, code), shown = execute(
         "own-solver",
         "float(moves[-1] / moves[-2])",
@@ -162,7 +167,7 @@ def test_your_own_solver(execute):
 
 @pytest.mark.slow
 def test_your_own_steps(execute):
-    """The same as `test_the_code_of_your_own_steps`, as a notebook shows it."""
+    """The notebook shows the results of `test_the_code_of_your_own_steps`."""
     (verdicts,), shown = execute("own-steps", "sorted(set(counts.verdict))")
     assert verdicts == ["verified"]
     assert shown["image/png"] == 1
@@ -170,7 +175,9 @@ def test_your_own_steps(execute):
 
 @pytest.mark.slow
 def test_your_own_bodies(execute):
-    """Mortar pressures come nearer to Hertz with the mesh, others do not."""
+    """With mesh refinement, mortar pressures converge to those of Hertz; nodal
+    pressures do not.
+    """
     (rows,), shown = execute("own-bodies", "rows")
     off = {
         (row["contact"], row["cells per half width"]): abs(row["largest pressure"])
@@ -188,7 +195,9 @@ def test_your_own_bodies(execute):
 
 @pytest.mark.slow
 def test_the_code_of_stick_and_slip(run_code):
-    """Stick radii are too large by a fraction of a cell; slip fans out for ν > 0."""
+    """Stick radii are too large by a fraction of a cell; for ν > 0 the slip directions
+    diverge.
+    """
     found = run_code("stick-and-slip")
     errors, angles = found["errors"], found["angles"]
 

@@ -1,4 +1,5 @@
-"""Histories: from a solver's memory to files, JSON and a terminal; malformed ones too.
+"""Histories from a solver's memory to files, JSON and a terminal, including malformed
+ones.
 
 Projected descent on min ½|x|² − Σx over x ≥ 0 with n = 3 goes from x = 0, where all
 bounds are active and g = −(1, 1, 1), to the minimiser x = (1, 1, 1) in one step.
@@ -35,13 +36,15 @@ TOLD = {
 
 
 def unsolved(qp):
-    """There is no reference solve here: residuals decide."""
+    """Disable the reference solve, so that residuals decide the verdict."""
     raise ArithmeticError("no reference solve")
 
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line that knows both plug-ins; its code, stdout and stderr."""
+    """Run a command line that loads both plug-ins; return its code, stdout
+    and stderr.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     toy = load_plugin(TOY_PROBLEM)

@@ -1,4 +1,4 @@
-"""A right claim of infeasibility is an answer, from the solver to the report."""
+"""A correct claim of infeasibility is an answer, from the solver to the report."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Mutations by tools/mutants.py, and its list compared with the code."""
+"""Mutations by tools/mutants.py, and consistency of its list with the code."""
 
 import ast
 import sys

@@ -1,4 +1,4 @@
-"""Result folders of earlier code are read, continued and made again."""
+"""Result folders of earlier versions can be read, continued and recomputed."""
 
 import json
 import shutil
@@ -66,7 +66,7 @@ PLUGIN = PLUGINS / "plug.py"  #: imports `harness`, and a module beside it
 
 
 class There(Registries):
-    """The machine and the code that measured a folder before."""
+    """Machine and code that measured a stored folder."""
 
     def environment(self):
         stored = json.loads((self.folder / "environment.json").read_text())
@@ -105,7 +105,7 @@ def test_a_folder_of_before_the_namespace_is_continued(before_namespace):
 
 
 def test_records_of_before_the_namespace_are_made_again(before_namespace):
-    """With the same verdict and nearly the same count of products."""
+    """A new run gives the same verdict and nearly the same number of products."""
     folder, plugins = before_namespace
     records = [r for r in read_journal(folder) if r.repeat == 0]
 

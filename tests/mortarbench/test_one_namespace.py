@@ -1,4 +1,6 @@
-"""One package: files of the user's that bear the names of its folders do not matter."""
+"""All modules are in one package, so that files of the user with the names of its
+folders are harmless.
+"""
 
 import subprocess
 import sys

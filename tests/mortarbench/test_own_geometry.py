@@ -1,4 +1,6 @@
-"""The way of docs/own-geometry.md: from gmsh's mesh to Hertz's pressures in a file."""
+"""The tutorial docs/own-geometry.md, from the gmsh mesh to a file with
+Hertz pressures.
+"""
 
 import re
 import shutil
@@ -24,7 +26,7 @@ LARGEST = 2 * LOAD / (np.pi * HALF_WIDTH)
 
 @pytest.fixture(scope="module")
 def solved(tmp_path_factory):
-    """The page's description of the mesh that gmsh makes of its drawing; Clarabel."""
+    """The problem described on the page, meshed by gmsh and solved by Clarabel."""
     folder = tmp_path_factory.mktemp("press")
     shutil.copy(ROOT / "tests" / "data" / "press.msh", folder)
     (toml,) = re.findall(r"<!-- file: press.toml -->\n```toml\n(.*?)```", PAGE, re.S)
@@ -77,7 +79,7 @@ def test_paraview_gets_triangles_pressures_and_a_table_along_each_contact(solved
 
 
 def test_what_the_page_says_of_refusals_is_what_is_said(solved):
-    """Every message of its table, or the part of it that does not vary."""
+    """Every message in the table of the page occurs, except for its variable parts."""
     code = "".join(
         path.read_text("utf-8")
         for folder in ("problems/fem", "problems/contact", "problems/models")

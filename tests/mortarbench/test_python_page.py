@@ -1,4 +1,6 @@
-"""docs/python.md, read from top to bottom in an empty folder, shows what happens."""
+"""The examples of docs/python.md, run from top to bottom in an empty folder, print the
+output shown.
+"""
 
 import doctest
 import re
@@ -10,7 +12,7 @@ from tests.support import ROOT
 
 @pytest.mark.slow
 def test_the_page_shows_what_happens(tmp_path, monkeypatch, capsys):
-    """Every example, in its order."""
+    """The examples run in their order."""
     page = (ROOT / "docs" / "python.md").read_text("utf-8")
     examples = "\n".join(re.findall(r"```pycon\n(.*?)```", page, re.S))
     test = doctest.DocTestParser().get_doctest(examples, {}, "python.md", None, 0)

@@ -1,4 +1,4 @@
-"""Verdicts at another factor follow from what the journal stores."""
+"""Verdicts for a different acceptance factor follow from the data in the journal."""
 
 import json
 from dataclasses import asdict
@@ -112,7 +112,7 @@ def judge(folder, factor):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A result folder with one answer of a worst residual of 4·tol."""
+    """A result folder with one answer whose largest residual is 4·tol."""
     stored = record(Status.SOLVED, Residuals(1e-9, 4e-6, 0, 1e-9), 1e-6)
     with Journal(tmp_path, "test") as journal:
         journal.append(stored)
@@ -165,7 +165,9 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
 
 
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
-    """The run has verified and refuted answers; stored statuses are not reused."""
+    """The run has verified and refuted answers. Statuses are recomputed and not read
+    from the journal.
+    """
     monkeypatch.chdir(tmp_path)
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,

@@ -1,7 +1,8 @@
-"""Remarks beside `verified`: two blocks whose displacements are known by hand.
+"""Remarks printed with `verified` for two blocks whose displacements are known
+analytically.
 
-Each block has side 2 and, with Poisson's ratio zero, the strain p/E under a pressure p:
-its upper end moves by 4p/E if both are pressed together.
+Each block has side 2 and Poisson's ratio zero. A pressure p causes the strain p/E, so
+the upper end moves by 4p/E if the blocks are pressed together.
 """
 
 from dataclasses import replace
@@ -45,7 +46,7 @@ def test_an_answer_as_expected_has_no_remarks(sound):
 def test_displacements_larger_than_the_body_are_remarked_upon(
     tmp_path, pressure, is_large
 ):
-    """4·0.6 is more than the side of 2, and 4·0.4 is not."""
+    """The displacement 4·0.6 exceeds the side 2, whereas 4·0.4 does not."""
     toml = BLOCKS.replace("-1e6", f"{-pressure * 1e9}")
     found = solved(tmp_path, toml=toml)
 
@@ -64,7 +65,9 @@ def test_displacements_larger_than_the_body_are_remarked_upon(
     [("dual", "smalbe"), ("primal", "clarabel"), ("dual-bounds", "osqp")],
 )
 def test_a_contact_that_never_closes_is_remarked_upon(tmp_path, form, solver):
-    """Interior points and iterates of OSQP leave forces of the size of rounding."""
+    """Interior-point solutions and iterates of OSQP contain contact forces of the size
+    of rounding errors.
+    """
     toml = APART.replace('boundary = "base"\nfix = ["y"]', 'boundary = "base"\n'
                          'fix = ["x", "y"]')  # fmt: skip
     found = solved(tmp_path, form, solver, toml=toml, gap=0.5)
@@ -78,7 +81,7 @@ def test_a_contact_that_never_closes_is_remarked_upon(tmp_path, form, solver):
 def test_bodies_that_overlap_before_any_load_are_remarked_upon(
     tmp_path, overlap, is_named
 ):
-    """The side of each block is 2: an overlap of 0.1 is 5 % of it."""
+    """An overlap of 0.1 is 5 % of the side 2 of each block."""
     case = mb.build(f"bodies:{stacked_blocks(tmp_path, gap=-overlap)}/dual")
 
     assert len(case.remarks) == is_named

@@ -1,4 +1,4 @@
-"""Formulas of the documentation arrive on the site whole."""
+"""The site renders all formulas of the documentation."""
 
 import re
 import sys
@@ -32,14 +32,14 @@ CODE = re.compile(r"^```.*?^```$|`[^`]*`|<!--.*?-->", re.DOTALL | re.MULTILINE)
 
 
 class Loader(yaml.SafeLoader):
-    """mkdocs.yml names Python objects, which are not needed here."""
+    """YAML loader that ignores the Python objects named in mkdocs.yml."""
 
 
 Loader.add_multi_constructor("", lambda *_: None)
 
 
 def rendered(text):
-    """HTML as mkdocs has it before its hooks."""
+    """HTML of a page before the hooks of mkdocs."""
     options = yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), Loader)
     named = [
         next(iter(e.items())) if isinstance(e, dict) else (e, {})
@@ -51,7 +51,7 @@ def rendered(text):
 
 
 def formulas(source):
-    """LaTeX between dollars, found without Markdown."""
+    """LaTeX between dollar signs, extracted without Markdown."""
     prose = CODE.sub("", source)
     found = re.findall(
         r"\$\$(.+?)\$\$|(?<![\\$])\$(?!\s)([^$]+?)(?<!\s)\$", prose, re.S
@@ -76,7 +76,9 @@ def test_every_formula_of_a_page_becomes_mathml(name):
 
 @pytest.mark.parametrize("name", sorted(SOURCES.keys() - UNICODE))
 def test_no_formula_of_a_page_is_plain_text(name):
-    """LaTeX in the sources, but in code and in the signs of numbers."""
+    """The sources contain mathematical symbols only as LaTeX, except in code and number
+    signs.
+    """
     prose = CODE.sub("", SOURCES[name].read_text("utf-8"))
     prose = unicodedata.normalize("NFD", re.sub(r"\$\$?[^$]+\$\$?", "", prose))
 

@@ -1,4 +1,4 @@
-"""Tasks of solver authors: sweeps, versions side by side, file templates."""
+"""Tasks of solver authors: sweeps, comparison of versions, file templates."""
 
 import json
 import os
@@ -71,7 +71,9 @@ def cli(capsys, monkeypatch, tmp_path):
 
 @pytest.fixture
 def versions(tmp_path):
-    """Give the options that load two versions of a plug-in of the same file name."""
+    """Return the options that load two versions of a plug-in with the same
+    file name.
+    """
     for name, length in (("old", 2), ("new", 1)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "mine.py").write_text(MINE)
@@ -157,7 +159,9 @@ def test_one_solve_has_options_too(cli, versions):
 
 @pytest.fixture
 def starting(capsys, monkeypatch, tmp_path):
-    """Run the command line with all that there is, in an empty folder."""
+    """Run the command line with all built-in solvers and problems in an
+    empty folder.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
 
@@ -193,7 +197,9 @@ def test_a_new_solver_keeps_its_answer_in_every_equivalent_formulation(starting)
 
 
 def test_a_new_problem_builds_what_its_name_says(starting):
-    """−u″ = −1 and u = −depth where it touches: u leaves it at √(2·depth)."""
+    """−u″ = −1, and u = −depth on the contact zone; contact ends at the distance
+    √(2·depth).
+    """
     starting("new", "problem", "mine")
     name = "mine/n=399/primal"
     solve = ("solve", name, "--solver", "clarabel", "--plugin", "mine.py", "--json")

@@ -29,10 +29,11 @@ def unit(rng, d):
 
 
 def conic_qp(seed):
-    """A QP with rows, bounds, discs and cones, and its strictly complementary solution.
+    """Draw a QP with rows, bounds, discs and cones, and its strictly complementary
+    solution.
 
-    Discs are active (z = c·x), inactive, or points (radius 0, any z); x in a cone is on
-    its boundary, inside, or the apex, and one cone has slope 0.
+    Discs are active (z = c·x), inactive, or points (radius 0, any z). In a cone, x is
+    on the boundary, inside, or at the apex, and one cone has slope 0.
     """
     rng = np.random.default_rng(seed)
     k, d, m, p = 6, int(rng.integers(2, 4)), 2, 3
@@ -112,7 +113,9 @@ def test_500_planted_solutions_are_reached(name):
 
 @pytest.mark.parametrize("name", ["clarabel", "scs", "qoco"])
 def test_a_sequence_changes_radii_and_right_hand_sides(name):
-    """Each QP by an update of its predecessor's solver; the fourth needs a new one."""
+    """Each QP is solved by updating the solver of its predecessor; the fourth one
+    requires a new solver.
+    """
     qp, _ = conic_qp(1)
     discs, cones = qp.sets[1:]
     larger = replace(discs, radius=2 * discs.radius)
@@ -134,7 +137,7 @@ def test_a_sequence_changes_radii_and_right_hand_sides(name):
 
 
 def test_a_warm_start_is_a_point_of_the_cones():
-    """SCS starts from x, slack and multipliers: at the solution they are exact."""
+    """SCS starts from x, slack and multipliers, which are exact at the solution."""
     for seed in range(10):
         qp, best = conic_qp(seed)
         form = to_cone(qp)
@@ -176,7 +179,9 @@ def test_what_is_degenerate_has_linear_rows():
 
 
 def degenerate():
-    """min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁: x* = (4, 4, 0), multiplier zero."""
+    """Return min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁; x* = (4, 4, 0), with
+    multiplier zero.
+    """
     none = csr_array((0, 3))
     return QP(
         P=eye_array(3, format="csr"), q=np.array([-4.0, -4.0, 0.0]), A=none,
@@ -206,7 +211,9 @@ def test_the_degenerate_cone_costs_half_of_the_digits(name):
 
 
 def turned(angle):
-    """min ½‖x − c‖² over ‖(x₁, x₂)‖ ≤ 1 and ‖(x₄, x₅)‖ ≤ ½x₃, c far along `angle`."""
+    """Return min ½‖x − c‖² over ‖(x₁, x₂)‖ ≤ 1 and ‖(x₄, x₅)‖ ≤ ½x₃, with c at a large
+    distance in direction `angle`.
+    """
     none = csr_array((0, 5))
     direction = np.array([np.cos(angle), np.sin(angle)])
     q = -np.concatenate([3 * direction, [1.0], 3 * direction])

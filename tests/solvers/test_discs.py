@@ -31,7 +31,7 @@ def solve(name, qp, tol=TOL, **options):
 
 
 def assert_solved(name, qp, x=None, *, digits=1e-6):
-    """Solve and verify; compare with the solution x where it is known."""
+    """Solve and verify a QP; compare the answer with x if the solution is known."""
     s = solve(name, qp)
     assert s.status is Status.SOLVED, s.message
     answer = mb.verify(qp, s.x, y=s.y, z_box=s.z_box, tol=TOL)
@@ -61,7 +61,9 @@ def test_planted_solutions_on_cones_are_reached(name, seed):
 @pytest.mark.parametrize("name", ON_DISCS)
 @pytest.mark.parametrize("seed", range(4))
 def test_discs_that_x_touches_without_a_multiplier(name, seed):
-    """Complementarity is not strict: x has half of the digits of the residuals."""
+    """Complementarity is not strict, so x has half as many correct digits as the
+    residuals.
+    """
     qp, x = qp_on_discs(seed + 100, touching=True)
     assert_solved(name, qp, x, digits=1e-4)
 
@@ -114,7 +116,7 @@ def test_equality_rows_beside_discs(name, seed, sparse):
 
 
 def test_small_discs_beside_large_shifts():
-    """The rounding of x̃ exceeds that of the radius."""
+    """The rounding error of x̃ exceeds that of the radius."""
     qp, _ = qp_on_discs(5249, dim=3, rows=3, spread=4.0)
     assert_solved("smalbe", qp)
 

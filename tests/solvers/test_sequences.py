@@ -49,7 +49,7 @@ def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, name):
 
 
 def test_half_the_products_again_and_the_support_block_factorised_once(load_steps):
-    """Everything counted, the 36 columns of F_EE too."""
+    """All products are counted, including the 36 columns of F_EE."""
     prepare = SMALBE().chain(1e-8)
     warm = [prepare(qp)().counts for qp in load_steps["dual"]]
     cold = [SMALBE().prepare(qp, 1e-8)().counts for qp in load_steps["dual"]]
@@ -64,7 +64,7 @@ def test_half_the_products_again_and_the_support_block_factorised_once(load_step
 
 @pytest.mark.parametrize("name", WARM)
 def test_steps_that_share_nothing_are_solved_as_well(load_steps, manufactured, name):
-    """Other sizes, other scales, other signs, an infeasible one in between."""
+    """The QPs differ in size, scale and sign, and one of them is infeasible."""
     qp, other = load_steps["dual"][9], load_steps["dual"][0]
     box, _ = manufactured("box", seed=271828)
     impossible = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))
@@ -93,7 +93,7 @@ def test_sequences_are_independent_of_each_other(load_steps):
 
 
 class Counting:
-    """A P that counts the products with it."""
+    """A matrix P that counts its products."""
 
     def __init__(self, P, calls):
         self.P, self.calls, self.shape = P, calls, P.shape
@@ -105,7 +105,7 @@ class Counting:
 
 @pytest.mark.parametrize("name", WARM)
 def test_every_product_of_a_sequence_is_counted(load_steps, name):
-    """Those of a spectrum that turns out to be stale, too."""
+    """The products of a spectrum that turns out to be outdated are included."""
     qps = load_steps["dual"]
     steps = [*qps[:3], replace(qps[3], P=1e3 * qps[3].P), qps[4], *qps[4:6]]
     prepare = SOLVERS[name].chain(1e-6)
@@ -117,7 +117,9 @@ def test_every_product_of_a_sequence_is_counted(load_steps, name):
 
 
 def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
-    """Nothing eliminated: from 46 products a step cold to 31 warm."""
+    """Without elimination, a step takes 46 products from a cold start and 31 from a
+    warm one.
+    """
     solver = replace(SMALBE(), eliminate="never")
     prepare = solver.chain(1e-8)
     warm = [prepare(qp)().counts["P_products"] for qp in load_steps["dual"]]
@@ -133,7 +135,7 @@ def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
 def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(
     manufactured, name, jump
 ):
-    """P = I, then a far larger one that agrees with it on the first component."""
+    """P = I is followed by a far larger P that agrees with I on the first component."""
     rng = np.random.default_rng(271828)
     qp, _ = manufactured("bounds", seed=271828, dense=True)
     W = rng.standard_normal((20, 20))
@@ -160,7 +162,7 @@ def test_a_failure_leaves_nothing_to_the_next(load_steps):
 
 
 def test_a_block_that_changes_is_not_factorised_again(load_steps):
-    """Every problem has another matrix, as in Newton's method."""
+    """Every problem has a different matrix, as in Newton's method."""
     scaled = [
         replace(qp, P=(1 + 0.01 * k) * qp.P)
         for k, qp in enumerate(load_steps["dual"][:4])
@@ -177,7 +179,9 @@ def test_a_block_that_changes_is_not_factorised_again(load_steps):
 @pytest.mark.parametrize("tol", [1e-4, 1e-8])
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 def test_qtqp_starts_each_load_step_from_the_last(load_steps, form, tol):
-    """Verified as from a cold start, with at most nine tenths of its iterations."""
+    """Answers are verified as from a cold start, with at most nine tenths of the
+    iterations.
+    """
     solver = SOLVERS["qtqp"]
     prepare = solver.chain(tol)
     warm = [prepare(qp)() for qp in load_steps[form]]

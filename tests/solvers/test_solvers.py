@@ -1,4 +1,6 @@
-"""The adapters: what conformance (test_conformance.py) does not ask of every solver."""
+"""Properties of individual adapters that the conformance suite (test_conformance.py)
+does not test.
+"""
 
 import subprocess
 import sys
@@ -63,7 +65,9 @@ def solve(name, qp, tol=1e-9):
 
 @pytest.fixture
 def membrane():
-    """Discrete membrane over a flat obstacle, fixed on one side, pulled on another."""
+    """Discrete membrane over a flat obstacle, fixed on one side and pulled
+    on another.
+    """
     k = 45
     end = np.eye(k)[:, [0, -1]].sum(axis=1)
     L = diags_array([-np.ones(k - 1), 2 - end, -np.ones(k - 1)], offsets=[-1, 0, 1])
@@ -141,7 +145,9 @@ def test_a_certificate_is_not_passed_off_as_a_point(name, problem):
     "name", ["osqp", "clarabel", "scs", "piqp", "highs", "qpalm", "qtqp"]
 )
 def test_a_certificate_of_infeasibility_has_our_signs(name):
-    """x₀ + x₁ = −1, −x₀ ≤ −3 and x₁ ≥ −1: of each kind of row one is in its way."""
+    """The QP has x₀ + x₁ = −1, −x₀ ≤ −3 and x₁ ≥ −1, so every kind of row has a
+    multiplier.
+    """
     qp = QP(
         P=csr_array(np.eye(3)), q=np.ones(3), A=csr_array([[1.0, 1, 0]]),
         b=np.array([-1.0]), G=csr_array([[-1.0, 0, 0], [0, 0, 1]]),

@@ -1,4 +1,4 @@
-"""Every solver that accepts discs or cones finds planted solutions over them."""
+"""Every solver that accepts discs or cones finds planted solutions."""
 
 import numpy as np
 import pytest
@@ -34,10 +34,11 @@ ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
 
 
 def faults(name, shape, seeds):
-    """List the seeds where f is off by more than 1e-8, or x by more than 1e-6.
+    """List the seeds for which f is off by more than 1e-8 or x by more than 1e-6.
 
-    f is relative to |qᵀx*|, as f* may cancel: 0.001 is left of 4 for one seed. If an
-    error is too large at `TOL`, the better one at `TIGHT` counts, whatever is claimed.
+    The error of f is relative to |qᵀx*|, since f* may cancel: for one seed, 0.001
+    remains of 4. If an error is too large at `TOL`, the smaller error at `TIGHT`
+    counts, whatever the solver claims.
     """
     wrong, declined = [], []
     limits = np.array([1e-8, ENDS_OFF_PATH.get(name, 1e-6)])
@@ -65,7 +66,9 @@ def faults(name, shape, seeds):
 
 
 def accepts_rows(name, shape, declined, count):
-    """Skip a solver that declines a shape as a whole, such as for its rows."""
+    """Skip a solver that declines all QPs of a shape, for example because
+    of their rows.
+    """
     if len(declined) == count:
         pytest.skip(f"{name} declines {shape}: {declined[0][1]}")
     assert not declined
@@ -81,7 +84,9 @@ def test_planted_solutions_over_sets_are_found(name, shape):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "shape"), PAIRS)
 def test_five_hundred_planted_solutions_over_sets_are_found(name, shape):
-    """250 of each shape: 500 over discs, 500 over cones, and 250 over both."""
+    """There are 250 QPs of each shape: 500 with discs, 500 with cones, and 250 with
+    both.
+    """
     wrong, declined = faults(name, shape, range(250))
     accepts_rows(name, shape, declined, 250)
     assert not wrong

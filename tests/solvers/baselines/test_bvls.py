@@ -1,4 +1,4 @@
-"""Bounded least squares of scipy: declines, exactness, limits."""
+"""Bounded least squares of SciPy: declined problems, exactness, limits."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Primal-dual active sets: the path, the safeguards and the certificates."""
+"""Primal-dual active sets: iterates, safeguards and certificates."""
 
 from dataclasses import replace
 
@@ -52,7 +52,9 @@ def cycling(request):
 
 
 def dual(seed, n=30, r=3):
-    """The dual of a floating body: F of rank n − 2, λ ≥ 0 on a half, Gλ = e."""
+    """Dual of a floating body: F of rank n − 2, λ ≥ 0 for half of the components, Gλ =
+    e.
+    """
     rng = np.random.default_rng(seed)
     W = rng.standard_normal((n, n - 2))
     G, x = rng.standard_normal((r, n)), np.abs(rng.standard_normal(n))
@@ -61,7 +63,9 @@ def dual(seed, n=30, r=3):
 
 
 def test_the_two_sided_box_is_crossed_in_three_solves():
-    """From 0 at the lower bound, free at 10, to the upper one."""
+    """The iterates are 0 at the lower bound, the free minimum 10, and the
+    upper bound.
+    """
     s = solve(quadratic([[1.0]], [-10.0], lb=0.0, ub=1.0))
 
     assert s.x == 1
@@ -81,7 +85,9 @@ def test_separate_variables_settle_after_one_change_each():
 
 
 def test_contact_rows_join_where_they_are_violated():
-    """min ½‖x‖² − x₁ − 2x₂, x₁ ≤ 0.5, x₂ ≤ 3: no contact, then the first row."""
+    """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, the first iterate has no active
+    row, the second one the first row.
+    """
     qp = quadratic(np.eye(2), [-1.0, -2], G=np.eye(2), h=[0.5, 3.0])
     s = solve(qp)
 
@@ -100,7 +106,7 @@ def test_a_fixed_variable_is_never_released():
 
 
 def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
-    """x₁ is at its bound; with the weight for x₁'s softness x₂ would never arrive."""
+    """x₁ is at its bound. With the weight of the soft x₁, x₂ would not converge."""
     qp = quadratic(np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf])
     s = solve(qp)
 
@@ -129,7 +135,7 @@ def test_the_step_limit_is_reported_with_the_point_reached(cycling):
 @pytest.mark.parametrize("exponent", [-30, 30])
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_scaling_objective_or_rows_changes_no_counter(seed, exponent):
-    """By a power of two, hence in exact arithmetic."""
+    """The factors are powers of two, so that the arithmetic is exact."""
     qp, factor = dual(seed), 2.0**exponent
     plain = solve(qp)
     for scaled in (
@@ -274,7 +280,9 @@ def test_an_operator_is_declined():
 
 
 def test_the_forms_of_a_contact_problem_agree():
-    """The contact rows' multipliers, and the displacement, are the reference's."""
+    """Multipliers of the contact rows and displacements equal those of the
+    reference.
+    """
     family, forms = PROBLEMS["beam-ring"], ("dual-bounds", "dual", "primal")
     names = [parse(f"beam-ring/Nr=4/Nh=3/step=7/{form}", PROBLEMS) for form in forms]
     cases = [family.build(n.form, n.params, reference_solution) for n in names]

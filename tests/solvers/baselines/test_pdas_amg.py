@@ -1,4 +1,4 @@
-"""Primal-dual active sets with multigrid agree with those with Cholesky factors."""
+"""Primal-dual active sets with multigrid agree with those that use Cholesky factors."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,9 @@ def test_multigrid_and_factors_find_the_same_displacements(case):
 
 
 def test_steps_in_space_hardly_grow_with_the_size():
-    """8 times the unknowns take at most 1.5 times the steps of CG per solve."""
+    """With 8 times as many unknowns, each solve takes at most 1.5 times as many CG
+    steps.
+    """
     steps = []
     for n in (5, 10):
         s = PDASAMG().prepare(mb.build(f"cube-wall/n={n}/primal").qp, 1e-6)()

@@ -1,4 +1,4 @@
-"""Spectral projected gradients: path, counters, invariance."""
+"""Spectral projected gradients: iterates, counters, invariance."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_degenerate_problems_have_their_solutions(qp, x):
 
 
 def test_the_first_step_is_that_of_the_exact_line_search():
-    """With P = cI one step of length 1/c ends at the minimiser."""
+    """For P = cI, one step of length 1/c reaches the minimiser."""
     s = solve(boxed(7 * np.eye(3), [1.0, -2, 3]))
 
     assert s.x == pytest.approx([-1 / 7, 2 / 7, -3 / 7], rel=1e-12)
@@ -78,7 +78,7 @@ def test_the_lengths_are_those_of_barzilai_and_borwein():
 
 
 def test_the_cost_never_rises_above_the_last_ones():
-    """With a memory of one the cost falls from step to step."""
+    """With a memory of one, the cost decreases in every step."""
     qp = random(271828)
     costs = [
         qp.objective(ProjectedGradient(memory=1, max_iter=k).prepare(qp, 1e-12)().x)

@@ -1,4 +1,4 @@
-"""The reference over ranks, on one rank in this process."""
+"""The distributed reference solver, run on one rank in this process."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ mpi = pytest.importorskip("mpi4py.MPI")
 
 
 class Identity:
-    """F = 1, as operators of torn bodies come."""
+    """F = I, with the interface of the operators of subdomains."""
 
     def __init__(self, n, ranks):
         self.shape, self.ranks = (n, n), ranks
@@ -32,7 +32,7 @@ class Identity:
 
 
 def balance(q, force, moment):
-    """Three contacts at −1, 0 and 1 hold one body:  min ½|x|² + qᵀx,  x ≥ 0."""
+    """Three contacts at −1, 0 and 1 support one body: min ½|x|² + qᵀx, x ≥ 0."""
     ranks = Ranks(mpi.COMM_SELF)
     G = csr_array([[1.0, 1.0, 1.0], [-1.0, 0.0, 1.0]])
     vectors = (distributed(np.array(v), ranks) for v in (q, 3 * [0.0], 3 * [np.inf]))
@@ -45,7 +45,9 @@ def balance(q, force, moment):
 
 
 def test_contacts_that_support_a_body_carry_its_load():
-    """With force 3 and moment 1, x = (t, 2 − 2t, 1 + t); −q is nearest at t = ½."""
+    """With force 3 and moment 1, the admissible points are x = (t, 2 − 2t, 1 + t); the
+    point nearest to −q has t = ½.
+    """
     q = np.array([-0.5, -1.0, -1.5])
 
     solution = reference_over_ranks(balance(q, 3.0, 1.0))
@@ -54,7 +56,9 @@ def test_contacts_that_support_a_body_carry_its_load():
 
 
 def test_a_face_that_leaves_a_body_unsupported_is_refused_in_one_line():
-    """Without bounds x = (−2/3, 7/3, −2/3): one contact is left, for two motions."""
+    """Without bounds, x = (−2/3, 7/3, −2/3): one contact remains for two
+    rigid motions.
+    """
     with pytest.raises(ArithmeticError, match="is not supported") as refused:
         reference_over_ranks(balance([1.0, -2.0, 1.0], 1.0, 0.0))
 

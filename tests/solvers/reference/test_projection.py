@@ -1,4 +1,4 @@
-"""The reference solve over cones with a singular P, as rigid bodies have."""
+"""Reference solves over cones with a singular P, as for rigid bodies."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Reference solves: exact solutions to the last digit, in every shape and unit."""
+"""Reference solutions are exact to the last digit, for every shape and unit."""
 
 import subprocess
 import sys
@@ -92,7 +92,9 @@ EXACT = {
 
 
 def seeds(first, few, all_):
-    """Parametrise with `few` seeds, and with the other `all_ - few` in a slow test."""
+    """Parametrise a test with `few` seeds and, in a slow test, with the other `all_ -
+    few`.
+    """
     return pytest.mark.parametrize(
         "seeds",
         [
@@ -107,7 +109,7 @@ def seeds(first, few, all_):
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize("kind", EXACT.values(), ids=EXACT)
 def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense, seeds):
-    """Every component that is not zero is exact."""
+    """Every nonzero component is exact."""
     for seed in seeds:
         qp, x, X = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
@@ -141,7 +143,7 @@ def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense, seeds)
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_planted_point_of_every_shape_is_found_in_every_unit(shape, dense):
-    """Units of x and of the objective from 1e-8 to 1e8."""
+    """The units of x and of the objective are between 1e-8 and 1e8."""
     qp, exact = manufactured(shape, dense=dense)
     for length, energy in [(1, 1), (1e8, 1), (1e-8, 1e8), (1, 1e-8)]:
         scaled = replace(
@@ -164,7 +166,7 @@ def test_every_kind_of_multiplier_has_its_sign_and_size():
 
 
 def test_the_multipliers_of_repeated_constraints_share_the_force():
-    """x = 1 by its bound, by two rows and by an equation, against q = −9."""
+    """A bound, two rows and an equation impose x = 1 against q = −9."""
     qp = QP(
         P=np.eye(1), q=np.array([-9.0]), A=np.ones((1, 1)), b=np.ones(1),
         G=np.array([[1.0], [2.0]]), h=np.array([1.0, 2.0]),
@@ -192,14 +194,18 @@ CASES = [
 
 
 def objective(qp, x):
-    """Return ½xᵀPx + qᵀx in extended precision; in doubles it is wrong by 7e-13."""
+    """Return ½xᵀPx + qᵀx in extended precision; double precision would cause an error
+    of 7e-13.
+    """
     P = qp.P.toarray() if hasattr(qp.P, "toarray") else np.asarray(qp.P)
     P, q, x = (v.astype(np.longdouble) for v in (P, qp.q, x))
     return x @ (P @ x) / 2 + q @ x
 
 
 def rounding(qp, s):
-    """Return the residual that rounding of x and of products with P may cause."""
+    """Return the residual that rounding errors of x and of products with P
+    may cause.
+    """
     Px, size = qp.P @ s.x, abs(qp.P) @ abs(s.x)
     return 4 * EPS * max(
         size.max() / max(abs(Px).max(), abs(qp.q).max()),
@@ -209,8 +215,9 @@ def rounding(qp, s):
 
 @pytest.mark.parametrize(("name", "params", "forms", "rel"), CASES)
 def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel):
-    """Up to the rounding of K and of F = BK⁺Bᵀ, which is worst for slender bodies and
-    for stiff bodies on soft ones."""
+    """The energies agree up to the rounding errors of K and of F = BK⁺Bᵀ, which are
+    largest for slender bodies and for stiff bodies on soft ones.
+    """
     family, energies = PROBLEMS[name], []
     for form in forms:
         case = family.build(form, completed(family, params), reference_solution)
@@ -252,7 +259,9 @@ def test_energies_known_by_hand_are_reached(name, params, form, energy):
     ("steps", "tip", "force"), [(1, -0.303750, 0.0), (10, -0.297282, -2.840e7)]
 )
 def test_the_beam_deflects_as_in_an_independent_prototype(form, steps, tip, force):
-    """Nr = 20, Nh = 10; the load in one or ten linearisations; 11 844 displacements."""
+    """Nr = 20, Nh = 10: 11 844 displacements; the load is applied in one or ten
+    linearisations.
+    """
     family = PROBLEMS["beam-ring"]
     params = completed(family, dict(Nr=20, Nh=10, steps=steps))
     case = family.build(form, params, reference_solution)
@@ -328,7 +337,9 @@ def test_few_iterations_identify_the_active_set_and_one_factor_is_enough_to_refi
 
 
 def test_a_wrong_active_set_is_corrected():
-    """From x = 0 with no active constraint; a membrane on an obstacle."""
+    """The solve for a membrane on an obstacle starts from x = 0 without active
+    constraints.
+    """
     qp = equilibrate(membrane(12)).qp
     exact = reference_solution(qp)
     start = replace(exact, x=0 * exact.x, z_box=0 * exact.x)
@@ -383,7 +394,7 @@ def crossing():
 
 
 def falling():
-    """Return an unconstrained QP with a gradient but no curvature."""
+    """Return an unconstrained QP with a nonzero gradient and zero curvature."""
     qp = membrane(4)
     return replace(qp, P=0 * qp.P, lb=np.full(16, -np.inf))
 
@@ -447,7 +458,7 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
 
 
 def test_a_qp_without_variables_has_the_empty_solution():
-    """Such QPs arise if no sides can touch; scipy's nnls would crash on them."""
+    """Such QPs arise if no sides can touch; SciPy's nnls would fail on them."""
     nothing = np.zeros(0)
     qp = QP(
         P=np.zeros((0, 0)), q=nothing, A=no_rows(0), b=nothing, G=no_rows(0),

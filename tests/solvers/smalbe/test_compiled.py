@@ -1,4 +1,4 @@
-"""SMALBE compiled against SMALBE as it is written."""
+"""The compiled SMALBE agrees with the textbook implementation."""
 
 from dataclasses import replace
 from functools import partial
@@ -26,7 +26,7 @@ PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
 
 class Operator:
-    """A matrix that only multiplies."""
+    """A matrix that supports products only."""
 
     def __init__(self, P):
         self._P, self.shape = P, P.shape
@@ -36,7 +36,9 @@ class Operator:
 
 
 def random_qp(seed, kind="dense"):
-    """Bounds below, above, on both sides or none; up to three rows, some repeated."""
+    """Draw a QP with lower, upper, two-sided or no bounds and up to three rows, some of
+    them repeated.
+    """
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(1, 40)), int(rng.integers(0, 4))
     W = rng.standard_normal((n, n)) * np.logspace(0, -rng.uniform(0, 3), n)
@@ -76,7 +78,9 @@ def test_a_product_is_the_product_and_is_counted(seed, kind):
 @pytest.mark.parametrize("offsets", [(), (1,), (1, 2), (1, 40), (3, 299), (1, 7, 8, 9)])
 @pytest.mark.parametrize("n", [1, 5, 16, 300, 777])
 def test_a_product_by_diagonals_is_the_product(offsets, n):
-    """With all rows short of some diagonal, unsorted entries, and entries in parts."""
+    """Each row lacks some diagonal, and entries are unsorted or given in
+    several terms.
+    """
     rng = np.random.default_rng([n, *offsets])
     P = np.diag(rng.standard_normal(n))
     for o in (o for o in offsets if o < n):
@@ -150,7 +154,9 @@ def test_preparation_is_as_it_is_written(seed):
 @pytest.mark.parametrize("kind", ["random", "graded", "split", "equal", "huge", "tiny"])
 @pytest.mark.parametrize("k", [1, 2, 3, 5, 6, 12])
 def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(k, kind):
-    """Graded over 16 orders, split by zeros, and near the ends of doubles."""
+    """The matrices are graded over 16 orders of magnitude, decoupled by zeros, or near
+    the limits of double precision.
+    """
     rng = np.random.default_rng([k, len(kind)])
     for _ in range(50):
         d, e = rng.standard_normal(k), rng.standard_normal(max(k - 1, 0))
@@ -179,7 +185,9 @@ def test_eigenpairs_of_zero_and_of_no_numbers_end():
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("seed", range(12))
 def test_the_steps_are_those_that_are_written(seed, name, kind):
-    """Letter for letter for 25 steps; rounding lets long runs part later."""
+    """The kinds of the first 25 steps agree; later steps of long runs differ by
+    rounding.
+    """
     they_agree(random_qp(seed, kind), replace(SOLVERS[name], max_steps=25))
 
 
@@ -195,10 +203,11 @@ def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
 def test_other_rows_and_preconditioners_take_the_steps_that_are_written(
     seed, rows, preconditioner, monkeypatch
 ):
-    """With rows by a sparse factor; and with a matrix M in the face, or nothing.
+    """Rows are given by a sparse factor, and faces are preconditioned by a matrix M or
+    not at all.
 
-    There a large penalty, or eigenvalues far apart, would let rounding tell within a
-    few steps.
+    With a large penalty or widely spread eigenvalues, rounding errors would change
+    these runs within a few steps.
     """
     qp, rng = random_qp(seed), np.random.default_rng(seed)
     n = qp.q.size
@@ -216,7 +225,9 @@ def test_other_rows_and_preconditioners_take_the_steps_that_are_written(
 
 
 def they_agree(qp, options):
-    """Compare; without the incomplete factors of a sparse P, which only one writes."""
+    """Compare both implementations, without incomplete factors of a sparse P, which
+    only the compiled one has.
+    """
     if options.preconditioner == "auto":
         options = replace(options, preconditioner="model")
     runs = []
@@ -262,7 +273,7 @@ def tight_box(seed):
 
 
 def test_steps_beyond_the_box_are_those_that_are_written():
-    """In flat spectra; some expansions end as gradient projections."""
+    """The spectra are flat, and some expansions end as gradient projections."""
     letters = ""
     for qp in (string(100), *map(tight_box, range(40))):
         runs = []
@@ -286,7 +297,7 @@ def test_steps_beyond_the_box_are_those_that_are_written():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypatch):
-    """Rounding may cost a few without a preconditioner."""
+    """Without a preconditioner, rounding errors may cause a few additional products."""
     fast = SOLVERS[name].prepare(contact, 1e-6)()
     monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
     slow = SOLVERS[name].prepare(contact, 1e-6)()
@@ -325,7 +336,9 @@ def test_the_way_back_is_as_it_is_written(seed):
 
 @pytest.mark.parametrize("seeds", [range(k, k + 50) for k in (0, 50, 100, 150)])
 def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
-    """Near a solution and far from it, with multipliers of either sign."""
+    """The points are near a solution or far from it, with multipliers of
+    either sign.
+    """
     for seed in seeds:
         rng = np.random.default_rng(seed)
         qp = random_qp(seed)
@@ -350,7 +363,7 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
 
 def disturbed(qp, solution, size, rng):
-    """A point near to a solution, or not so near, within its bounds."""
+    """A point at a small or moderate distance from a solution, within its bounds."""
 
     def noise(v):
         return v + size * (1 + np.abs(v)) * rng.standard_normal(v.size)
@@ -365,7 +378,7 @@ def disturbed(qp, solution, size, rng):
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-permon"])
 @pytest.mark.parametrize("stored", ["integers", "with gaps"])
 def test_any_storage_of_vectors_is_taken(name, stored):
-    """The minimum of Σ i xᵢ² + qᵀx over Σ xᵢ = 2, 0 ≤ x ≤ 5."""
+    """The problem is to minimise Σ i xᵢ² + qᵀx over Σ xᵢ = 2, 0 ≤ x ≤ 5."""
     P, q, A = 2 * np.diag([1, 2, 3, 4]), np.array([-1, -2, 3, -4]), np.ones((1, 4), int)
     b, lb, ub = np.array([2]), np.zeros(4, int), np.full(4, 5)
     if stored == "with gaps":

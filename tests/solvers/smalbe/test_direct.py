@@ -1,4 +1,4 @@
-"""SMALBE with exact face problems: solutions, its path, and what it declines."""
+"""SMALBE with exact solutions on faces: solutions, steps and declined problems."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,9 @@ def solved(qp, tol=1e-10):
 
 
 def with_solution(seed, n, m, rank):
-    """Draw a KKT point and a QP that has it: a box on both sides, below, or none."""
+    """Draw a KKT point and a QP with this solution, with two-sided, lower
+    or no bounds.
+    """
     rng = np.random.default_rng(seed)
     W = rng.standard_normal((n, rank))
     side = rng.choice([-1, 0, 1], n)
@@ -52,7 +54,9 @@ def test_a_known_solution_is_found(seed, n, m):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_singular_P_leaves_no_residual(seed):
-    """Its null space has a third of the dimensions; there may be more minimisers."""
+    """The null space has a third of the dimensions, so the minimiser may
+    not be unique.
+    """
     solved(with_solution(seed, 30, 3, rank=20)[0], 1e-8)
 
 
@@ -66,14 +70,14 @@ def test_P_may_be_stored_in_any_way(store):
 
 
 def test_a_linear_cost_ends_in_a_vertex():
-    """min −x₁ − 2x₂ over x₁ + x₂ = 3 and 0 ≤ x ≤ 2 is at (1, 2)."""
+    """The minimiser of −x₁ − 2x₂ over x₁ + x₂ = 3, 0 ≤ x ≤ 2 is (1, 2)."""
     qp = box_qp(np.zeros((2, 2)), [-1, -2], 0, 2, [[1, 1]], [3])
 
     assert solved(qp, 1e-8).x == pytest.approx([1, 2], abs=1e-9)
 
 
 def test_an_upper_bound_stops_a_component_that_a_lower_one_released():
-    """½x² − 10x on [0, 1], where PERMON's proportioning step ends at 10."""
+    """For ½x² − 10x on [0, 1], PERMON's proportioning step would end at 10."""
     s = solved(box_qp([[1]], [-10], 0, 1))
 
     assert s.x == pytest.approx([1])
@@ -81,7 +85,9 @@ def test_an_upper_bound_stops_a_component_that_a_lower_one_released():
 
 
 def test_components_with_one_gradient_are_released_together():
-    """x = (1, 1, 1, 0, …): first a factor without rows, then one with three."""
+    """The solution is x = (1, 1, 1, 0, …): the first factor has no rows, the second one
+    has three.
+    """
     q = np.r_[-np.ones(3), np.ones(5)]
     s = solved(box_qp(np.eye(8), q, 0), 1e-8)
 
@@ -90,7 +96,9 @@ def test_components_with_one_gradient_are_released_together():
 
 
 def test_a_smaller_gradient_waits_for_the_larger_one():
-    """Released at 4, and then, with the share halved to 0.45, at 1 and at 0.3."""
+    """The component with gradient 4 is released first, those with 1 and 0.3 after the
+    share has been halved to 0.45.
+    """
     s = solved(box_qp(np.eye(3), [-4, -1, -0.3], 0), 1e-8)
 
     assert s.x == pytest.approx([4, 1, 0.3])
@@ -99,7 +107,7 @@ def test_a_smaller_gradient_waits_for_the_larger_one():
 
 @pytest.mark.parametrize("gone", [1, 2, 40, 79])
 def test_rows_leave_the_factor_by_rotations_or_a_new_one(gone):
-    """The free minimum of the first `gone` components is below their bound, at −1."""
+    """The free minimum of the first `gone` components is −1, below their bound."""
     n = 80
     rng = np.random.default_rng(gone)
     W = rng.standard_normal((n, n)) / np.sqrt(n)

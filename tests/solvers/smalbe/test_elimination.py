@@ -1,4 +1,4 @@
-"""Eliminating the free variables: the same solution, through a smaller QP."""
+"""Elimination of the free variables: the same solution from a smaller QP."""
 
 from dataclasses import replace
 
@@ -16,8 +16,9 @@ EXACT = SMALBE(eliminate="never")
 
 @pytest.fixture
 def dual():
-    """F positive definite, the first half free, r equality rows of which `apart` do not
-    meet the free variables."""
+    """Draw F positive definite, with the first half of the variables free and r
+    equality rows, of which `apart` have no entries in free variables.
+    """
 
     def draw(seed, n=24, r=3, apart=0):
         rng = np.random.default_rng(seed)
@@ -60,7 +61,7 @@ def test_bounds_from_above_are_those_of_the_variables_that_are_left(dual):
 
 
 def test_more_rows_than_free_variables_leave_rows(dual):
-    """14 rows determine the 12 free ones; two combinations of them are left."""
+    """14 rows determine the 12 free variables; two combinations of the rows remain."""
     qp = dual(271828, r=14)
     small = eliminate_free(qp)
     solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
@@ -70,7 +71,7 @@ def test_more_rows_than_free_variables_leave_rows(dual):
 
 
 def test_the_reduced_matrix_is_the_hessian_along_optimal_free_variables(dual):
-    """½vᵀP̂v + q̂ᵀv differs from the minimum over x_E of the whole cost by a constant."""
+    """½vᵀP̂v + q̂ᵀv differs by a constant from the minimum of the cost over x_E."""
     qp = dual(271828)
     small = eliminate_free(qp)
     rng = np.random.default_rng(161803)
@@ -90,7 +91,7 @@ def test_the_reduced_matrix_is_the_hessian_along_optimal_free_variables(dual):
 
 
 def test_the_order_of_the_variables_does_not_matter(dual):
-    """Free ones one after another, of which P is looked at, and scattered ones."""
+    """Free variables are consecutive, so that P can be a view, or scattered."""
     qp = dual(314159, apart=1)
     order = np.random.default_rng(577215).permutation(24)
     mixed = replace(
@@ -153,7 +154,9 @@ def test_on_bounds_only_it_agrees_with_the_reference(dual):
 
 
 def test_factorised_columns_count_as_products(dual):
-    """12 of them; 5 Lanczos steps for 12 unknowns; steps; two checks."""
+    """The total consists of 12 columns, 5 Lanczos steps for 12 unknowns, the steps of
+    MPRGP and two checks.
+    """
     qp = dual(271828, r=0)
     c = SMALBE(eliminate="always").prepare(qp, 1e-6)().counts
     steps = sum(c.get(k, 0) for k in ("cg", "beyond", "proportioning"))

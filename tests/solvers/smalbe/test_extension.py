@@ -1,4 +1,4 @@
-"""A preconditioner and a step rule of a subclass: used, safe, refused in one line."""
+"""Preconditioners and step rules of subclasses: use, safeguards, one-line refusals."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 
 def bounded(P, q, lb, ub=None, rows=None):
-    """½xᵀPx + qᵀx with bounds and, perhaps, rows with the right-hand side 0."""
+    """Draw ½xᵀPx + qᵀx with bounds and, optionally, rows with right-hand side 0."""
     n = len(q)
     rows = no_rows(n) if rows is None else rows
     return QP(
@@ -28,7 +28,9 @@ def spd(n, seed, condition=1e3):
 
 
 def qp_with_solution(n, seed):
-    """A QP with a row sum x = 0, boxes, and its solution by construction."""
+    """Draw a QP with the row sum x = 0, a box, and a solution that is known by
+    construction.
+    """
     rng = np.random.default_rng(seed)
     P, x = spd(n, seed), rng.standard_normal(n)
     x -= x.mean()
@@ -41,7 +43,7 @@ def qp_with_solution(n, seed):
 
 @dataclass(frozen=True)
 class WithM(SMALBE):
-    """SMALBE with a preconditioner of the QP and v."""
+    """SMALBE with a preconditioner that depends on the QP and v."""
 
     inverse: object = None
 
@@ -63,7 +65,9 @@ PLAIN = dict(expansion="std", proportioning="cg", recycle=False, eliminate="neve
 
 
 def test_the_inverse_as_preconditioner_needs_one_cg_step():
-    """P⁻¹ takes CG to the unconstrained minimum in one step, for any condition."""
+    """With P⁻¹, CG reaches the unconstrained minimum in one step for any condition
+    number.
+    """
     n = 40
     P, q = spd(n, 1, 1e6), np.linspace(1, 2, n)
     qp = bounded(P, q, np.full(n, -1e9))
@@ -89,7 +93,9 @@ def test_one_like_a_built_in_one_takes_the_same_steps():
 
 
 def test_a_rule_sees_the_problem_in_its_own_units():
-    """g = Px + q, both lengths by definition, and p points where the cost grows."""
+    """The rule receives g = Px + q, both step lengths as defined, and p, a direction in
+    which the cost increases.
+    """
     n, seen = 12, []
     P, q = 1e7 * spd(n, 3), np.linspace(-1e8, 2e8, n)
     qp = bounded(P, q, np.full(n, -1e-2), np.full(n, 2e-2))
@@ -114,7 +120,9 @@ def test_a_rule_sees_the_problem_in_its_own_units():
 
 
 def test_a_trial_point_outside_is_projected():
-    """For P = I the projected unconstrained minimum is the solution: one step."""
+    """For P = I, the projection of the unconstrained minimum is the solution, so one
+    step suffices.
+    """
     n = 20
     q = np.linspace(-1, 1, n)
     qp = bounded(np.eye(n), q, np.full(n, -0.3), np.full(n, 0.4))
@@ -141,7 +149,9 @@ RULES = {
 
 @pytest.mark.parametrize("name", RULES)
 def test_no_rule_spoils_an_answer_or_lets_the_cost_rise(name):
-    """Bad rules cost products; the planted solutions are found, going downhill."""
+    """Bad rules cost products. The cost decreases in every step, and the planted
+    solutions are found.
+    """
     for seed in range(20):
         qp, x = qp_with_solution(25, seed)
         solver = WithRule(rule=RULES[name], preconditioner="none", history=True)
@@ -194,7 +204,7 @@ def test_a_rule_that_returns_no_point_is_refused(rule, message):
 
 
 def test_in_a_sequence_the_functions_meet_every_variable():
-    """Without them, free variables are eliminated from the second QP on."""
+    """Without user functions, free variables are eliminated from the second QP on."""
     n, sizes = 30, []
     lb = np.where(np.arange(n) < 10, -np.inf, 0.0)
     qps = [bounded(spd(n, 6), np.linspace(-1, k, n), lb) for k in (1, 2, 3)]
@@ -214,7 +224,9 @@ def test_in_a_sequence_the_functions_meet_every_variable():
 
 @pytest.mark.parametrize("kind", [WithM, WithRule])
 def test_incomplete_factors_are_refused_rather_than_left_out(kind):
-    """They scale the variables; `auto` chooses another preconditioner instead."""
+    """Incomplete factors scale the variables. With `auto`, another preconditioner is
+    used instead.
+    """
     with pytest.raises(
         ValueError, match="preconditioner = 'incomplete' works in scaled"
     ):
@@ -222,7 +234,9 @@ def test_incomplete_factors_are_refused_rather_than_left_out(kind):
 
 
 def test_a_rule_meets_a_sparse_qp_in_its_own_variables():
-    """`auto` would scale them; the rule sees x and the bounds as given."""
+    """`auto` would scale the variables; the rule receives x and the bounds in the
+    user's variables.
+    """
     n, steps = 60, []
     P = 1e4 * csr_array(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
     qp = bounded(P, np.linspace(-3, -1, n), np.full(n, -1.0), np.full(n, 5e-3))

@@ -1,4 +1,4 @@
-"""SMALBE on duals with friction: boxes on both sides, sticking and slipping rows."""
+"""SMALBE on duals with friction: two-sided bounds, sticking and slipping rows."""
 
 from dataclasses import replace
 from functools import cache
@@ -62,7 +62,9 @@ def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
 def test_compiled_and_written_steps_are_the_same(
     name, solver, recycle, steps, monkeypatch
 ):
-    """In the first ones, before rounding tells: sooner where directions are kept."""
+    """The first steps agree. Rounding errors change later steps, earlier if directions
+    are stored.
+    """
     qp, runs = emitted(name), []
     for compiled in (True, False):
         options = replace(
@@ -77,7 +79,9 @@ def test_compiled_and_written_steps_are_the_same(
 
 
 def test_all_that_slipped_slips_back():
-    """From a bound to the opposite one and through, warm: peak to −peak, and again."""
+    """Warm-started steps go from one bound to the opposite one and back: peak, −peak,
+    peak.
+    """
     there, back = (
         emitted(f"half-plane/law=cattaneo/Q={Q}/peak=0.9/dual") for Q in (0.9, -0.9)
     )
@@ -93,7 +97,7 @@ def test_all_that_slipped_slips_back():
 
 
 def test_bounds_that_close_and_open_again_are_followed():
-    """Without friction every tangential multiplier is held at zero from both sides."""
+    """Without friction, both bounds of every tangential multiplier are zero."""
     with_friction = emitted("greco/n=16/dual-bounds")
     without = emitted("greco/n=16/iterate=1/dual-bounds")
     some = replace(
@@ -113,7 +117,7 @@ def test_bounds_that_close_and_open_again_are_followed():
 
 
 def test_the_history_ends_with_the_rows_that_slip():
-    """Histories have the column `two_sided` only if a variable has two bounds."""
+    """A history has the column `two_sided` only if a variable has two finite bounds."""
     qp = emitted("greco/n=16/dual-bounds")
     solver = replace(SOLVERS["smalbe"], history=True)
     s = solver.prepare(qp, TOL)()
@@ -151,7 +155,7 @@ def fixed_point(qp, mu, solve, enough, tighten=0.0):
 
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-permon"])
 def test_a_warm_fixed_point_takes_less_than_half_the_products_of_a_cold_one(name):
-    """Each solver on its own sequence, to the same residual of Coulomb's law."""
+    """Each solver follows its own sequence to the same residual of Coulomb's law."""
     qp, solver, enough = emitted("greco/n=16/dual-bounds"), SOLVERS[name], 1e-7
     prepare = solver.chain(TOL)
     warm, left = fixed_point(qp, 1.0, lambda qp: prepare(qp)(), enough)
@@ -179,7 +183,9 @@ def test_inner_tolerances_that_tighten_save_products_at_an_equal_residual():
 
 
 def test_an_emitted_problem_says_how_far_from_the_fixed_point_it_is():
-    """‖g − mu·λ_n‖/‖g‖ of its own solution, which is how far the next bound is."""
+    """‖g − mu·λ_n‖/‖g‖ of the solution of the QP is the relative change of the next
+    friction bound.
+    """
     names = "greco/n=16/iterate={}/dual-bounds"
     cases = [parse(names.format(i), PROBLEMS).build(reference_solution)
              for i in range(2, 6)]  # fmt: skip
@@ -219,7 +225,9 @@ def test_the_emitted_sequence_is_cheaper_warm_where_rows_are_equations_too():
 
 
 def test_a_sequence_with_one_equation_goes_on_with_the_spectrum_of_before():
-    """The arrays that are carried are as the compiled code needs them."""
+    """The arrays that are passed to the next QP have the layout that the compiled code
+    requires.
+    """
     qp = emitted("half-plane/law=cattaneo/Q=0.6/dual")
     prepare = SOLVERS["smalbe"].chain(TOL)
     first, again = prepare(qp)(), prepare(qp)()

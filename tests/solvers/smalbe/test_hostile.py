@@ -1,4 +1,4 @@
-"""A search for QPs on which SMALBE claims what it has not, or gives up."""
+"""Search for QPs on which SMALBE makes a false claim or gives up."""
 
 from dataclasses import replace
 
@@ -12,11 +12,11 @@ TOLERANCES = (1e-6, 1e-9, 1e-12)
 
 
 def hostile(seed):
-    """Draw a QP with a KKT point: ill-conditioned, degenerate, of any scale.
+    """Draw a QP with a known KKT point: ill-conditioned, degenerate, of any scale.
 
-    P has condition numbers to 1e10 or is singular, a third of the multipliers of active
-    bounds is zero, and two rows may differ by 1e-8 alone (less, and the rounding of b
-    makes QPs without a feasible point of them).
+    P is singular or has a condition number up to 1e10, a third of the multipliers of
+    active bounds are zero, and two rows may differ by only 1e-8. With a smaller
+    difference, the rounding of b would make the QP infeasible.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 60))
@@ -49,7 +49,9 @@ def hostile(seed):
 
 
 def ends(name, seeds):
-    """Return how many runs gave up, of how many, and what was claimed wrongly."""
+    """Return the number of runs that gave up, the number of all runs, and the false
+    claims.
+    """
     given_up, runs, wrong = 0, 0, []
     for seed in seeds:
         qp = hostile(seed)
@@ -75,7 +77,7 @@ def test_nothing_is_claimed_wrongly(name):
 @pytest.mark.parametrize("seed", [343, *range(8)])
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-direct", "smalbe-condensed"])
 def test_without_a_cost_any_feasible_point_is_found_optimal(name, seed):
-    """No multiplier has a size then, not even one that rounding makes of nothing."""
+    """The multipliers are then zero, without contributions of rounding errors."""
     qp = hostile(seed)
     qp = replace(qp, P=0 * qp.P, q=0 * qp.q)
     for tol in TOLERANCES:

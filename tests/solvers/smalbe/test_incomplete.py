@@ -1,4 +1,4 @@
-"""MPRGP with incomplete factors of the free part of a sparse P."""
+"""MPRGP with incomplete factors of the free submatrix of a sparse P."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def primal(name):
 
 
 def half_string(n):
-    """A string over an obstacle that ends in the middle."""
+    """A string over an obstacle that ends in the middle of the string."""
     qp = primal(f"string/n={n}")
     lb = qp.lb.copy()
     lb[n // 2 :] = -np.inf
@@ -74,7 +74,9 @@ def test_on_a_tridiagonal_matrix_the_factor_is_the_one_of_cholesky(n):
 @pytest.mark.parametrize("kind", ["five-point", "nine-point", "line", "graph", "wide"])
 @pytest.mark.parametrize("seed", range(10))
 def test_the_factor_is_the_one_that_is_written(seed, kind):
-    """By diagonals and by columns, from both ends and from one, on every face alike."""
+    """Factors by diagonals and by columns, from one end or from both, agree with the
+    textbook on every face.
+    """
     rng = np.random.default_rng([7, seed])
     side = int(rng.integers(9, 16))
     P = grid(side)
@@ -108,7 +110,9 @@ def test_the_factor_is_the_one_that_is_written(seed, kind):
 
 
 def test_a_five_point_grid_loses_what_its_factor_drops_but_for_a_twentieth():
-    """Row sums of M are those of P, plus what is not kept of each dropped entry."""
+    """Row sums of M equal those of P plus the uncompensated share of each
+    dropped entry.
+    """
     P = grid(15)
     M = np.linalg.inv(
         np.column_stack([factor(P).solve(np.ones(225, bool), e) for e in np.eye(225)])
@@ -124,7 +128,9 @@ def test_a_five_point_grid_loses_what_its_factor_drops_but_for_a_twentieth():
 
 
 def test_where_pivots_fail_the_diagonal_is_shifted():
-    """Kershaw's matrix (J. Comput. Phys. 26, 1978): plainly, a pivot is negative."""
+    """The incomplete factorisation of Kershaw's matrix (J. Comput. Phys. 26, 1978) has
+    a negative pivot.
+    """
     P = np.array([[3.0, -2, 0, 2], [-2, 3, -2, 0], [0, -2, 3, -2], [2, 0, -2, 3]])
     F = factor(P, keep=False)
     M = np.column_stack([F.solve(np.ones(4, bool), e) for e in np.eye(4)])
@@ -138,7 +144,7 @@ def test_where_pivots_fail_the_diagonal_is_shifted():
 
 @pytest.mark.parametrize("seed", range(60))
 def test_the_inverse_is_positive_definite_on_every_face(seed):
-    """Also of an indefinite matrix: all it takes is a positive diagonal."""
+    """This also holds for an indefinite matrix with a positive diagonal."""
     rng = np.random.default_rng([8, seed])
     P = sparse_matrix(60, rng)
     if seed % 3 == 0:
@@ -196,7 +202,9 @@ def test_where_a_factor_would_not_do_there_is_none(reason):
 
 
 def test_trilinear_elements_are_scaled_without_a_factor():
-    """Units of neighbours three orders apart: 30 000 products without scaling."""
+    """The units of neighbouring variables differ by three orders of magnitude; without
+    scaling, the solve takes 30 000 products.
+    """
     n, rng = 30, np.random.default_rng(1)
     T = diags_array(
         [-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
@@ -226,7 +234,9 @@ def test_who_asks_for_a_factor_that_is_not_there_is_told_why():
 
 
 def test_sparsity_by_hand():
-    """A string, a grid in its natural order, and one of which a unit is a hundredth."""
+    """The matrices are those of a string, of a grid in its natural order, and of a grid
+    with one unit scaled by 1/100.
+    """
     unit = diags_array(np.r_[np.full(35, 10.0), 1.0])
     scaled = csr_array(unit @ grid(6) @ unit)
 
@@ -262,7 +272,9 @@ def test_a_factor_is_used_where_it_saves_time(case, pays):
     [("journal-bearing/n=30/eccentricity=0.9", True), ("torsion/n=70", False)],
 )
 def test_in_a_random_order_a_factor_needs_a_wide_spread(case, pays):
-    """It is three times less accurate, and costs twice as much, in that order."""
+    """In random order, the factor is three times less accurate and costs
+    twice as much.
+    """
     qp = primal(case)
     order = np.random.default_rng(3).permutation(qp.q.size)
     P = csr_array(qp.P)[order][:, order]
@@ -314,7 +326,9 @@ def test_every_step_is_feasible_and_lessens_the_cost(seed, expansion):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_unit_of_a_variable_changes_nothing(seed):
-    """Bounds, cost and matrix in other units: the same steps, up to rounding."""
+    """If bounds, cost and matrix are expressed in other units, the steps are the same
+    up to rounding.
+    """
     rng = np.random.default_rng([9, seed])
     qp, _ = qp_with_minimum(seed, 100)
     unit = 2.0 ** rng.integers(-9, 9)
@@ -350,7 +364,9 @@ def test_on_the_named_families_it_takes_few_products(case, most):
 
 
 def test_half_a_string_takes_a_tenth_of_the_products_of_a_face_after_the_other():
-    """PERMON's branch takes 224, about one for each of the faces on the way."""
+    """PERMON's unmerged branch takes 224 products, about one for each
+    intermediate face.
+    """
     qp = half_string(1000)
     s = FACTORS.prepare(qp, 1e-6)()
 
@@ -373,7 +389,9 @@ def test_on_large_ones_as_well(case, most):
 
 
 def test_it_stops_where_the_residual_is_what_was_asked_for():
-    """Steps are cheap there: not below a twentieth of it."""
+    """Since steps are cheap, the final residual is not far below the tolerance, at
+    least one twentieth of it.
+    """
     for case in ("journal-bearing/n=50/eccentricity=0.9", "torsion/n=50",
                  "journal-bearing/n=50"):  # fmt: skip
         for tol in (1e-4, 1e-6, 1e-8):
@@ -384,7 +402,7 @@ def test_it_stops_where_the_residual_is_what_was_asked_for():
 
 
 def test_all_at_their_bounds_from_the_start():
-    """No component is free: the first face is empty."""
+    """No component is free, so the first face is empty."""
     qp = boxed(grid(6), np.ones(36), np.zeros(36), np.ones(36))
     s = FACTORS.prepare(qp, 1e-8)()
 
@@ -393,7 +411,7 @@ def test_all_at_their_bounds_from_the_start():
 
 
 def test_a_cost_without_a_bound_below_is_not_solved():
-    """A floating membrane that is pulled to one side."""
+    """The problem is a floating membrane that is pulled to one side."""
     P = grid(5)
     P = csr_array(P - diags_array(np.asarray(P.sum(axis=0)).ravel()))
     inf = np.full(25, np.inf)
@@ -403,7 +421,7 @@ def test_a_cost_without_a_bound_below_is_not_solved():
 
 
 def test_a_floating_membrane_on_an_obstacle():
-    """P is singular: the last pivot of its factor is rounding."""
+    """P is singular, so the last pivot of its factor consists of rounding errors."""
     P = grid(8)
     P = csr_array(P - diags_array(np.asarray(P.sum(axis=0)).ravel()))
     qp = boxed(P, np.ones(64), np.linspace(0, 1, 64), np.full(64, np.inf))

@@ -1,4 +1,4 @@
-"""The path that MPRGP takes, which no test of its answer can see."""
+"""Steps of MPRGP, which tests of its solution cannot check."""
 
 import re
 from collections import Counter
@@ -23,7 +23,7 @@ MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 
 
 def run_textbook(A, b, lower, upper, x, *, tau, tol, rules, B, M, **options):
-    """Run the textbook's MPRGP; M preconditions every face."""
+    """Run the textbook implementation of MPRGP; M preconditions every face."""
     products = []
 
     def H(v):
@@ -43,8 +43,8 @@ def run_compiled(
 ):
     """Run the compiled MPRGP on a problem without rows.
 
-    A model is what Ritz pairs without residuals leave; expansions without one take
-    τ = 1/ᾱ, so that they are run in units where that is so.
+    A model corresponds to Ritz pairs without residuals. Expansions without a model use
+    τ = 1/ᾱ, so they are run in units in which this holds.
     """
     B = B or Model.of_norm(tau, b.size)
     unit = 1.0 if rules.expansion == "model" else rules.relaxation * B.tau
@@ -118,7 +118,7 @@ def minimised(
 
 
 def test_without_active_bounds_it_is_conjugate_gradients(minimise):
-    """The number of steps is that of the distinct eigenvalues."""
+    """The number of steps is the number of distinct eigenvalues."""
     run, products = minimise(
         np.diag(np.repeat([1.0, 3.0, 10.0, 40.0], 5)), np.arange(1.0, 21.0),
         np.full(20, -np.inf),
@@ -129,7 +129,9 @@ def test_without_active_bounds_it_is_conjugate_gradients(minimise):
 
 @pytest.mark.parametrize(("Gamma", "first"), [(1.9, "p"), (2.1, "c")])
 def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first):
-    """‖β‖ = 2, ‖φ̃‖ = ‖φ‖ = 1: Γ = 2 decides; Γ² = 4, not 2, multiplies ‖φ‖² = 1."""
+    """‖β‖ = 2 and ‖φ̃‖ = ‖φ‖ = 1, so Γ = 2 is the threshold. The test compares ‖β‖²
+    with Γ²‖φ‖², where Γ² = 4.
+    """
     rules = Rules(Gamma, "mixed", "cg")
     run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], rules=rules)
 
@@ -137,8 +139,9 @@ def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first)
 
 
 def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning(minimise):
-    """φ = 1 but φ̃ = 10⁻⁹ at the first component: the reduced gradient decides, where
-    it is asked."""
+    """φ = 1 but φ̃ = 10⁻⁹ in the first component: with the corresponding option, the
+    reduced gradient decides.
+    """
     first = [
         minimise(
             np.eye(2), [-1.0, 0.01], [-1e-9, 0.0], x=[0, 0], alpha=1.0,
@@ -151,7 +154,7 @@ def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning(minimis
 
 
 def test_proportioning_stops_at_the_opposite_bound(minimise):
-    """min ½x² − 10x over [0, 1] from x = 0: the minimising step would end at 10."""
+    """For min ½x² − 10x over [0, 1] from x = 0, the minimising step would end at 10."""
     run, _ = minimise([[1.0]], [10.0], [0.0], [1.0])
 
     assert run.x == pytest.approx([1.0])
@@ -159,7 +162,9 @@ def test_proportioning_stops_at_the_opposite_bound(minimise):
 
 
 def test_an_expansion_projects_the_cg_step(minimise):
-    """From (1, 1) with H = I, b = (−1, 0): CG ends at (−1, 0), projected (0, 0)."""
+    """From (1, 1) with H = I, b = (−1, 0), the CG step ends at (−1, 0), whose
+    projection is (0, 0).
+    """
     run, products = minimise(np.eye(2), [-1.0, 0.0], [0.0, 0.0], x=[1.0, 1.0])
 
     assert run.trace == "e"
@@ -168,8 +173,11 @@ def test_an_expansion_projects_the_cg_step(minimise):
 
 
 def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one(minimise):
-    """In a tilted valley the second CG step ends at (−1, 0); cut at x₁ = 0 it climbs.
-    One product for each c, three for the fallback."""
+    """In a tilted valley, the second CG step ends at (−1, 0); its projection onto x₁ =
+    0 has a higher cost.
+
+    Each letter c takes one product, and the fallback takes three.
+    """
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     run, products = minimise(A, b, lower, x=[1.0, 0.2])
     before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1)
@@ -184,7 +192,9 @@ def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one(minimise):
 
 
 def test_a_fallback_is_a_half_step_and_a_gradient_projection(minimise):
-    """By hand: the CG step as far as x₁ = 0, then −ᾱφ on what is still free."""
+    """By hand: the CG step is cut at x₁ = 0 and followed by −ᾱφ on the remaining free
+    components.
+    """
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1)
     after, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=2)
@@ -319,7 +329,7 @@ def test_the_inverse_in_a_face_inverts_the_block_of_the_model():
 
 
 def test_a_model_is_raised_to_what_a_product_shows():
-    """sᵀBs = sᵀHs afterwards; in the directions of U it stays what it was."""
+    """Afterwards sᵀBs = sᵀHs, and the model is unchanged along U."""
     rng = np.random.default_rng(271828)
     U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
     B = Model(0.5, U, np.array([30.0, 20.0, 10.0]))
@@ -335,7 +345,9 @@ def test_a_model_is_raised_to_what_a_product_shows():
 
 
 def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
-    """H = 4I, B = I: the step ends four times too far, the line search at x = b/4."""
+    """H = 4I and B = I: the step of the model is four times too long, and the line
+    search ends at x = b/4.
+    """
     run, products = minimise(
         4 * np.eye(2), [4.0, 40.0], [0.0, 0.0], B=Model.of_norm(1.0, 2), rules=Rules()
     )
@@ -345,7 +357,7 @@ def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
 
 
 def test_an_exact_model_finds_the_minimum_at_once(minimise):
-    """B = H: the first step ends at the solution."""
+    """For B = H, the first step ends at the solution."""
     U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
     B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
     H = np.eye(20) + U.T @ np.diag(B.w) @ U
@@ -356,7 +368,9 @@ def test_an_exact_model_finds_the_minimum_at_once(minimise):
 
 
 def test_a_preconditioner_in_the_face_is_used_with_conjugation(minimise):
-    """M = A⁻¹ solves in one step; M = D⁻¹ makes D¹ᐟ²(I + rank 2)D¹ᐟ² take three."""
+    """M = A⁻¹ gives the solution in one step; with M = D⁻¹, the matrix D¹ᐟ²(I + rank
+    2)D¹ᐟ² requires three steps.
+    """
     rng = np.random.default_rng(271828)
     D, W = np.diag(rng.uniform(1, 100, 30)), rng.standard_normal((30, 2))
     half = np.sqrt(D)
@@ -386,7 +400,9 @@ def test_the_observer_sees_every_step(minimise):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed):
-    """A flat spectrum of [1, 50] with B = I/20: some 27 products; 40 where τ stays."""
+    """For a flat spectrum in [1, 50] and B = I/20, about 27 products suffice; with
+    constant τ, 40 are needed.
+    """
     rng = np.random.default_rng(seed)
     V = np.linalg.qr(rng.standard_normal((60, 60)))[0]
     H, b = V * np.linspace(1, 50, 60) @ V.T, 10 * rng.standard_normal(60)
@@ -400,7 +416,9 @@ def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed)
 
 
 def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
-    """By hand: to x₁ = 0 along the CG step, then the model's minimum from there."""
+    """By hand: the CG step is cut at x₁ = 0; the second part ends at the minimum of the
+    model.
+    """
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     B = Model.of_norm(np.linalg.norm(A, 2), 2)
     rules = Rules(proportioning="cg")
@@ -417,7 +435,9 @@ def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
 
 
 def test_a_half_step_that_is_the_solution_is_kept(minimise):
-    """min ½x² + x over x ≥ −½ from 0: CG leads to −1, the bound is the solution."""
+    """For min ½x² + x over x ≥ −½ from 0, the CG step leads to −1, and the bound is the
+    solution.
+    """
     run, products = minimise([[1.0]], [-1.0], [-0.5], rules=Rules())
 
     assert run.stopped
@@ -434,7 +454,7 @@ def test_a_rounded_model_is_never_lowered():
 
 
 def model_run(minimise, problem, rules, B=None, tol=1e-6):
-    """Run with the letter, the active set and the cost of each step kept."""
+    """Run MPRGP and record the letter, the active set and the cost of each step."""
     A, b, lower = problem
     upper, seen = np.full(b.size, np.inf), []
 
@@ -451,7 +471,9 @@ def model_run(minimise, problem, rules, B=None, tol=1e-6):
 
 
 def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise):
-    """Else an expansion undoes the one before, and conjugate gradients never run."""
+    """Otherwise an expansion would undo the previous one, and conjugate gradients would
+    never start.
+    """
     seen, products = model_run(minimise, string(), Rules())
     expansions = 0
     for (_, before, _), (letter, after, _) in pairwise(seen):
@@ -473,7 +495,7 @@ def test_every_step_by_the_model_lessens_the_cost(minimise):
 
 
 def tight_box(seed):
-    """A spectrum of up to four decades, and boxes of which many bounds are active."""
+    """Draw a spectrum of up to four decades and a box with many active bounds."""
     rng = np.random.default_rng(seed)
     Q = np.linalg.qr(rng.standard_normal((30, 30)))[0]
     A = (Q * np.logspace(0, -rng.uniform(0, 4), 30)) @ Q.T
@@ -489,7 +511,9 @@ def string_and_boxes():
 
 
 def test_no_more_steps_beyond_the_box_than_inside(minimise):
-    """Or one, where there were none: what they cost is at most doubled."""
+    """There may be one such step if there are no steps inside; hence the products are
+    at most doubled.
+    """
     most, steps = 0, 0
     for A, b, lower, upper in string_and_boxes():
         run, products = minimise(
@@ -514,8 +538,10 @@ def watched(seen, letter, at, face):
 
 
 def test_each_step_gains_what_the_rate_of_the_book_needs(minimise):
-    """G/4τ with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖ and Γ = 1; so f − f* shrinks by
-    1 − λ_min/4‖H‖ at least, the book's factor for steps of 1/‖H‖."""
+    """Each step decreases f by at least G/4τ, with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖
+    and Γ = 1. Hence f − f* decreases by at least the factor 1 − λ_min/4‖H‖, which the
+    book proves for steps of length 1/‖H‖.
+    """
     letters = Counter()
     for A, b, lower, upper in string_and_boxes():
         tau = np.linalg.norm(A, 2)
@@ -543,7 +569,9 @@ def test_each_step_gains_what_the_rate_of_the_book_needs(minimise):
 
 
 def ill_conditioned(n):
-    """Draw a matrix of condition 10⁸ whose eigenvalues all differ, and two vectors."""
+    """Draw a matrix with condition number 10⁸ and distinct eigenvalues, and
+    two vectors.
+    """
     rng = np.random.default_rng(314159)
     Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
     A = (Q * np.logspace(0, -8, n)) @ Q.T
@@ -551,7 +579,9 @@ def ill_conditioned(n):
 
 
 def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns(minimise):
-    """Conjugate to the last alone, rounding costs it twice as many."""
+    """If directions are conjugate to the last one only, rounding errors double the
+    number of steps.
+    """
     n = 40
     A, x, _ = ill_conditioned(n)
     b, free = A @ x, np.full(n, -np.inf)
@@ -577,7 +607,7 @@ def test_directions_are_conjugate_and_the_last_ones_are_kept():
 
 
 def test_directions_that_span_the_face_solve_for_another_right_hand_side():
-    """Without a product; where a bound is in the way, they end there."""
+    """The solve takes no product and ends at a bound if one is in the way."""
     a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
     p = np.diag(1 / np.sqrt(a))
     known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))

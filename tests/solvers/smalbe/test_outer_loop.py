@@ -1,4 +1,6 @@
-"""The outer loop of SMALBE: what ends it, and what it does where nothing helps."""
+"""The outer loop of SMALBE: stopping tests, and behaviour if no progress is
+possible.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -17,7 +19,9 @@ from tests.support.textbook.projected import by_lanczos, projected_problem
 
 
 def drawn(seed, n=60, condition=1e3):
-    """Bounds on the second half, two equality rows, eigenvalues 1 to 1/condition."""
+    """Draw a QP with bounds on the second half, two equality rows, and eigenvalues from
+    1 to 1/condition.
+    """
     rng = np.random.default_rng(seed)
     Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
     P = Q * np.geomspace(1, 1 / condition, n) @ Q.T
@@ -31,7 +35,7 @@ def drawn(seed, n=60, condition=1e3):
 
 @pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
 def outer_loop(request):
-    """Run from x, with the constants of which the penalty is far too small."""
+    """Run from x with constants for which the penalty is far too small."""
 
     def run(problem, x, *, tol, max_steps=20_000, energy=0.0, at=None):
         options = SMALBE(
@@ -52,7 +56,9 @@ def problem_of(qp):
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, seed):
-    """A quarter more, and what the last inner run takes: the estimate is never met."""
+    """Since the estimate never falls below its limit, the solve takes a quarter more
+    products and those of the last inner run.
+    """
     qp = drawn(seed)
     products, found = [], []
     for energy, tol in ((0.0, 1e-3), (1e-6, 1e-3), (0.0, 1e-12)):
@@ -69,7 +75,9 @@ def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, 
 
 
 def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts(outer_loop):
-    """Relative to b, not to the gradient at the start, which is small there already."""
+    """The tolerance is relative to b and not to the initial gradient, which is already
+    small here.
+    """
     free = dict(A=no_rows(60), b=np.zeros(0), lb=np.full(60, -np.inf))
     problem = problem_of(replace(drawn(271828), **free))
     near = outer_loop(problem, np.zeros(60), tol=1e-8)
@@ -102,7 +110,9 @@ def test_a_run_that_goes_on_has_what_is_left_of_the_limit(outer_loop):
 
 @pytest.mark.parametrize("most", [1, 5, 20])
 def test_the_lagrangian_is_that_of_the_point(outer_loop, most):
-    """½νᵀHν − bᵀν + μᵀCν with the multipliers of the inner run, before their step."""
+    """L = ½νᵀHν − bᵀν + μᵀCν, with the multipliers of the inner run before
+    their update.
+    """
     problem = problem_of(drawn(314159))
     at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=most)
     Cnu, rho = problem.rows.C @ at.nu, at.outer[-1].rho
@@ -135,7 +145,9 @@ def test_of_a_stall_with_rows_that_are_not_met_the_penalty_grows():
 @pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, unit):
-    """x ≥ lb and a positive row whose right-hand side only x = lb meets, or nothing."""
+    """The constraints are x ≥ lb and a positive row whose right-hand side is attained
+    only at x = lb, or not at all.
+    """
     rng = np.random.default_rng(seed)
     A, lb = rng.uniform(0.1, 1, (1, 6)), rng.uniform(1, 2, 6)
 
@@ -150,7 +162,7 @@ def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, un
 
 @pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
 def test_a_far_feasible_point_is_seen_in_every_unit(unit):
-    """(2, −1000) meets x₁ + x₂/1000 = 1; x₂ has no bound."""
+    """(2, −1000) satisfies x₁ + x₂/1000 = 1; x₂ has no bound."""
     rows = orthonormal_rows(np.array([[1.0, 1e-3]]), np.array([unit]))
     bounds = (unit * np.array([2.0, -np.inf]) - rows.x_tilde, np.full(2, np.inf))
 

@@ -1,4 +1,4 @@
-"""Preconditioners in the face: exact where they can be, masked, counted."""
+"""Preconditioners on faces: exact cases, restriction to the face, counters."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 
 
 def chain(n):
-    """Stiffness of n springs in a row, held at the left end."""
+    """Stiffness of n springs in series, fixed at the left end."""
     K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     K[-1, -1] = 1
     return K
@@ -27,7 +27,7 @@ def chain(n):
 
 @pytest.fixture
 def gap():
-    """A dual of one body: rows pick every third node, F = BK⁻¹Bᵀ."""
+    """Dual of one body: rows select every third node, F = BK⁻¹Bᵀ."""
     K, B = chain(30), np.eye(30)[::3]
     structure = Structure(
         K=csr_array(K), B=csr_array(B), fixed=np.zeros(0, dtype=np.int64)
@@ -51,7 +51,7 @@ def ours(problem, qp, kind, free):
 
 @pytest.fixture(params=[ours, textbook])
 def in_face(request):
-    """Return what preconditions in a face, and the norm of the projected problem."""
+    """Return the preconditioner on a face and the norm of the projected problem."""
 
     def prepared(qp, kind, free):
         problem = projected_problem(
@@ -64,7 +64,7 @@ def in_face(request):
 
 @pytest.fixture
 def whole(in_face):
-    """The preconditioner on the face of all components, as a matrix."""
+    """Return the preconditioner on the face of all components as a matrix."""
 
     def matrix(qp, kind):
         n = qp.q.size
@@ -91,7 +91,7 @@ def test_diagonal_divides_by_the_diagonal(whole, gap):
 
 @pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
 def test_held_components_stay_out(whole, kind):
-    """A chain held in the middle is two chains."""
+    """A chain with a fixed interior node consists of two chains."""
     K, B = chain(9), np.eye(9)[[1, 3, 6, 8]]
     free = np.arange(9) != 4
     F = B[:, free] @ np.linalg.solve(K[np.ix_(free, free)], B[:, free].T)
@@ -148,7 +148,7 @@ def test_structure_survives_the_file(gap, tmp_path):
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_the_matrix_of_a_dual_is_what_its_structure_says(form):
-    """P = BK⁺Bᵀ: on self-equilibrated λ, whatever the generalised inverse."""
+    """P = BK⁺Bᵀ on self-equilibrated λ, for any generalised inverse."""
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=3))
     qp = family.build(form, params, reference_solution).qp

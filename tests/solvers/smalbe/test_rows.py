@@ -1,4 +1,6 @@
-"""Equality rows by a sparse Cholesky factor: rows, models and steps of dense ones."""
+"""Equality rows with a sparse Cholesky factor: rows, models and steps equal those of
+dense rows.
+"""
 
 from functools import partial
 
@@ -26,7 +28,7 @@ SEED = 20210805
 
 @pytest.fixture
 def G():
-    """Nine rows of very different lengths on forty unknowns."""
+    """Nine rows of very different norms with forty unknowns."""
     rng = np.random.default_rng(SEED)
     entries = random_array((9, 40), density=0.2, rng=rng, data_sampler=rng.normal)
     return csr_array(np.logspace(-3, 3, 9)[:, None] * entries.tocsr())
@@ -42,7 +44,9 @@ ALL, THIRD = np.ones(40, dtype=bool), np.arange(40) % 3 == 0
 
 @pytest.fixture(params=["held", "all", "all, refactorised"])
 def pair(G, e, request, monkeypatch):
-    """The rows, sparse and dense; what may be held decides how faces are factorised."""
+    """The rows, sparse and dense. The set of components that may be fixed determines
+    how faces are factorised.
+    """
     if "refactorised" in request.param:
         monkeypatch.setattr(module, "MAX_BORDER", 0)
     bounded = THIRD if request.param == "held" else ALL
@@ -51,7 +55,7 @@ def pair(G, e, request, monkeypatch):
 
 @pytest.fixture
 def face():
-    """Every third component held."""
+    """A face with every third component fixed."""
     return ~THIRD
 
 
@@ -105,7 +109,9 @@ def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
 
 @pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
 def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch):
-    """P = I, whose model has no Ritz vectors: by a factor, by an array, and by hand."""
+    """For P = I, whose model has no Ritz vectors, results with a factor, with an array
+    and by hand agree.
+    """
     qp = QP(
         P=np.eye(40), q=np.ones(40), A=G, b=e, G=no_rows(40), h=np.zeros(0),
         lb=np.where(face, -np.inf, -0.5), ub=np.full(40, np.inf),
@@ -160,7 +166,7 @@ def test_of_dependent_rows_that_are_too_many_some_stand_for_all(G, e, monkeypatc
 
 
 def test_a_qp_with_dependent_sparse_rows_is_solved(G, e, monkeypatch):
-    """Independent rows stand for all; residuals are those of the rows as given."""
+    """The solver uses independent rows; residuals are those of the original rows."""
     dependent = csr_array(np.vstack([G.toarray(), 2 * G.toarray()[3:4]]))
     qp = QP(
         P=np.eye(40), q=np.ones(40), A=dependent, b=np.append(e, 2 * e[3]),
@@ -182,10 +188,12 @@ def test_a_qp_with_dependent_sparse_rows_is_solved(G, e, monkeypatch):
 def test_a_motion_that_held_components_alone_feel_leaves_a_factor(
     monkeypatch, border, shift
 ):
-    """Free components: rows of integers, of which one is the sum of two others.
+    """On the free components, the rows consist of integers and one row is the sum of
+    two others.
 
-    It differs from that sum in held components alone, and there by as little as the
-    rounding of G_H G_Hᵀ. A right-hand side G_F v has a solution whatever the shift.
+    This row differs from the sum only in fixed components, and only by an amount of the
+    order of the rounding errors of G_H G_Hᵀ. A right-hand side G_F v has a solution for
+    any shift.
     """
     if not border:
         monkeypatch.setattr(module, "MAX_BORDER", 0)
@@ -229,7 +237,9 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
 
 
 def test_a_right_hand_side_of_rounding_is_none(G):
-    """A right-hand side of 1e-18 is rounding and sets no scale for residuals."""
+    """A right-hand side of 1e-18 is a rounding error and does not set a scale for
+    residuals.
+    """
     e = 1e-18 * (-1.0) ** np.arange(9)
     size, nu = np.linalg.norm(G.toarray()), np.full(40, 1e-9)
     nu[0] = 1e3

@@ -1,4 +1,4 @@
-"""SMALBE: its path, its invariants and the problems that break such solvers."""
+"""SMALBE: steps, invariants and difficult problems."""
 
 from dataclasses import replace
 from functools import partial
@@ -54,7 +54,9 @@ def bounded(P, q, A=None, b=(), lb=-np.inf, ub=np.inf):
 
 @pytest.fixture
 def dual():
-    """A dual of a floating body: F of rank n − 2, λ ≥ 0 on the second half, Gλ = e."""
+    """Draw the dual of a floating body: F of rank n − 2, λ ≥ 0 on the second half, Gλ =
+    e.
+    """
 
     def draw(seed, n=30, r=3):
         rng = np.random.default_rng(seed)
@@ -80,7 +82,7 @@ def test_what_is_claimed_is_true(dual, name, seed, tol):
 @pytest.mark.parametrize("name", INHOUSE)
 @pytest.mark.parametrize("exponent", [-30, 30])
 def test_scaling_the_objective_changes_no_step(dual, name, exponent):
-    """By a power of two, hence in exact arithmetic."""
+    """The factor is a power of two, so that the arithmetic is exact."""
     qp, factor = dual(271828), 2.0**exponent
     scaled = replace(qp, P=qp.P * factor, q=qp.q * factor)
     plain, large = (SOLVERS[name].prepare(p, 1e-8)() for p in (qp, scaled))
@@ -108,7 +110,7 @@ def test_scaled_repeated_and_zero_rows_of_G_change_no_answer(dual, seed):
 
 
 def test_rows_that_contradict_each_other_by_rounding_end_the_solve():
-    """Nearly parallel rows, 10⁻¹² apart: no penalty brings ‖Cν‖ to its tolerance."""
+    """Two rows differ by 10⁻¹². No penalty reduces ‖Cν‖ to its tolerance."""
     n = 6
     A = np.vstack([np.ones(n), 1 + 1e-9 * np.arange(n)])
     qp = QP(
@@ -149,7 +151,9 @@ def test_rows_that_no_point_within_the_bounds_meets_are_reported(qp):
 
 
 def test_nearly_parallel_rows_are_independent():
-    """x = (0, 10⁴, ·): the rows differ by 5·10⁻¹¹ only, and that decides on x₂."""
+    """x = (0, 10⁴, ·): the rows differ by 5·10⁻¹¹ only, and this difference determines
+    x₂.
+    """
     qp = bounded(np.eye(3), [0.0, 0, 1], [[1, 0, 0], [1, 5e-11, 0]], [0.0, 5e-7])
     rows = orthonormal_rows(qp.A, qp.b)
 
@@ -166,8 +170,9 @@ def test_a_repeated_row_must_ask_for_the_same(off):
 
 
 def test_a_stalled_multiplier_is_helped_by_a_larger_penalty():
-    """Fixed variables leave a row that the free ones can hardly move: with ρ fixed this
-    took more than ten thousand outer iterations."""
+    """Because of fixed variables, the free ones have little effect on one row. With
+    constant ρ, more than ten thousand outer iterations were needed.
+    """
     rng = np.random.default_rng(271828)
     W = rng.standard_normal((6, 6))
     A = rng.standard_normal((2, 6)) * [1, 1, 1, 1, 1e-3, 1e-3]
@@ -192,8 +197,9 @@ def test_the_gradient_projection_step_is_shorter_than_two_over_the_norm(dual, rh
 
 
 def test_the_model_knows_what_the_lanczos_process_and_the_rows_tell(dual):
-    """On C it is ρ; on a Ritz vector the value and its residual; and it is far below
-    the norm elsewhere, where the spectrum decays like 1/k²."""
+    """The model is ρ on C, and the Ritz value plus its residual on a Ritz vector.
+    Elsewhere it is far below the norm, because the spectrum decays like 1/k².
+    """
     rng = np.random.default_rng(271828)
     V = np.linalg.qr(rng.standard_normal((60, 60)))[0]
     F = V / np.arange(1, 61) ** 2 @ V.T
@@ -242,8 +248,10 @@ def test_every_product_with_F_is_counted(dual):
 
 
 def test_products_are_explained_by_the_steps(dual):
-    """5 Lanczos (n = 30), homogenisation, none for the start at 0; 1 per c, b or p,
-    2 per e, 3 per f; the residual on the original problem."""
+    """The total is 5 for Lanczos (n = 30), one for homogenisation, none for the start
+    at 0, 1 for each c, b or p, 2 for each e, 3 for each f, and one for the residual of
+    the original problem.
+    """
     s = SMALBE().prepare(dual(271828), 1e-6)()
     c = s.counts
 
@@ -305,7 +313,9 @@ def test_too_few_steps_are_not_called_solved(dual):
 def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
     orders, bounds, is_compiled, monkeypatch
 ):
-    """No point has the residual that is asked for; eigenvalues 1 … 10^orders."""
+    """The eigenvalues are 1 … 10^orders, and no point in double precision has the
+    required residual.
+    """
     if not is_compiled:
         monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
     rng, n = np.random.default_rng(1), 60
@@ -327,7 +337,7 @@ def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
 
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed):
-    """And at no other time; checked from the recorded L, ‖Cν‖ and M."""
+    """M shrinks only in this case, as the recorded L, ‖Cν‖ and M show."""
     rho = 3.0
     outer = outer_loop(projected(dual(seed)), M=1e3, eta=1e9, rho=rho).outer
 
@@ -344,7 +354,9 @@ def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed)
 def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(
     outer_loop, dual
 ):
-    """By the growth where M is cut, and by 10 where it stalls."""
+    """The penalty is multiplied by `rho_growth` when M is reduced, and by 10 when the
+    loop stalls.
+    """
     outer = outer_loop(projected(dual(271828)), M=1e3, eta=1e9, growth=4.0).outer
     factors = [later.rho / o.rho for o, later in pairwise(outer[1:])]
     cut = [later.M < o.M for o, later in pairwise(outer[1:])]
@@ -418,7 +430,9 @@ def test_lanczos_ends_early_where_all_ritz_values_are_of_one_size():
 
 
 def test_the_power_method_stops_at_its_tolerance():
-    """Eigenvalues 1 and 1/2: the error falls by 4 each product, to 10⁻⁴ in a few."""
+    """For eigenvalues 1 and 1/2, each product reduces the error by a factor of 4, to
+    10⁻⁴ in a few products.
+    """
     products = []
 
     def H(v):
@@ -452,7 +466,7 @@ def test_scaling_the_rows_changes_no_step(dual, exponent):
     ids=["40", "85 more"],
 )
 def test_random_planted_problems_are_solved_and_certified(manufactured, shape, seeds):
-    """Every answer has small residuals and is the planted one."""
+    """Every answer has small residuals and equals the planted solution."""
     for seed in seeds:
         qp, planted_point = manufactured(shape, seed=seed, dense=seed % 2 == 0)
         s = SMALBE().prepare(qp, 1e-9)()
@@ -490,8 +504,9 @@ def test_every_combination_of_rules_solves(
     ],
 )  # fmt: skip
 def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
-    """PERMON's are measured on these QPs, at its best setting, to 1e-6 and 1e-8; the
-    stopping test is recomputed here from the QP."""
+    """The products of PERMON were measured on these QPs with its best setting at 1e-6
+    and 1e-8; the stopping test is recomputed from the QP.
+    """
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=Nr, Nh=Nh, step=step))
     qp = family.build("dual", params, reference_solution).qp
@@ -526,7 +541,7 @@ def test_few_products_with_bounds_alone():
     ids=["20", "40 more"],
 )
 def test_a_claim_keeps_half_of_what_the_harness_allows(dual, tol, seeds):
-    """The residuals of the QP as given decide, not those of the projected problem."""
+    """The residuals of the original QP decide, not those of the projected problem."""
     for seed in seeds:
         qp = dual(seed)
         for name in ("smalbe", "smalbe-permon"):
@@ -537,7 +552,7 @@ def test_a_claim_keeps_half_of_what_the_harness_allows(dual, tol, seeds):
 
 
 def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
-    """On free components what is left of Fx − d + Gᵀy is orthogonal to the rows."""
+    """On free components, Fx − d + Gᵀy is orthogonal to the rows."""
     qp = dual(271828)
     s = SMALBE().prepare(qp, 1e-3)()
     free = s.x > qp.lb
@@ -549,7 +564,7 @@ def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
 
 
 def test_an_inner_run_ends_at_eta_at_the_latest(outer_loop, dual):
-    """With M so large that only η stops it."""
+    """M is so large that only η stops the inner run."""
     problem = projected(dual(271828))
     loose, tight = (
         outer_loop(problem, M=1e9, eta=eta).outer[0].trace for eta in (0.5, 1e-4)
@@ -595,7 +610,9 @@ def test_what_once_failed(qp, name):
 
 
 def test_two_distinct_eigenvalues_are_known_after_two_lanczos_steps():
-    """The large one must not be left to the tail of the model."""
+    """The large eigenvalue must be among the Ritz values and not in the tail of the
+    model.
+    """
     rng = np.random.default_rng(28)
     v, A, x = rng.standard_normal(8), rng.standard_normal((1, 8)), rng.random(8)
     P = np.eye(8) + 1e6 * np.outer(v, v) / (v @ v)
@@ -607,7 +624,7 @@ def test_two_distinct_eigenvalues_are_known_after_two_lanczos_steps():
 
 @pytest.mark.parametrize("name", INHOUSE)
 def test_a_large_box_with_a_far_feasible_point_is_not_called_infeasible(name):
-    """(0, 10⁷) meets x₁ + 10⁻⁷x₂ = 1, x₁ ≤ ½."""
+    """(0, 10⁷) satisfies x₁ + 10⁻⁷x₂ = 1, x₁ ≤ ½."""
     qp = mixed(np.eye(2), [0, 0], 0.0, [0.5, 2e7], [[1, 1e-7]], [1])
 
     assert SOLVERS[name].prepare(qp, 1e-8)().status is not Status.INFEASIBLE
@@ -618,7 +635,9 @@ def test_a_large_box_with_a_far_feasible_point_is_not_called_infeasible(name):
 def test_a_box_whose_only_feasible_point_is_a_corner_is_not_called_infeasible(
     rows, seed
 ):
-    """Even where the search is cut short: what is left of Ax − b is then rounding."""
+    """This holds even if the search is cut short, because Ax − b then consists of
+    rounding errors.
+    """
     rng = np.random.default_rng(seed)
     A, lb = rng.uniform(0.1, 1, (rows, 6)), rng.standard_normal(6)
     W = rng.standard_normal((6, 6))

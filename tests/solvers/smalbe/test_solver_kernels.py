@@ -1,4 +1,4 @@
-"""Vector operations of MPRGP by hand."""
+"""Vector operations of MPRGP, checked by hand."""
 
 import numpy as np
 
@@ -6,7 +6,9 @@ from tests.support.textbook import kernels
 
 
 def test_lengths_by_hand():
-    """Along p from x: the cost's minimum, and the first bound met; −p moves up."""
+    """The lengths from x along −p lead to the minimum of the cost and to the first
+    bound.
+    """
     x, p = np.array([1.0, 0.5]), np.array([2.0, -1.0])
     bounds = np.zeros(2), np.full(2, 2.0)
 

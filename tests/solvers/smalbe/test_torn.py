@@ -1,4 +1,6 @@
-"""SMALBE on duals of torn bodies: counts that do not grow, answers of the whole."""
+"""SMALBE on duals of decomposed bodies: bounded numbers of products, and the solution
+of the undivided problem.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,9 @@ def torn(Nr, **keys):
 
 @pytest.fixture(scope="module", params=[1e-6, 1e-8])
 def answers(request):
-    """Return answers on three meshes, H/h = 8, 500 to 30 000 degrees of freedom."""
+    """Return answers on three meshes with H/h = 8 and 500 to 30 000 degrees
+    of freedom.
+    """
     qps = [torn(Nr).qp for Nr in (8, 16, 32)]
     return request.param, [(qp, SMALBE().prepare(qp, request.param)()) for qp in qps]
 
@@ -77,7 +81,9 @@ def test_the_displacement_is_that_of_the_whole(glue):
     ],
 )
 def test_calls_of_python_take_the_same_steps(name, tol, monkeypatch):
-    """Ranks fill the table of operations by calls of Python: here one process does."""
+    """On ranks, the table of operations contains Python functions; here it does so in
+    one process.
+    """
     qp = build(f"{name}/dual").qp
     compiled = SMALBE().prepare(qp, tol)()
     monkeypatch.setattr(SparseRows, "on_one_process", False)
@@ -113,7 +119,7 @@ def test_a_sequence_is_warm():
 @pytest.mark.parametrize("basis", ["standard", "dual"])
 @pytest.mark.parametrize("parts", [4, 20])
 def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
-    """With sparse rows, as on ranks, one eigenvalue of G_F G_Fᵀ is rounding."""
+    """With sparse rows, as on ranks, one eigenvalue of G_F G_Fᵀ is a rounding error."""
     monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
     qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
     assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
@@ -124,7 +130,9 @@ def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypa
 
 @pytest.mark.parametrize(("jump", "tol"), [(1e8, 1e-9), (1e10, 1e-14)])
 def test_a_solve_that_rounding_stops_ends(jump, tol):
-    """Moduli far apart: CG finds no direction any more that is conjugate to others."""
+    """The moduli are far apart, and CG cannot find further directions that are
+    conjugate to earlier ones.
+    """
     given = {"n": 6, "pattern": "checkerboard", "jump": jump}
     plate = PROBLEMS["plate"]
     qp = plate.build("dual", plate.complete(given), reference_solution).qp
@@ -139,7 +147,9 @@ def test_a_solve_that_rounding_stops_ends(jump, tol):
 @pytest.mark.parametrize("jump", [1e2, 1e4, 1e6, 1e8])
 @pytest.mark.parametrize("tol", [1e-8, 1e-10])
 def test_rounding_along_directions_that_were_taken_is_taken_out(jump, tol):
-    """It took 209 products and more: as many as directions are kept, then anew."""
+    """Without this correction, the solve took at least 209 products: as many as
+    directions are stored, and then further ones.
+    """
     plate = PROBLEMS["plate"]
     given = plate.complete({"pattern": "checkerboard", "jump": jump})
     qp = plate.build("dual", given, reference_solution).qp

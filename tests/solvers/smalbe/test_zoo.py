@@ -1,6 +1,6 @@
-"""SMALBE beside the rules of PERMON and ESPRESO on problems it was not made for.
+"""SMALBE compared with the rules of PERMON and ESPRESO on problems of other fields.
 
-Products are all with P, those of the norm included, to points that are verified.
+All products with P up to a verified point are counted, including those for the norm.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ CASES = [(family, given) for family, several in NAMED.items() for given in sever
 
 
 def products(name, qp, tol):
-    """Return the products to a verified point, inf where it is none."""
+    """Return the number of products up to a verified point, or inf if there is none."""
     s = SOLVERS[name].prepare(qp, tol)()
     if not kkt_residuals(qp, s).worst <= VERIFIED_FACTOR * tol:
         return np.inf
@@ -38,7 +38,7 @@ def products(name, qp, tol):
 
 
 def ratio(qp, tol):
-    """Divide the products of SMALBE by the better preset's."""
+    """Return the products of SMALBE divided by those of the better preset."""
     return products("smalbe", qp, tol) / min(products(p, qp, tol) for p in PRESETS)
 
 
@@ -88,7 +88,7 @@ def laplacian(seed):
 
 
 def dense(seed):
-    """Draw a dense P whose spectrum falls, or is flat but for some outliers."""
+    """Draw a dense P whose spectrum decays, or is flat except for some outliers."""
     rng = np.random.default_rng(seed)
     n, kind = int(rng.integers(10, 200)), rng.integers(3)
     Q = np.linalg.qr(rng.standard_normal((n, n)))[0]
@@ -132,7 +132,9 @@ def test_bodies_of_all_kinds_are_solved():
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 @pytest.mark.parametrize("seed", [55, 79, 88, 94, 172, 202, 274])
 def test_the_residual_is_within_the_tolerance_not_only_within_what_counts(seed, tol):
-    """By ‖g^P‖ alone it was 1.0 to 4.6 times the tolerance on these."""
+    """With a test of ‖g^P‖ alone, the residual was 1.0 to 4.6 times the tolerance on
+    these problems.
+    """
     qp = generated_case(seed).qp
 
     assert kkt_residuals(qp, SOLVERS["smalbe"].prepare(qp, tol)()).worst <= tol
@@ -153,15 +155,18 @@ def test_the_residual_of_a_dual_with_bounds_alone_is_within_the_tolerance(step, 
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 @pytest.mark.parametrize("seed", [76, 106])
 def test_where_rounding_undoes_conjugacy_it_needs_no_more_than_the_presets(seed, tol):
-    """Bodies of which nothing is known but stiffnesses six orders apart: n = 148, 125.
+    """The bodies have moduli six orders of magnitude apart; n = 148, 125.
 
-    With directions conjugate to the last one alone, 147 and 111 products for 72 and 69.
+    With directions conjugate to the last one only, the solves took 147 and 111 products
+    instead of 72 and 69.
     """
     assert ratio(generated_case(seed).qp, tol) <= 1.2
 
 
 def test_rows_that_no_free_component_sees_get_no_multiplier_from_rounding():
-    """Rows of a tower on flat faces have a singular value of 1e-14 on what is free."""
+    """On the free components, the rows of a tower on flat faces have a singular value
+    of 1e-14.
+    """
     qp = generated_case(0).qp
     s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
 
@@ -170,14 +175,18 @@ def test_rows_that_no_free_component_sees_get_no_multiplier_from_rounding():
 
 
 def test_where_the_rows_are_met_a_stall_makes_the_gradient_stricter():
-    """A larger penalty made noise of 1e-13 in the rows a gradient: 1058 products."""
+    """With a larger penalty instead, rounding errors of 1e-13 in the rows enter the
+    gradient, and the solve took 1058 products.
+    """
     qp = generated_case(228).qp
 
     assert products("smalbe", qp, 1e-8) <= 200
 
 
 def test_a_model_that_leaves_the_chopped_gradient_gives_way():
-    """Six Lanczos steps yield a poor model B; continued steps took 596 products."""
+    """Six Lanczos steps yield a poor model B; if its steps are continued, the solve
+    takes 596 products.
+    """
     qp = generated_case(51).qp
     s = replace(SOLVERS["smalbe"], lanczos_steps=6).prepare(qp, 1e-6)()
 
@@ -190,7 +199,7 @@ def test_a_model_that_leaves_the_chopped_gradient_gives_way():
     [(1000, 3177), pytest.param(10_000, 41_801, marks=pytest.mark.slow)],
 )
 def test_a_long_string_takes_no_more_than_permon_itself(n, most):
-    """At its best for that length: with standard or with projected CG expansion."""
+    """PERMON uses the better of standard and projected CG expansion for this length."""
     family = PROBLEMS["string"]
     case = family.build("primal", family.complete({"n": n}), reference_solution)
 
