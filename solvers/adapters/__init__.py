@@ -1,1 +1,1 @@
-"""Adapters from solver libraries to our protocol, one file for each library."""
+"""Adapters from solver libraries to the `Solver` protocol, one file per library."""

@@ -42,18 +42,18 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class Clarabel:
-    """https://clarabel.org, one thread.
+    """Clarabel (https://clarabel.org), run on one thread.
 
-    Clarabel divides its residuals by max(1, size of their terms), and accepts a gap
-    below tol, absolute *or* relative to max(1, |objective|). For a small objective
-    these tests are absolute, and tol = 1e-6 loses five digits at an energy of 1e-5.
-    With the objective scaled to ‖q‖∞ = 1e4, each test is relative if x is of order one,
-    as in every QP of this project, and tol is passed unchanged. (The steps hardly
-    change, since Clarabel equilibrates the objective.) In units in which x is tiny,
-    Clarabel may stop early.
+    Clarabel divides each residual by max(1, size of its terms). It accepts a duality
+    gap below tol, either absolute or relative to max(1, |objective|). If the objective
+    is small, these tests are absolute: at an energy of 1e-5, tol = 1e-6 would leave
+    five digits fewer. The adapter therefore scales the objective to ‖q‖∞ = 1e4 and
+    passes tol unchanged. Each test is then relative if x is of order one, as in every
+    QP of this project. The scaling hardly changes the iterations, because Clarabel
+    equilibrates the objective. In units in which x is tiny, Clarabel may stop early.
 
-    Equalities go to the zero cone; inequalities and finite bounds, one row each, to the
-    nonnegative cone.
+    Equality rows use the zero cone. Inequality rows and finite bounds, one row each,
+    use the nonnegative cone.
     """
 
     max_iter: int = 200
@@ -66,8 +66,10 @@ class Clarabel:
         package="clarabel",
         linear_solver="QDLDL or faer (sparse LDLᵀ), chosen by Clarabel; one "
         "factorisation per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; no warm starts",
+        phases="the preparation equilibrates the QP and analyses the sparsity pattern; "
+        "the solve performs all factorisations",
+        sequence="an update of the vectors keeps the analysis; warm starts are not "
+        "supported",
     )
 
     def __post_init__(self) -> None:

@@ -26,12 +26,13 @@ from mortarbench.solvers.common.conversion import (
 
 @dataclass(frozen=True)
 class CVXOPT:
-    """https://cvxopt.org, dense if P is dense, else sparse.
+    """CVXOPT (https://cvxopt.org), with dense matrices if P is dense, else sparse ones.
 
-    CVXOPT divides the 2-norms of residuals by max(1, ‖q‖) and max(1, norm of the
-    right-hand sides), and tests the gap in absolute terms (abstol) or relative to the
-    objective (reltol). So feastol = reltol = tol, abstol is negligible, and the
-    objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
+    CVXOPT divides the 2-norm of the dual residual by max(1, ‖q‖), and those of the
+    primal residuals by max(1, norm of the right-hand sides). It accepts a gap that is
+    below abstol, or below reltol relative to the objective. The adapter sets feastol =
+    reltol = tol and a negligible abstol. It scales the objective to ‖q‖∞ = 1e4, where
+    the 1 in max(1, ‖q‖) has no effect.
     """
 
     max_iter: int = 200
@@ -42,15 +43,18 @@ class CVXOPT:
         method="interior point (path following)",
         licence="GPL-3.0-or-later",
         package="cvxopt",
-        linear_solver="CHOLMOD (sparse) or LAPACK (dense), bundled, one factorisation "
+        linear_solver="bundled CHOLMOD (sparse) or LAPACK (dense), one factorisation "
         "per iteration",
-        phases="preparing converts only; solving does everything else",
+        phases="the preparation only converts the data; the solve includes all other "
+        "work",
         limits=(
-            "Declines dependent equality rows, which end in an error or as 'unknown' "
-            "(conformance, shape 'redundant').",
-            "Bodies supported by equality rows only (an exactly singular P) end as "
-            "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
-            "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
+            "QPs with linearly dependent equality rows are declined. CVXOPT ends on "
+            "them with an error or the status 'unknown' (conformance, shape "
+            "'redundant').",
+            "If bodies are supported by equality rows only, P is exactly singular. "
+            "With its default KKT solver, 'chol2', CVXOPT then ends with the status "
+            "'unknown' after 2 iterations. With 'chol' or 'ldl' it solves the same QP "
+            "(docs/weaknesses.md).",
         ),
     )
 

@@ -27,7 +27,7 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: arguments for backends; backends that are not listed run with cvxpy's defaults
+#: arguments for each backend; a backend that is not listed uses cvxpy's defaults
 CALLS: Mapping[str, Call] = {
     "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
@@ -53,8 +53,8 @@ CALLS: Mapping[str, Call] = {
 }
 
 SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends that accept discs and cones
-CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
-LINEAR = "takes linear programs only"
+CONIC = "cvxpy converts the QP to a cone program, which loses half of the digits"
+LINEAR = "accepts linear programs only"
 DECLINED_BACKENDS: Mapping[str, str] = {
     "CVXOPT": CONIC,
     "ECOS": CONIC,
@@ -76,14 +76,19 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class CVXPY:
-    """One backend of cvxpy; compilation is timed as preparing, its setup as solving.
+    """One backend of cvxpy (https://www.cvxpy.org).
 
-    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
-    absolute and a relative tolerance, it is the relative one. A backend not listed
-    there runs with cvxpy's defaults. As in the native adapters, the objective is scaled
-    to ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (HIGHS, DAQP). Backends to
-    which cvxpy passes a cone program are declined, and so is ProxQP, because cvxpy
-    cannot enable its gap test.
+    The compilation of the model is timed as preparation, and the setup of the backend
+    as part of the solve.
+
+    The tolerance is passed under the keywords of the backend (`CALLS`). If a stopping
+    test adds an absolute and a relative tolerance, only the relative one is set to tol.
+    A backend that `CALLS` does not list runs with cvxpy's defaults. As in the native
+    adapters, the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the backend's test is
+    absolute (HIGHS, DAQP).
+
+    Every backend to which cvxpy passes a cone program is declined. ProxQP is also
+    declined, because cvxpy cannot enable its test of the duality gap.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME
@@ -94,14 +99,15 @@ class CVXPY:
         licence="Apache-2.0; backends have their own licences",
         package="cvxpy",
         linear_solver="the backend's",
-        phases="preparing compiles the model to the backend's data; solving is the "
-        "backend's setup and solve",
+        phases="the preparation compiles the model to the data of the backend; the "
+        "solve includes the setup of the backend",
         limits=(
-            "CVXOPT and ECOS are declined: they would receive a cone program, which "
-            "costs half of the digits (dual residuals of 1e-5 at tol 1e-6, by the "
-            "conformance suite).",
-            "PROXQP is declined: without its gap test, a claimed solution has a "
-            "complementarity of 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
+            "CVXOPT and ECOS are declined, because cvxpy passes them a cone program, "
+            "which loses half of the digits (dual residuals of 1e-5 at tol 1e-6 in "
+            "the conformance suite).",
+            "PROXQP is declined, because cvxpy cannot enable its test of the duality "
+            "gap. Without this test, PROXQP claims a solution whose complementarity "
+            "is 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
         ),
     )
 
@@ -163,9 +169,9 @@ def _files() -> dict[str, Path]:
 def _model(
     cvxpy: Any, qp: QP, form: ConicForm, scale: float
 ) -> tuple[Any, Any, list[tuple[NDArray[np.int64], Any]]]:
-    """Return the problem, its variable, and the constraints with their row indices."""
+    """Return the cvxpy problem, its variable, and (row indices, constraint) pairs."""
     x, rows = cvxpy.Variable(qp.q.size), form.rows.tocsr()
-    # assume_PSD: otherwise cvxpy computes eigenvalues of P to prove convexity
+    # without assume_PSD, cvxpy would compute eigenvalues of P to prove convexity
     energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
     objective = cvxpy.Minimize(0.5 * energy + (qp.q * scale) @ x)
     equal, less = np.split(np.arange(form.linear), [form.equalities])
@@ -174,7 +180,7 @@ def _model(
         constraints.append((equal, rows[equal] @ x == form.rhs[equal]))
     if less.size:
         constraints.append((less, rows[less] @ x <= form.rhs[less]))
-    for size in np.unique(form.cones):  # one cvxpy constraint for all cones of a size
+    for size in np.unique(form.cones):  # one constraint for all cones of equal size
         heads = form.heads[form.cones == size]
         tails = (heads[:, None] + np.arange(1, size)).ravel()
         t, w = (form.rhs[place] - rows[place] @ x for place in (heads, tails))

@@ -43,22 +43,23 @@ MESSAGES = {
 INFINITE = 1e30  #: DAQP's value for an absent bound
 EQUALITY = 5  #: DAQP's flag for an equality
 TOL_FACTOR = 1e-3  #: tolerances passed to DAQP, relative to tol
-#: smallest tolerance passed to DAQP: with 1e-12 its proximal iterations stop early or
+#: smallest tolerance passed to DAQP; with 1e-12, its proximal iterations stop early or
 #: cycle
 MIN_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True)
 class DAQP:
-    """https://darnstrom.github.io/daqp, dense.
+    """DAQP (https://darnstrom.github.io/daqp), with dense matrices.
 
-    DAQP ends with an active set for which the KKT conditions hold to rounding;
-    primal_tol and dual_tol only decide which violations and multiplier signs count.
-    Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are set to
-    tol/1000, but at least 1e-11. Larger values would not save steps.
+    DAQP ends with an active set for which the KKT conditions are satisfied up to
+    rounding. The parameters primal_tol and dual_tol are the absolute thresholds beyond
+    which a constraint violation or the wrong sign of a multiplier changes the active
+    set. The objective is therefore scaled to ‖q‖∞ = 1, and both parameters are set to
+    max(tol/1000, 1e-11). Larger values would not save iterations.
 
-    If the Cholesky factorisation of P breaks down, DAQP runs its own proximal-point
-    iterations (eps_prox < 0: automatic).
+    If the Cholesky factorisation of P breaks down, DAQP uses its own proximal-point
+    iterations. A negative eps_prox selects them automatically.
     """
 
     max_iter: int = 100_000
@@ -68,14 +69,15 @@ class DAQP:
         method="dual active set",
         licence="MIT",
         package="daqp",
-        linear_solver="its own dense LDLᵀ, updated as rows become active",
-        phases="preparing converts to dense matrices and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factors and the active set",
+        linear_solver="its own dense LDLᵀ, updated when the active set changes",
+        phases="the preparation converts the matrices to dense ones and factorises "
+        "them; the solve iterates",
+        sequence="an update of the vectors keeps the factors and the active set",
         limits=(
-            "Takes over 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
-            "(suites/fleet.toml).",
-            "With tolerances of 1e-12 its proximal iterations end with residuals of "
-            "7e-7 on singular QPs, so its tolerances are at least 1e-11.",
+            "It takes more than 20 s on beam-ring/Nr=12/Nh=6/primal, which has 4420 "
+            "unknowns (suites/fleet.toml).",
+            "If its tolerances are 1e-12, its proximal iterations end on singular QPs "
+            "with residuals of 7e-7. The adapter therefore passes at least 1e-11.",
         ),
     )
 
@@ -138,7 +140,7 @@ class DAQP:
 
 
 def _sides(qp: QP) -> tuple[Vector, Vector]:
-    """Return lower and upper limits, stacked: bounds, equalities, inequalities."""
+    """Return the lower and upper limits of variables, equalities and inequalities."""
     no_low = np.full(qp.h.size, -INFINITE)
     low = np.concatenate([np.maximum(qp.lb, -INFINITE), qp.b, no_low])
     return low, np.concatenate([np.minimum(qp.ub, INFINITE), qp.b, qp.h])

@@ -33,20 +33,24 @@ CLAIMS = {
 PRIMAL = 1  #: exit flag for which ECOS returns a certificate
 #: eigenvalues of P below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-14
-#: Units of the corrections, relative to ‖x‖∞, tried in turn, four per decade. Which of
-#: them helps depends on the QP: ECOS breaks down near the optimum, at a residual that
-#: varies by two orders of magnitude between neighbouring units.
+#: Units of the corrections, relative to ‖x‖∞, in the order in which they are tried
+#: (four per decade). ECOS breaks down near the optimum, at a residual that differs by
+#: two orders of magnitude between neighbouring units, so the unit that helps
+#: depends on the QP.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
-#: a point is reported as solved if its KKT residuals are at most this times tol
+#: a point is claimed as a solution if its KKT residuals are at most this factor times
+#: tol
 CLAIM_FACTOR = 10.0
 
 
 @dataclass(frozen=True)
 class ECOS:
-    """https://github.com/embotech/ecos.
+    """ECOS (https://github.com/embotech/ecos).
 
-    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues of P. A gap
-    of tol permits errors of √tol in x, so ECOS is called again for corrections of x.
+    The quadratic term ½xᵀPx = ½‖Lᵀx‖² is expressed by a second-order cone, where the
+    factor L is computed from the eigenvalues and eigenvectors of P. A duality gap of
+    tol permits errors of √tol in x, so the adapter calls ECOS repeatedly to compute
+    corrections of x.
     """
 
     max_iter: int = 200
@@ -57,9 +61,10 @@ class ECOS:
         method="interior point",
         licence="GPL-3.0-only",
         package="ecos",
-        linear_solver="sparse LDLᵀ, bundled, one factorisation per iteration",
-        phases="preparing computes eigenvalues",
-        limits=("Fails below tol 1e-8.",),
+        linear_solver="bundled sparse LDLᵀ, one factorisation per iteration",
+        phases="the preparation computes the eigenvalues and eigenvectors of P; the "
+        "solve includes all other work",
+        limits=("It fails at tolerances below 1e-8.",),
     )
 
     def __post_init__(self) -> None:
@@ -84,7 +89,7 @@ class ECOS:
         root = (vectors * roots).T / np.sqrt(energy)
 
         def correct(x: Vector, sigma: float) -> tuple[dict[str, Any], Vector, Vector]:
-            """Solve for e; return ECOS's result, x + σe and multipliers of rows."""
+            """Compute a correction e; return ECOS's result, x + σe and multipliers."""
             factor = energy * (sigma / size) ** 2
             cost = (P @ x + qp.q) * sigma / factor
             answer = _solve(
@@ -142,7 +147,8 @@ def _solve(
 ) -> dict[str, Any]:
     """Minimise ½‖root·e‖² + costᵀe with ECOS, subject to rhs − Re in the cones.
 
-    ½‖root·e‖² ≤ t is the second-order cone  ‖(√2·root·e, t − 1)‖ ≤ t + 1.
+    The constraint ½‖root·e‖² ≤ t is equivalent to the second-order cone
+    ‖(√2·root·e, t − 1)‖ ≤ t + 1.
     """
     m, n = form.equalities, cost.size
     t = csc_matrix(([-1.0, -1.0], ([0, 1], [0, 0])), shape=(2, 1))

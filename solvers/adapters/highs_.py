@@ -1,4 +1,4 @@
-"""HiGHS, an active-set and an interior-point method for QPs.
+"""HiGHS, with an active-set and an interior-point method for QPs.
 
 Reference: Q. Huangfu, J. A. J. Hall, Parallelizing the dual revised simplex method,
 Math. Program. Comput. 10 (2018) 119-142; its QP solvers: https://highs.dev.
@@ -38,18 +38,24 @@ MIN_ENTRY = 1e-12  #: smallest value of small_matrix_value that HiGHS accepts
 
 @dataclass(frozen=True)
 class HiGHS:
-    """https://highs.dev, one thread: active set (qpasm) or interior point (hipo).
+    """HiGHS (https://highs.dev): active set (qpasm) or interior point (hipo).
 
-    HiGHS tests violations and multiplier signs in absolute terms. So the objective is
-    scaled to ‖q‖∞ = 1, and all tolerances are set to tol/100, but at least 1e-10, the
-    smallest value that HiGHS accepts. An active-set method needs few additional steps
-    for it.
+    HiGHS runs on one thread.
 
-    The adapter works around three properties of HiGHS. On QPs with bounds only, qpasm
-    claims an optimum after 0 iterations, so a free row is added. HiGHS adds
-    qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which leaves
-    residuals of 1e-6 on a singular QP of order one; it is set to 0. HiGHS drops entries
-    below small_matrix_value (default 1e-9), which is lowered to 1e-12.
+    HiGHS applies absolute tolerances to constraint violations and to the signs of
+    multipliers. The objective is therefore scaled to ‖q‖∞ = 1, and all tolerances are
+    set to tol/100, but at least 1e-10, the smallest value that HiGHS accepts. This
+    reduction of the tolerance costs an active-set method only a few more iterations.
+
+    The adapter works around three properties of HiGHS:
+
+    - On QPs that have bounds but no rows, qpasm claims an optimum after 0 iterations.
+      The adapter adds a row without limits to such QPs.
+    - HiGHS adds qp_regularization_value (default 1e-7) to the diagonal of the Hessian,
+      which leaves residuals of 1e-6 on a singular QP of order one. The adapter sets
+      this value to 0.
+    - HiGHS drops entries below small_matrix_value (default 1e-9). The adapter lowers
+      this value to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -60,25 +66,26 @@ class HiGHS:
         method="active set (qpasm) or interior point (hipo)",
         licence="MIT; highspy-extras (hipo) Apache-2.0",
         package="highspy",
-        linear_solver="qpasm: LU of the active rows and a dense reduced Hessian; hipo: "
-        "its own multifrontal LDLᵀ",
-        phases="preparing passes the model; solving does everything else",
+        linear_solver="LU of the active rows and a dense reduced Hessian (qpasm), or "
+        "its own multifrontal LDLᵀ (hipo)",
+        phases="the preparation passes the model to HiGHS; the solve includes all "
+        "other work",
         limits=(
-            "qpasm takes longer than 20 s on the 4420 unknowns of "
-            "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
-            "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
-            "residuals of 5e-12.",
-            "qpasm ends with kSolveError where lengths of 1e-3 make the Hessian's "
-            "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
-            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
-            "number 260 (suites/friction.toml).",
-            "Without the free row, the result for a membrane of 225 nodes has a "
+            "qpasm takes more than 20 s on beam-ring/Nr=12/Nh=6/primal, which has 4420 "
+            "unknowns (suites/fleet.toml).",
+            "At tol 1e-9, hipo ends with the status kUnknown on "
+            "beam-ring/Nr=30/Nh=15/primal, although the residuals are 5e-12.",
+            "qpasm ends with kSolveError if lengths of 1e-3 make the entries of the "
+            "Hessian 1e6 times larger (tests/solvers/test_solvers.py). It also ends "
+            "with kSolveError on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, "
+            "although the condition number of F is 260 (suites/friction.toml).",
+            "Without the additional row, the result for a membrane of 225 nodes has a "
             "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
             "400 nodes touches').",
-            "Without highspy-extras HiGHS silently runs qpasm in place of hipo; the "
-            "adapter reports a failure.",
-            "qpasm stores a dense Hessian on the null space of active rows; a QP for "
-            "which it would not fit into memory is declined.",
+            "If highspy-extras is not installed, HiGHS silently runs qpasm instead of "
+            "hipo. In this case the adapter reports a failure.",
+            "qpasm stores a dense Hessian on the null space of the active rows. A QP "
+            "is declined if this Hessian would not fit into memory.",
         ),
     )
 
@@ -93,13 +100,13 @@ class HiGHS:
         import highspy
 
         if self.method == "hipo":
-            import highspy_extras  # noqa: F401  # without it HiGHS runs qpasm instead
+            import highspy_extras  # noqa: F401  # without this, HiGHS would run qpasm
 
         scale = objective_factor(qp, 1.0)
         solver = highspy.Highs()
         for name, value in self._options(tol).items():
             if solver.setOptionValue(name, value) != highspy.HighsStatus.kOk:
-                message = f"HiGHS refuses {name} = {value}"
+                message = f"HiGHS rejects the option {name} = {value}"
                 return lambda: Solution.without_point(qp, Status.FAILED, message)
         solver.passModel(_model(highspy, qp, scale))
 
@@ -154,7 +161,7 @@ class HiGHS:
 
 
 def _model(highspy: Any, qp: QP, scale: float) -> Any:
-    """Return `qp` as a HighsModel, with one free row if `qp` has no rows."""
+    """Return `qp` as a HighsModel; add a row without limits if `qp` has no rows."""
     n = qp.q.size
     rows = csc(vstack([csc(qp.A), csc(qp.G)]))
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf)])

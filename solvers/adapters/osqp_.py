@@ -28,7 +28,7 @@ PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status for which OSQP returns a certificat
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
     "OSQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    # iteration limit, but within 10·tol
+    # stopped at the iteration limit, with residuals within 10·tol
     "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,
     "OSQP_TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
@@ -38,20 +38,20 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class OSQP:
-    """https://osqp.org, with its built-in algebra (QDLDL), one thread.
+    """OSQP (https://osqp.org), with its built-in algebra (QDLDL), on one thread.
 
-    OSQP stops when the max norms of the primal and dual residuals and the duality gap
-    are below eps_abs + eps_rel·(their largest term). With a negligible eps_abs, this is
-    the relative test of the harness, so eps_rel = tol. It is evaluated every 25
-    iterations. Bounds become rows of the identity, one per bounded variable.
+    OSQP stops when the duality gap and the max norms of the primal and dual residuals
+    are below eps_abs + eps_rel·(largest term of each). With a negligible eps_abs, this
+    is the relative test of the harness, so eps_rel = tol. OSQP evaluates the test every
+    25 iterations. Bounds become rows of the identity, one per bounded variable.
 
-    If the dual residual is below 1e-10 (absolute) before polishing, OSQP accepts any
-    dual residual after it. With polishing, the objective is therefore scaled to
-    ‖q‖∞ = 1e4.
+    If the absolute dual residual is below 1e-10 before polishing, OSQP accepts any dual
+    residual after polishing. If polishing is enabled, the objective is therefore scaled
+    to ‖q‖∞ = 1e4.
     """
 
     max_iter: int = 1_000_000
-    polishing: bool = False  #: solve again with the active rows as equalities
+    polishing: bool = False  #: finally solve again with the active rows as equalities
 
     about: ClassVar[About] = About(
         title="OSQP",
@@ -59,13 +59,15 @@ class OSQP:
         licence="Apache-2.0",
         package="osqp",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per change of ρ",
-        phases="preparing scales and factorises; solving iterates and polishes",
-        sequence="`update` of vectors keeps the factors; starts from the last point",
+        phases="the preparation scales and factorises the matrices; the solve iterates "
+        "and polishes",
+        sequence="an update of the vectors keeps the factors, and the iteration starts "
+        "from the last point",
         limits=(
-            "Polishing made residuals worse on QPs with a small objective: without "
-            "the scaling, a dual residual of 3e-3 at a tolerance of 1e-6 "
-            "(tests/solvers/test_solvers.py, energies of 1e-6), and a gap of 3e-7 at a "
-            "tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
+            "Without the scaling, polishing increased the residuals of QPs with a "
+            "small objective: to a dual residual of 3e-3 at a tolerance of 1e-6 "
+            "(tests/solvers/test_solvers.py, energies of 1e-6), and to a gap of 3e-7 "
+            "at a tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
         ),
     )
 

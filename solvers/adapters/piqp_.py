@@ -36,11 +36,12 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class PIQP:
-    """https://predict-epfl.github.io/piqp.
+    """PIQP (https://predict-epfl.github.io/piqp).
 
-    PIQP stops when the max norms of the residuals and the duality gap are below eps_abs
-    *or* below eps_rel·max(1, their largest term). So eps_abs is negligible, eps_rel =
-    tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
+    PIQP stops when the duality gap and the max norm of each residual are below eps_abs
+    *or* below eps_rel·max(1, largest term). The adapter sets eps_rel = tol and a
+    negligible eps_abs. It scales the objective to ‖q‖∞ = 1e4, where the 1 in the
+    maximum has no effect.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -51,9 +52,12 @@ class PIQP:
         method="interior point (proximal)",
         licence="BSD-2-Clause",
         package="piqp",
-        linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; no warm starts",
+        linear_solver="its own Cholesky (dense) or LDLᵀ (sparse), one factorisation "
+        "per iteration",
+        phases="the preparation equilibrates the QP and analyses the sparsity pattern; "
+        "the solve performs all factorisations",
+        sequence="an update of the vectors keeps the analysis; warm starts are not "
+        "supported",
     )
 
     def __post_init__(self) -> None:

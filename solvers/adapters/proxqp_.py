@@ -41,19 +41,23 @@ CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
 
 @dataclass(frozen=True)
 class ProxQP:
-    """https://simple-robotics.github.io/proxsuite.
+    """ProxQP (https://simple-robotics.github.io/proxsuite).
 
     ProxQP stops when the max norms of the primal and dual residuals are below
-    eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The test of the duality gap is off by default and enabled here. ProxQP does
-    not test the signs of multipliers. Its default start, which treats every row as an
-    equality, often passes all tests with negative multipliers (primal forms, tol ≥
-    1e-4). The adapter starts from zero: negative multipliers become rare, and fewer
-    iterations are needed.
+    eps_abs + eps_rel·(largest term of each). The adapter sets eps_rel = tol and a
+    negligible eps_abs. It also enables the test of the duality gap, which is off by
+    default.
 
-    Certificates of infeasibility are tested in absolute terms: at the default 1e-4,
-    feasible QPs with multipliers of that size are claimed infeasible. At 1e-8 they are
-    not, but some infeasible QPs end at the iteration limit.
+    ProxQP does not test the signs of multipliers. Its default starting point is the
+    solution of the QP without inequalities. From this point, ProxQP often ends with
+    negative multipliers that pass all its tests (primal forms, tol ≥ 1e-4). The adapter
+    starts from zero instead, so that negative multipliers are rare and fewer iterations
+    are needed.
+
+    ProxQP tests certificates of infeasibility with an absolute tolerance. At the
+    default of 1e-4, it claims that feasible QPs are infeasible if their multipliers
+    are of this size. The adapter sets 1e-8, which avoids these claims, but some
+    infeasible QPs then end at the iteration limit.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -64,18 +68,20 @@ class ProxQP:
         method="proximal augmented Lagrangian",
         licence="BSD-2-Clause",
         package="proxsuite",
-        linear_solver="its own LDLᵀ, dense or sparse, updated as rows become active",
-        phases="preparing equilibrates and, in the sparse backend, analyses; solving "
-        "factorises and iterates",
-        sequence="`update` of vectors keeps the equilibration; starts from the last "
-        "point",
+        linear_solver="its own LDLᵀ, dense or sparse, updated when the active set "
+        "changes",
+        phases="the preparation equilibrates the QP, and in the sparse backend also "
+        "analyses the sparsity pattern; the solve factorises and iterates",
+        sequence="an update of the vectors keeps the equilibration, and the iteration "
+        "starts from the last point",
         limits=(
-            "The sign of multipliers is not tested.",
-            "At tol 1e-3 it claims points with residuals of 1e-2 to 2e-2 on duals with "
-            "friction (greco/dual-bounds, beam-ring/steps=1/friction=tresca/bound=1e8/"
-            "dual); at 1e-6 and 1e-9 all are verified.",
-            "Has no time limit and does not release Python's GIL: only killing the "
-            "process ends it.",
+            "ProxQP does not test the signs of multipliers.",
+            "At tol 1e-3, ProxQP claims points with residuals of 1e-2 to 2e-2 as "
+            "solutions of duals with friction (greco/dual-bounds, "
+            "beam-ring/steps=1/friction=tresca/bound=1e8/dual). At 1e-6 and 1e-9, all "
+            "its claims on these QPs are verified.",
+            "ProxQP has no time limit and does not release Python's GIL, so a solve "
+            "can be ended only by killing its process.",
         ),
     )
 
@@ -147,7 +153,7 @@ class ProxQP:
             settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT
             solver.update(g=new.q, b=new.b, **form.sides(new))
 
-        # `solve` of the dense backend takes x, y and z, but no multipliers of bounds
+        # `solve` of the dense backend accepts x, y and z, but no multipliers of bounds
         takes_no_start = isinstance(form, _Dense) and form.has_box
         return Session(
             solve, update, None if takes_no_start else starts.append, tighten
@@ -155,7 +161,7 @@ class ProxQP:
 
 
 class _Dense:
-    """Dense backend: accepts bounds; their n multipliers follow those of G."""
+    """Dense backend, which accepts bounds; n multipliers of bounds follow z."""
 
     def __init__(self, qp: QP) -> None:
         self.qp, self.has_box = qp, bool(has_bound(qp).any())
@@ -181,7 +187,7 @@ class _Dense:
 
 
 class _Sparse:
-    """Sparse backend: bounds become rows of the identity."""
+    """Sparse backend, which receives bounds as rows of the identity."""
 
     def __init__(self, qp: QP) -> None:
         self.qp = qp

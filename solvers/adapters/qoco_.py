@@ -32,14 +32,16 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class QOCO:
-    """https://qoco-org.github.io/qoco.
+    """QOCO (https://qoco-org.github.io/qoco).
 
-    QOCO stops when the max norms of the residuals are below abstol + reltol·(their
-    largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
-    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
-    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
-    every relative residual is small, and QOCO reports success. A claim with ‖x‖∞ > 1e12
-    therefore counts as failed.
+    QOCO stops when the max norm of each residual is below abstol + reltol·(largest
+    term) and the gap is below abstol + reltol·max(1, |objective|). The adapter sets
+    reltol = tol and a negligible abstol. It scales the objective to ‖q‖∞ = 1e4, where
+    the 1 in the maximum has no effect.
+
+    QOCO does not compute certificates of infeasibility. On an unbounded QP its iterates
+    grow until every relative residual is small, and QOCO reports success. The adapter
+    therefore returns the status FAILED if ‖x‖∞ > 1e12.
     """
 
     max_iter: int = 200
@@ -51,12 +53,13 @@ class QOCO:
         licence="BSD-3-Clause",
         package="qoco",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
-        "accepts no starting point",
+        phases="the preparation equilibrates the QP and analyses the sparsity pattern; "
+        "the solve performs all factorisations",
+        sequence="an update of the vectors keeps the analysis; the Python module of "
+        "version 0.3.2 does not accept a starting point",
         limits=(
-            "No certificates of infeasibility (conformance check 'unbounded': claimed "
-            "solved with ‖x‖∞ = 1e16).",
+            "QOCO does not compute certificates of infeasibility. In the conformance "
+            "check 'unbounded' it claims a solution with ‖x‖∞ = 1e16.",
         ),
     )
 

@@ -36,11 +36,11 @@ INFINITE = 1e20  #: QPALM's value for an absent bound
 
 @dataclass(frozen=True)
 class QPALM:
-    """https://kul-optec.github.io/QPALM.
+    """QPALM (https://kul-optec.github.io/QPALM).
 
     QPALM stops when the max norms of the primal and dual residuals are below eps_abs +
-    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. QPALM
-    does not test the duality gap. Bounds become rows of the identity.
+    eps_rel·(largest term of each). The adapter sets eps_rel = tol and a negligible
+    eps_abs. QPALM does not test the duality gap. Bounds become rows of the identity.
     """
 
     max_iter: int = 10_000
@@ -50,12 +50,13 @@ class QPALM:
         method="proximal augmented Lagrangian with semismooth Newton steps",
         licence="LGPL-3.0-or-later",
         package="qpalm",
-        linear_solver="LADEL (sparse LDLᵀ, updated as rows become active)",
-        phases="preparing scales; solving does all factorisations",
-        sequence="`update` of vectors; starts from the last point",
+        linear_solver="LADEL (sparse LDLᵀ, updated when the active set changes)",
+        phases="the preparation scales the QP; the solve performs all factorisations",
+        sequence="the vectors are updated, and the iteration starts from the last "
+        "point",
         limits=(
-            "No duality-gap test: it may stop early if primal and dual residuals "
-            "are small and the gap is not.",
+            "QPALM does not test the duality gap, so it may stop early if the primal "
+            "and dual residuals are small but the gap is large.",
         ),
     )
 

@@ -35,7 +35,7 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-#: arguments for backends; backends that are not listed run with their defaults
+#: arguments for each backend; a backend that is not listed uses its own defaults
 CALLS: Mapping[str, Call] = {
     "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "cvxopt": Call(("feastol", "abstol", "reltol")),
@@ -47,7 +47,7 @@ CALLS: Mapping[str, Call] = {
             "qp_regularization_value": 0.0,
             "small_matrix_value": 1e-12,
             "threads": 1,
-            "qp_iteration_limit": 1_000_000,  # without a limit it may cycle forever
+            "qp_iteration_limit": 1_000_000,  # without a limit, HiGHS may cycle forever
         },
         size=1.0,
         tighter=1e-2,
@@ -81,7 +81,8 @@ DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadpro
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
-#: claims for the status message if there is no solution; the first match counts
+#: pairs (pattern, claim) for the status message of a run without a solution; the first
+#: pattern that matches decides
 STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
     (r"time", Status.TIME_LIMIT),
@@ -92,34 +93,39 @@ STATUS_PATTERNS = (
 
 @dataclass(frozen=True)
 class QPSolvers:
-    """One backend of qpsolvers; all work except the conversion is timed as solving.
+    """One backend of qpsolvers (https://github.com/qpsolvers/qpsolvers).
 
-    The tolerance is passed in the backend's own keywords (`CALLS`); if a test adds an
-    absolute and a relative tolerance, it is the relative one. A backend not listed
-    there runs with its defaults. As in the native adapters, the objective is scaled to
-    ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (highs, daqp). Backends that
-    accept both dense and sparse matrices receive dense ones if P is dense. qpsolvers
-    reports iterations only for some backends.
+    All work except the conversion is timed as part of the solve.
+
+    The tolerance is passed under the keywords of the backend (`CALLS`). If a stopping
+    test adds an absolute and a relative tolerance, only the relative one is set to tol.
+    A backend that `CALLS` does not list runs with its own defaults. As in the native
+    adapters, the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the backend's test is
+    absolute (highs, daqp).
+
+    A backend that accepts both dense and sparse matrices receives dense ones if P is
+    dense. qpsolvers reports the number of iterations only for some backends.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME
 
     about: ClassVar[About] = About(
         title="qpsolvers",
-        method="that of the backend NAME",
+        method="the method of the backend NAME",
         licence="LGPL-3.0-or-later; backends have their own licences",
         package="qpsolvers",
-        linear_solver="the backend's",
-        phases="preparing converts only; the backend's setup and factorisation count "
-        "as solving",
+        linear_solver="the linear solver of the backend",
+        phases="the preparation only converts the data; the setup and factorisation of "
+        "the backend are part of the solve",
         limits=(
-            "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs with its "
-            "own code, which claims that strictly convex ones are unbounded "
-            "(conformance, shape 'unconstrained'); such QPs are declined.",
-            "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
-            "ecos attains only half of the requested digits; use our adapter `ecos` "
-            "instead. pyqpmad, which is not installed, returns wrong multipliers for "
-            "fixed variables.",
+            "With the backends clarabel, qtqp and scs, qpsolvers solves unconstrained "
+            "QPs by its own code, which claims that strictly convex QPs are unbounded "
+            "(conformance, shape 'unconstrained'). The adapter declines such QPs.",
+            "The backends clarabel, cvxopt, daqp, highs, quadprog and sip do not "
+            "report the number of iterations.",
+            "The backend ecos attains only half of the requested digits; use the "
+            "solver `ecos` instead. The backend pyqpmad, which is not installed, "
+            "returns wrong multipliers for fixed variables.",
         ),
     )
 
@@ -133,7 +139,7 @@ class QPSolvers:
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:
-            return "needs a row or a bound: qpsolvers solves unconstrained QPs itself"
+            return "needs a row or a bound; qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
@@ -179,7 +185,7 @@ def _files() -> dict[str, Path]:
 def _arguments(
     qp: QP, convert: Callable[[Matrix], Matrix], scale: float
 ) -> dict[str, Any]:
-    """Return the arguments of qpsolvers.Problem; absent rows and bounds are omitted."""
+    """Return the arguments of qpsolvers.Problem, without absent rows and bounds."""
     arguments = {"P": convert(qp.P) * scale, "q": qp.q * scale}
     if qp.h.size:
         arguments |= {"G": convert(qp.G), "h": qp.h.copy()}
@@ -192,7 +198,7 @@ def _arguments(
 
 
 def _solution(qp: QP, result: Any, scale: float) -> Solution:
-    """Convert a qpsolvers.Solution, which has the sign convention of `Solution`."""
+    """Convert a qpsolvers.Solution, whose multipliers have the signs of `Solution`."""
     info = result.extras.get("info", result.extras)
     info = info if isinstance(info, Mapping) else _attributes(info)
     message = str(info.get("status", "found" if result.found else "not found"))
@@ -225,7 +231,7 @@ def _claim(message: str) -> Status:
 
 
 def _vector(v: Any, size: int, *, absent: bool = False) -> Vector:
-    """Return `v` as a vector; zeros if `absent`, NaN if it has another size."""
+    """Return `v` as a vector (size,): zeros if `absent`, NaN if `v` does not fit."""
     if absent:
         return np.zeros(size)
     if v is None or np.size(v) != size:

@@ -33,18 +33,19 @@ LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 
 @dataclass(frozen=True)
 class QTQP:
-    """https://github.com/google-deepmind/qtqp.
+    """QTQP (https://github.com/google-deepmind/qtqp).
 
-    QTQP compares its residuals with max(1, size of their terms), and accepts a gap
-    below tol, absolute or relative to max(1, |objective|). So the objective is scaled
-    to ‖q‖∞ = 1e4, where the 1 has no effect, and tol is passed unchanged.
+    QTQP divides each residual by max(1, size of its terms). It accepts a gap below tol,
+    either absolute or relative to max(1, |objective|). The adapter passes tol unchanged
+    and scales the objective to ‖q‖∞ = 1e4, where the 1 in the maxima has no effect.
 
-    In sequences QTQP starts from the last point, shifted into the interior. If the
-    residuals there are too large, it starts cold. The count `accepted_starts` is 1 or 0
-    accordingly.
+    In a sequence, QTQP starts from the last point, shifted into the interior. If the
+    residuals at the shifted point are too large, QTQP uses its default starting point.
+    The count `accepted_starts` is 1 if QTQP starts from the last point, otherwise 0.
     """
 
-    linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"
+    #: "pardiso" (MKL), "scipy" (SuperLU) or "scipy_dense" (dense Cholesky)
+    linear_solver: str = "pardiso"
     max_iter: int = 100
 
     about: ClassVar[About] = About(
@@ -53,17 +54,19 @@ class QTQP:
         licence="Apache-2.0",
         package="qtqp",
         linear_solver="MKL Pardiso (py-mkl-pardiso), one factorisation per iteration",
-        phases="preparing converts only; solving equilibrates and factorises",
-        sequence="starts from the last point if QTQP accepts it",
+        phases="the preparation only converts the data; the solve equilibrates and "
+        "factorises",
+        sequence="the iteration starts from the last point if QTQP accepts this point",
         limits=(
-            "Needs an inequality row or a bound: without one it divides by zero.",
-            "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
-            "Nr=30/Nh=15/primal and ends at its iteration limit, near the solution; "
-            "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
-            "of the claimed point is 2.0e-8, twice the limit of a verified one.",
-            "When its own test is met, the complementarity may exceed 10·tol: on "
-            "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
-            "and 1.7e-7 at 1e-8 (step 5, cold start).",
+            "QTQP needs an inequality row or a bound; without any, it divides by zero.",
+            "At tol 1e-9, QTQP stagnates on beam-ring/Nr=30/Nh=15/primal with a "
+            "relative gap of 1.1e-9 and ends at its iteration limit, near the "
+            "solution. On hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, the "
+            "complementarity of the point that it claims is 2.0e-8, twice the largest "
+            "value that is verified.",
+            "The complementarity may exceed 10·tol although QTQP's stopping test is "
+            "satisfied. On beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 "
+            "of a sequence) and 1.7e-7 at tol 1e-8 (step 5, default start).",
         ),
     )
 
@@ -124,8 +127,8 @@ class QTQP:
 
         def start_at(s: Solution) -> None:
             nonlocal start
-            # start from the slack s = r − Rx with the rows R, r of this QP, because the
-            # slack of the previous QP satisfies other rows
+            # compute the slack s = r − Rx from the rows R, r of this QP, because the
+            # slack of the previous QP belongs to different rows
             x, y, slack = form.point(s)
             start = x, y * scale, slack
 

@@ -22,21 +22,23 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: a Hessian counts as singular if its smallest pivot is below this times the largest
+#: a Hessian counts as singular if the ratio of its smallest to its largest Cholesky
+#: pivot is below this value
 MIN_PIVOT = 1e-12
 
 
 @dataclass(frozen=True)
 class Quadprog:
-    """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
+    """quadprog (https://github.com/quadprog/quadprog), for positive definite P.
 
-    quadprog has no tolerance, so `tol` is not used: after finitely many changes of the
-    active set, the KKT conditions hold to rounding.
+    quadprog uses dense matrices. It has no tolerance, so `tol` is not used: after
+    finitely many changes of the active set, the KKT conditions are satisfied up to
+    rounding.
 
-    A QP is declined after the factorisation of its Hessian if this is not positive
-    definite or its smallest Cholesky pivot is below 1e-12 of the largest. QPs with
-    dependent equality rows are also declined, because quadprog reports that such rows
-    are inconsistent.
+    The adapter factorises P, and declines the QP if P is not positive definite or if
+    the smallest Cholesky pivot is less than 1e-12 times the largest. It also declines
+    QPs with linearly dependent equality rows, because quadprog reports such rows as
+    inconsistent.
     """
 
     about: ClassVar[About] = About(
@@ -44,13 +46,16 @@ class Quadprog:
         method="dual active set (Goldfarb-Idnani)",
         licence="GPL-2.0-or-later",
         package="quadprog",
-        linear_solver="dense Cholesky (LAPACK), QR of the active rows updated",
-        phases="preparing factorises P and inverts the factor; solving iterates",
+        linear_solver="dense Cholesky (LAPACK); the QR factors of the active rows are "
+        "updated",
+        phases="the preparation factorises P and inverts the factor; the solve "
+        "iterates",
         limits=(
-            "Strictly convex QPs only: the dual with Dirichlet rows, whose F is "
-            "singular, is declined.",
-            "Declines dependent equality rows, which quadprog claims infeasible even "
-            "if they are consistent (conformance, shape 'redundant').",
+            "Only strictly convex QPs are accepted. For example, the dual with "
+            "Dirichlet rows is declined, because its F is singular.",
+            "QPs with linearly dependent equality rows are declined. quadprog claims "
+            "that they are infeasible even if the rows are consistent (conformance, "
+            "shape 'redundant').",
         ),
     )
 

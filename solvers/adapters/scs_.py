@@ -26,7 +26,7 @@ from mortarbench.solvers.common.sequence import Session, chain
 PRIMAL = -2  #: status for which SCS returns a certificate
 CLAIMS = {
     1: Status.SOLVED,
-    2: Status.ITERATION_LIMIT,  # inaccurate, at the iteration limit
+    2: Status.ITERATION_LIMIT,  # inaccurate point at the iteration limit
     -1: Status.INFEASIBLE,  # unbounded
     PRIMAL: Status.INFEASIBLE,
 }  #: all others count as FAILED
@@ -35,13 +35,14 @@ CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
 @dataclass(frozen=True)
 class SCS:
-    """https://www.cvxgrp.org/scs.
+    """SCS (https://www.cvxgrp.org/scs).
 
-    SCS stops when the max norms of the primal and dual residuals and the duality gap
-    are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
-    negligible eps_abs. The test is evaluated every 25 iterations. Equalities go to the
-    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone;
-    discs and cones to second-order cones.
+    SCS stops when the duality gap and the max norms of the primal and dual residuals
+    are below eps_abs + eps_rel·(largest term of each). The adapter sets eps_rel = tol
+    and a negligible eps_abs. SCS evaluates the test every 25 iterations.
+
+    Equality rows use the zero cone. Inequality rows and finite bounds, one row each,
+    use the nonnegative cone. Discs and cones use second-order cones.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
@@ -53,11 +54,13 @@ class SCS:
         method="operator splitting (homogeneous embedding, Anderson acceleration)",
         licence="MIT; bundles Intel MKL",
         package="scs",
-        linear_solver="MKL Pardiso, bundled (or QDLDL), one factorisation per change "
-        "of scale",
-        phases="preparing equilibrates and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factors; starts from the last point",
-        limits=("Needs a row or a bound, because its cone must not be empty.",),
+        linear_solver="bundled MKL Pardiso or QDLDL, one factorisation per change of "
+        "the scale parameter",
+        phases="the preparation equilibrates and factorises the matrices; the solve "
+        "iterates",
+        sequence="an update of the vectors keeps the factors, and the iteration starts "
+        "from the last point",
+        limits=("SCS needs a row or a bound, because its cone must not be empty.",),
     )
 
     def __post_init__(self) -> None:
@@ -67,7 +70,7 @@ class SCS:
     def declines(self, qp: QP) -> str | None:
         rows = ("equalities", "inequalities", "bounds")
         if len(qp.sets) == 1 and not any(qp.sizes[k] for k in rows):
-            return "needs a row or a bound: its cone must not be empty"
+            return "needs a row or a bound, because its cone must not be empty"
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
