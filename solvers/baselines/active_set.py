@@ -14,14 +14,16 @@ from mortarbench.harness import QP, Matrix, Vector
 from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
 
-DELTA = 1e-9  #: δᵢ/Dᵢ: weight of the proximal term of xᵢ, relative to its curvature Dᵢ
-#: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to the curvature along it, with D
-#: = diag P
+#: δᵢ/Dᵢ: weight of the proximal term of xᵢ, relative to the curvature Dᵢ = Pᵢᵢ
+DELTA = 1e-9
+#: ρ·aD⁻¹aᵀ, with D = diag P: penalty ρ of a row a of A or G, relative to the curvature
+#: of the objective along a
 KAPPA = 1e4
-#: Number of consecutive changes of the active set that may fail to reduce the number of
-#: wrong constraints; after these, constraints are exchanged one at a time.
+#: Largest number of consecutive changes of the active set that do not reduce the number
+#: of wrong constraints. Afterwards, constraints are exchanged one at a time.
 PATIENCE = 10
-SIGN_ROUNDING = 1e-13  #: smaller relative errors of signs and bounds count as rounding
+#: smaller relative errors of multiplier signs and of bounds count as rounding errors
+SIGN_ROUNDING = 1e-13
 
 
 class Active(NamedTuple):
@@ -40,13 +42,13 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Result of the inner iterations, with the final face and its solution operator."""
+    """Result of the inner iterations, with the final active set and its solver."""
 
     active: Active
-    solve: Solve
+    solve: Solve  #: solution operator of the face of `active`
     at: Point
-    gradient: Vector
-    settled: bool  #: the active set no longer changes; False at the iteration limit
+    gradient: Vector  #: gradient of the proximal Lagrangian at `at` (n,)
+    settled: bool  #: True if the active set no longer changes, False at the step limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class Problem:
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) diagonal of P, with its mean positive entry in place of zeros
+    D: Vector  #: (n,) diagonal of P; zeros are replaced by the mean positive entry
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise
@@ -73,7 +75,9 @@ class Problem:
 def penalise(
     qp: QP, counts: Counter[str], factorise: Factorise, kappa: float = KAPPA
 ) -> Problem:
-    """Weight each row a by κ/(a D⁻¹aᵀ); factorise the block that all faces share.
+    """Return the problem with row weights κ/(a D⁻¹aᵀ); factorise the common block.
+
+    The common block is the block of components that are free on every face.
 
     Raises
     ------
@@ -110,9 +114,10 @@ def solve_subproblem(
     slack: float,
     max_iter: int,
 ) -> Run:
-    """Update the active set until it no longer changes (steps 1 and 2 of `pdas`).
+    """Update the active set until it no longer changes (extensions 1, 2 of `pdas`).
 
-    start : active set, and the solution operator of its face if already factorised
+    start : active set, and the solution operator of its face, or None if this face has
+        not been factorised
     slack : largest relative errors of signs and bounds that are accepted
     """
     active, solve = start
@@ -144,7 +149,7 @@ def solve_subproblem(
 def _newton(
     problem: Problem, active: Active, centre: Point, solve: Solve
 ) -> tuple[Point, Vector, Vector]:
-    """Solve in the face; return the point, its gradient and z_k + σ(Gx − h)."""
+    """Take a Newton step on a face; return the point, gradient and z_k + σ(Gx − h)."""
     qp = problem.qp
 
     def evaluate(x: Vector) -> tuple[Point, Vector, Vector]:
@@ -159,13 +164,13 @@ def _newton(
 
 
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
-    """Drop active constraints with multipliers of the wrong sign; add violated ones.
+    """Activate violated constraints; release those with multipliers of wrong sign.
 
-    Errors of variables are measured in √D·x, whose unit is √energy. The result
-    therefore does not depend on the units of the variables.
+    Violations of bounds are measured in terms of √D·x, whose unit is √energy, so that
+    the result does not depend on the units of the variables.
 
-    at : x (n,); in the field y, the gradient without the multipliers of bounds; in the
-        field z, the trial multipliers of all inequality rows
+    at : x (n,); in its field `y`, the gradient without the multipliers of bounds; in
+        its field `z`, the trial multipliers of all inequality rows
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)

@@ -4,12 +4,12 @@ With the projection Π on the product of sets and a curvature L,
 
     x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x).
 
-Nesterov's weights β restart from 0 when the objective would rise. L grows
-until it bounds the curvature along the step, and shrinks after each step (Mazhar, Heyn,
-Negrut and Tasora, Using Nesterov's method to accelerate multibody dynamics with
-friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a linear
-combination of the last two products Px. A step therefore takes one product, plus one
-each time L grows.
+Nesterov's weights β restart from 0 if the objective would increase. In each step, L
+increases until it bounds the curvature along the step; after the step, L is reduced
+(Mazhar, Heyn, Negrut and Tasora, Using Nesterov's method to accelerate multibody
+dynamics with friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a
+linear combination of the last two products Px. A step therefore takes one product with
+P, and one more for each increase of L.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ ROUNDING = 1e-12  #: relative rounding error of a curvature
 class AcceleratedGradient:
     """In-house accelerated projected gradient method (APGD).
 
-    The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
-    residuals at this point exceed 5·tol, the bound is lowered and the iteration
-    continues; only a point with residuals within 5·tol is reported as solved. The
-    starting point is the feasible point nearest to zero. Iterations are steps; all
-    products with P are counted.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖. If a KKT
+    residual exceeds 5·tol at this point, the iteration continues with a smaller bound.
+    The solver claims a solution only if all KKT residuals are at most 5·tol. It starts
+    from the feasible point nearest to zero. It reports the number of steps as
+    iterations, and counts all products with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    shrink: float = 0.9  #: factor of L after each step; 1 for a fixed step
-    #: smallest factor by which L grows; L grows to the curvature along the step if that
-    #: curvature is larger
+    shrink: float = 0.9  #: factor by which L changes after each step; 1: constant L
+    #: factor by which an increase multiplies L, unless the curvature along the step is
+    #: larger than this product; L then increases to the curvature
     growth: float = 2.0
     max_iter: int = 50_000
 
@@ -52,7 +52,7 @@ class AcceleratedGradient:
         licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
-        phases="preparing takes no work; solving does all computations",
+        phases="the preparation does nothing; the solve includes all work",
     )
 
     def __post_init__(self) -> None:
@@ -64,7 +64,9 @@ class AcceleratedGradient:
 
     def declines(self, qp: QP) -> str | None:
         return (
-            "takes bounds, discs and cones, no rows" if qp.b.size or qp.h.size else None
+            "accepts bounds, discs and cones, but no rows"
+            if qp.b.size or qp.h.size
+            else None
         )
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -87,7 +89,7 @@ class _State(NamedTuple):
 
 
 def _start(problem: Problem) -> _State:
-    """Return the start; L = ‖Pd‖/‖d‖ with d = q, or a vector of ones if q = 0."""
+    """Return the initial state with L = ‖Pd‖/‖d‖; d is q, or all ones if q = 0."""
     q = problem.qp.q
     x = problem.project(np.zeros(q.size))
     d = q if q.any() else np.ones(q.size)
@@ -109,7 +111,7 @@ def _step(problem: Problem, options: AcceleratedGradient, s: _State) -> _State:
         square, work = float(d @ d), float(d @ (g - s.g_y))
         curvature = work / square if square else 0.0
         most = max(most, curvature)
-        # the rounding of g would spoil the curvature along tiny steps
+        # along tiny steps, rounding errors of g dominate the computed curvature
         rounding = ROUNDING * float(np.linalg.norm(g)) * np.sqrt(square)
         if work <= L * square + rounding:
             break

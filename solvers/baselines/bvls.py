@@ -1,9 +1,10 @@
-"""Bounded-variable least squares of scipy, on a Cholesky factor.
+"""Bounded-variable least squares (scipy), applied to a Cholesky factor of P.
 
 With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖².  A strictly convex QP with
-bounds is therefore a least-squares problem. Problems with lower bounds only are solved
-by the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974,
-Chapter 23), others by the extension due to Stark and Parker (Comput. Stat. 10, 1995).
+bounds is therefore a least-squares problem. If only lower bounds are present, it is
+solved by the active-set method of Lawson and Hanson (Solving Least Squares Problems,
+1974, Chapter 23), otherwise by the extension due to Stark and Parker (Comput. Stat. 10,
+1995).
 """
 
 from __future__ import annotations
@@ -26,20 +27,21 @@ from mortarbench.harness import (
 )
 from mortarbench.solvers.common.conversion import check_positive, dense
 
-MAX_COMPONENTS = 5_000  #: limit of n, because P is converted to a dense matrix
-CLAIM_FACTOR = (
-    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
-)
+MAX_COMPONENTS = 5_000  #: largest accepted n, because P is converted to a dense matrix
+#: a point is claimed as a solution if its KKT residuals are at most this factor times
+#: tol
+CLAIM_FACTOR = 5.0
 
 
 @dataclass(frozen=True)
 class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") for other bounds.
 
-    Both routines end with the exact active set. `tol` bounds the optimality test of
-    bvls, and a point is reported as solved if its KKT residuals are within 5·tol. Fixed
-    variables are eliminated, and the objective is scaled, because the test of bvls is
-    absolute. scipy reports the iterations of bvls but not those of nnls.
+    Both routines end with the exact active set. The tolerance passed to bvls is
+    min(tol, 1e-10). The solver claims a solution if all KKT residuals are at most
+    5·tol. Fixed variables are eliminated. The objective is scaled, because the
+    stopping test of bvls is absolute. scipy reports the number of iterations for bvls
+    but not for nnls.
     """
 
     max_iter: int = 10_000
@@ -47,10 +49,10 @@ class BVLS:
     about: ClassVar[About] = About(
         title="Bounded least squares (scipy)",
         licence="BSD-3-Clause",
-        method="active set: `nnls` and `lsq_linear` on a Cholesky factor",
-        linear_solver="LAPACK, within scipy",
-        phases="preparing factorises P",
-        limits=("`nnls` does not report its iterations",),
+        method="active set (`nnls` or `lsq_linear`), applied to a Cholesky factor",
+        linear_solver="LAPACK, called by scipy",
+        phases="the preparation factorises P; the solve iterates",
+        limits=("`nnls` does not report the number of iterations.",),
     )
 
     def __post_init__(self) -> None:
@@ -58,11 +60,14 @@ class BVLS:
 
     def declines(self, qp: QP) -> str | None:
         if qp.b.size or qp.h.size:
-            return "takes bounds only"
+            return "accepts bounds only"
         if reason := needs_matrices(qp):
             return reason
         if qp.q.size > MAX_COMPONENTS:
-            return f"converts P to dense; takes at most {MAX_COMPONENTS} components"
+            return (
+                "converts P to a dense matrix; accepts at most "
+                f"{MAX_COMPONENTS} components"
+            )
         try:
             cholesky(dense(qp.P), overwrite_a=True, check_finite=False)
         except LinAlgError:
@@ -95,7 +100,7 @@ class BVLS:
 def _least_squares(
     C: Vector, rhs: Vector, box: tuple[Vector, Vector], tol: float, limit: int
 ) -> tuple[Vector, Vector, int | None]:
-    """Minimise ‖Cx − rhs‖ in the box; return x, active sides and iterations."""
+    """Minimise ‖Cx − rhs‖ in the box; return x, sides (−1, 0, 1) and iterations."""
     from scipy.optimize import lsq_linear, nnls
 
     if not rhs.size:
@@ -112,7 +117,7 @@ def _point(
 ) -> Solution:
     """Return the solution, with the free components recomputed by a direct solve.
 
-    The multipliers of active bounds are the components of −(Px + q).
+    The multiplier of an active bound is the component of −(Px + q).
     """
     x = np.where(side < 0, qp.lb, np.where(side > 0, qp.ub, x))
     free = np.flatnonzero(side == 0)

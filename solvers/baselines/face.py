@@ -1,15 +1,15 @@
 """Newton systems of the primal-dual active set method, one per face.
 
-On the face with free components F and active inequality rows R, the system for the
-Newton step dx with right-hand side r,
+Let F be the free components of a face and R its active inequality rows. The Newton step
+dx for the right-hand side r is the solution of
 
     (M + G_RᵀρG_R)_FF dx_F = r_F
 
-is solved with a Cholesky factor. M is positive definite, and ρ is the diagonal matrix
-of the penalties of rows. If M is dense and there are no inequality rows, the components
-E without bounds are first eliminated. That costs about one factorisation; each face
-then needs only a factor of the free part of the Schur complement S on the bounded
-components E̅:
+and is computed with a Cholesky factor. M is positive definite, and ρ is the diagonal
+matrix of the penalties of the rows. If M is dense and the QP has no inequality rows,
+the components E without bounds are eliminated in advance, which costs about as much as
+one factorisation. A face then needs only a factor of the free block of the Schur
+complement S on the bounded components E̅:
 
     S = M_E̅E̅ − W ᵀW,   W = L⁻¹M_EE̅,   M_EE = LLᵀ.
 """
@@ -30,10 +30,10 @@ from mortarbench.harness import Matrix, Vector
 Mask = NDArray[np.bool_]
 #: r (n,) ↦ dx (n,), zero outside F; only r_F is used
 Solve = Callable[[Vector], Vector]
-#: mask of free components (n,), mask of active rows (p,) ↦ solution operator of that
+#: mask of free components (n,), mask of active rows (p,) ↦ solution operator of the
 #: face
 Faces = Callable[[Mask, Mask], Solve]
-#: M, G, ρ, mask of components without bounds ↦ `Faces`, as in `factoriser`
+#: M, G, ρ, mask of components without bounds ↦ `Faces`; see `factoriser`
 Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
 
 

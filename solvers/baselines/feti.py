@@ -1,9 +1,9 @@
 """FETI: projected preconditioned conjugate gradients for equality rows only.
 
-Minimises ½xᵀFx − dᵀx subject to Gx = e. On the dual of bodies decomposed into
-subdomains, this is the linear problem without contact (Farhat and Roux 1991). The
-algorithm is that of Farhat, Mandel and Roux (1994). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a
-preconditioner M:
+The method minimises ½xᵀFx − dᵀx subject to Gx = e. The dual of a linear problem without
+contact, on bodies decomposed into subdomains, has this form (Farhat and Roux 1991). The
+algorithm was published by Farhat, Mandel and Roux (1994). With the projector P_Q =
+I − QGᵀ(GQGᵀ)⁻¹G and a preconditioner M, its steps are:
 
 1. x = QGᵀ(GQGᵀ)⁻¹e, r = d − Fx
 2. w = P_Qᵀr; stop if ‖w‖ ≤ tol ‖w₀‖
@@ -11,9 +11,9 @@ preconditioner M:
 4. p = y − Σ pᵢ (yᵀFpᵢ)/(pᵢᵀFpᵢ) over all previous directions pᵢ
 5. x ← x + αp, r ← r − αFp with α = pᵀw/pᵀFp; go to 2
 
-Any Q that is positive definite on the range of Gᵀ is admissible. Q = I needs only G;
-Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if the stiffness
-jumps within a body.
+Every Q that is positive definite on the range of Gᵀ is admissible. With Q = I, the
+projector depends only on G. With Q = M (Klawonn and Widlund 2001), the number of steps
+stays bounded if the stiffness jumps within a body.
 """
 
 from __future__ import annotations
@@ -48,17 +48,18 @@ from mortarbench.solvers.common.conversion import (
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
-CLAIM_FACTOR = (
-    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
-)
-#: the solve gives up if its stopping bound falls below this times tol
+#: a point is claimed as a solution if its KKT residuals are at most this factor times
+#: tol
+CLAIM_FACTOR = 5.0
+#: the solve fails if its stopping bound falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
-PATIENCE = (
-    #: number of consecutive steps without halving ‖w‖ after which the solve gives up
-    100
+#: the solve fails after this number of consecutive steps that have not halved ‖w‖
+PATIENCE = 100
+STAGNATED = (
+    "no further progress because of rounding, or the objective is unbounded below"
 )
-STAGNATED = "no further progress: rounding, or the objective is unbounded below"
-#: rows count as dependent if a pivot of GQGᵀ is below this times the largest
+#: rows count as dependent if the ratio of a pivot of GQGᵀ to the largest pivot is below
+#: this value
 MIN_PIVOT = 1e-13
 BATCH = 256  #: number of columns of Gᵀ per application of the preconditioner
 
@@ -67,28 +68,29 @@ BATCH = 256  #: number of columns of Gᵀ per application of the preconditioner
 class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
-    The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If
-    the KKT residuals at this point exceed 5·tol, the bound is lowered and the iteration
-    continues; only a point with residuals within 5·tol is reported as solved.
-    Iterations are CG steps; all products with P are counted.
+    The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If a
+    KKT residual exceeds 5·tol at this point, the iteration continues with a smaller
+    bound. The solver claims a solution only if all KKT residuals are at most 5·tol. It
+    reports the number of CG steps as iterations, and counts all products with P.
     """
 
-    preconditioner: Kind = (
-        "auto"  #: "auto": the Dirichlet preconditioner if P provides one, else none
-    )
-    scaling: Scaling = "stiffness"  #: weights of the copies of a node in M
-    Q: Weight = "identity"  #: weight Q in the projector P_Q
+    #: preconditioner M; "auto" selects "dirichlet" if P provides it, otherwise "none"
+    preconditioner: Kind = "auto"
+    scaling: Scaling = "stiffness"  #: weights in M of the copies of an interface node
+    Q: Weight = "identity"  #: matrix Q in the projector P_Q
     max_iter: int = 2000
 
     about: ClassVar[About] = About(
         title="FETI (ours)",
         licence="BSD-3-Clause",
         method="projected preconditioned conjugate gradients",
-        linear_solver="products with P; a Cholesky factor of the coarse problem",
-        phases="preparing factorises the coarse problem and sets up the preconditioner",
+        linear_solver="products with P, and a Cholesky factor of the coarse problem",
+        phases="the preparation factorises the coarse problem and sets up the "
+        "preconditioner; the solve iterates",
         limits=(
-            "for linear problems only: bounds and inequality rows are declined",
-            "stores two vectors per iteration",
+            "Only linear problems are solved; QPs with bounds or inequality rows are "
+            "declined.",
+            "The solver stores two vectors per iteration.",
         ),
     )
 
@@ -100,12 +102,12 @@ class FETI:
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size or has_bound(qp).any():
-            return "takes equality rows only: it solves linear problems"
+            return "accepts equality rows only, because it solves linear problems"
         if preconditioner_source(qp) is None:
             if self.preconditioner in ("lumped", "dirichlet"):
-                return f"P offers no preconditioner {self.preconditioner!r}"
+                return f"P does not provide the preconditioner {self.preconditioner!r}"
             if self.Q == "preconditioner":
-                return "Q = 'preconditioner' needs a P that offers one"
+                return "Q = 'preconditioner' needs a P that provides a preconditioner"
         elif self.Q == "preconditioner":
             if self.preconditioner == "none":
                 return "Q = 'preconditioner' needs a preconditioner other than 'none'"
@@ -141,14 +143,14 @@ def preconditioner_source(qp: QP) -> Preconditioned | None:
 
 @dataclass(frozen=True, eq=False)
 class _Coarse:
-    """Projector P_Q with the coarse matrix GQGᵀ."""
+    """Projector P_Q, with a factor of the coarse matrix GQGᵀ."""
 
     G: csr_array  #: (r, m)
     QGT: Any  #: QGᵀ (m, r), sparse or dense
     solve: Callable[[Vector], Vector]  #: t ↦ (GQGᵀ)⁻¹t
 
     def feasible(self, e: Vector) -> Vector:
-        """Return the x in the span of QGᵀ with Gx = e."""
+        """Return the x in the range of QGᵀ with Gx = e."""
         return np.asarray(self.QGT @ self.solve(e))
 
     def project(self, v: Vector) -> Vector:
@@ -227,7 +229,7 @@ class _Directions:
 
 
 def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
-    """Iterate, lowering the bound on ‖w‖, until the KKT residuals are within 5·tol."""
+    """Reduce the bound on ‖w‖ until all KKT residuals are at most 5·tol."""
     qp, tighter = task.qp, 1.0
     at = _state(task, task.coarse.feasible(qp.b))
     directions = _Directions(np.empty((16, qp.q.size)), np.empty((16, qp.q.size)))
@@ -275,9 +277,9 @@ def _iterate(
 
 
 def _state(task: _Task, x: Vector) -> _State:
-    """Return the state at x with the residual recomputed."""
+    """Return the state at x, with w recomputed from F and d."""
     # project twice: the second projection removes the rounding errors that a large y
-    # causes in the first
+    # causes in the first one
     once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
     return _project(task, *once)
 
@@ -304,7 +306,7 @@ def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
 
 def _point(task: _Task, at: _State, norms: list[float]) -> Solution:
     n, m = task.qp.q.size, len(norms)
-    # the caller's evaluation of residuals takes one product
+    # the evaluation of KKT residuals by the caller takes one product
     task.counts["P_products"] += 1
     return Solution(
         status=Status.SOLVED,

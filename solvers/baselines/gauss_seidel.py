@@ -1,11 +1,12 @@
 """Projected Gauss–Seidel over discs and cones, as used in granular dynamics.
 
-A sweep minimises the objective over one block of variables at a time, with all others
-fixed. A block is a disc, a cone, or a single variable of the box. The method is
-known as NSGS (nonsmooth Gauss–Seidel: Jourdan, Alart and Jean, Comput. Methods Appl.
-Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008, Chapter 13). The problem on a
-block is solved by projected gradient steps of length 1/λ until they become short, where
-λ is the largest eigenvalue of the diagonal block of P.
+A sweep minimises the objective over one block of variables at a time, with all other
+variables fixed. The variables of a block belong to one disc or cone, or a block is a
+single variable with bounds. The method is known as NSGS (nonsmooth Gauss–Seidel:
+Jourdan, Alart and Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998, 31–47; Acary and
+Brogliato 2008, Chapter 13). The problem on a block is solved by projected gradient
+steps of length 1/λ, where λ is the largest eigenvalue of the diagonal block of P. The
+steps end when they become short.
 
 After each change of a block, the gradient is updated with the columns of P of this
 block. A sweep over all blocks therefore costs as much as a product with P.
@@ -28,11 +29,11 @@ from mortarbench.harness.qp import NEEDS_MATRICES
 from mortarbench.solvers.baselines.natural_map import Problem
 from mortarbench.solvers.common.conversion import check_positive
 
-#: The steps in a block end at a step shorter than this times the first one. With 1,
-#: which means a single step, 30 QPs on cones take 70 sweeps on average; with this
-#: value, as with 1e-6, they take 34.
+#: The steps on a block end when the ratio of the last to the first step length is at
+#: most this value. With the value 1, which permits a single step, 30 QPs with cones
+#: take 70 sweeps on average. With 1e-3 or 1e-6, they take 34.
 SETTLED = 1e-3
-MAX_LOCAL = 100  #: limit of steps in a block
+MAX_LOCAL = 100  #: largest number of steps on a block in one sweep
 
 Point = list[float]
 
@@ -42,23 +43,26 @@ class GaussSeidel:
     """In-house projected Gauss–Seidel method (NSGS).
 
     The iteration stops when the norm of the natural map after a sweep is at most
-    tol·‖q‖. If the KKT residuals at this point exceed 5·tol, the bound is lowered and
-    the iteration continues; only a point with residuals within 5·tol is reported as
-    solved. The starting point is the feasible point nearest to zero. Iterations are
-    sweeps; a sweep costs about as much as one product with P.
+    tol·‖q‖. If a KKT residual exceeds 5·tol at this point, the iteration continues with
+    a smaller bound. The solver claims a solution only if all KKT residuals are at most
+    5·tol. It starts from the feasible point nearest to zero. It reports the number of
+    sweeps as iterations; a sweep costs about as much as one product with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    max_iter: int = 10_000  #: limit of sweeps
+    max_iter: int = 10_000  #: largest number of sweeps
 
     about: ClassVar[About] = About(
         title="Projected Gauss–Seidel (ours)",
         licence="BSD-3-Clause",
         method="block Gauss–Seidel over discs, cones and single variables (NSGS)",
         linear_solver="none (columns of P)",
-        phases="preparing takes no work; solving does all computations",
-        limits=("the loop over blocks is in Python: compare sweeps, not times",),
+        phases="the preparation does nothing; the solve includes all work",
+        limits=(
+            "The loop over blocks is written in Python, so compare numbers of sweeps "
+            "rather than times.",
+        ),
     )
 
     def __post_init__(self) -> None:
@@ -66,7 +70,7 @@ class GaussSeidel:
 
     def declines(self, qp: QP) -> str | None:
         if qp.b.size or qp.h.size:
-            return "takes bounds, discs and cones, no rows"
+            return "accepts bounds, discs and cones, but no rows"
         if not qp.is_explicit:
             return NEEDS_MATRICES
         diagonal = qp.diagonal()
@@ -90,20 +94,20 @@ class GaussSeidel:
 class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
-    most: float  #: largest curvature along the change of x in a sweep so far
+    most: float  #: largest curvature dᵀPd/dᵀd of a sweep so far; d is its change of x
 
 
 class _Block(NamedTuple):
-    """Variables of a block, with the diagonal block A of P."""
+    """Block of variables, with the diagonal block A of P."""
 
     variables: NDArray[np.int64]  #: (d,)
     A: list[Point]  #: (d, d)
     length: float  #: step length 1/‖A‖
-    project: Callable[[Point], Point]
+    project: Callable[[Point], Point]  #: projection onto the set of the block
 
 
 def _blocks(qp: QP) -> Iterator[_Block]:
-    """Yield the discs and cones as blocks, then the single variables of the box."""
+    """Yield a block for each disc and cone, then one for each remaining variable."""
     alone = np.ones(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         alone[one.block] = False

@@ -1,9 +1,9 @@
-"""Certificates that a QP has no solution, checked on the data of the QP.
+"""Tests whether a vector certifies that a QP has no solution.
 
-If a QP has such a certificate, the differences of successive proximal iterates converge
-to a certificate. (Banjac et al., Infeasibility detection in the alternating direction
-method of multipliers for convex optimization, JOTA 183, 2019, prove this for ADMM, a
-related method.)
+If a certificate exists, the differences of successive proximal iterates converge to a
+certificate. Banjac et al. prove this for ADMM, a related method (Infeasibility
+detection in the alternating direction method of multipliers for convex optimization,
+JOTA 183, 2019).
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ import numpy as np
 
 from mortarbench.harness import QP, Matrix, Vector
 
-#: a sum counts as zero below this times the sum of the absolute values of its terms
+#: a sum counts as zero if it is below this factor times the sum of the absolute values
+#: of its terms
 ROUNDING = 1e-10
 
 
@@ -33,7 +34,7 @@ def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
     np.multiply(v, bound, out=terms, where=v != 0)
     most = qp.b @ y + qp.h @ z
     size = np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + np.abs(terms).sum()
-    # an infinite term belongs to an absent bound, so that vᵀx has no lower bound
+    # a term is infinite if the bound is absent; vᵀx then has no lower bound
     return bool(np.isfinite(size) and terms.sum() - most > 1e-6 * size)
 
 
@@ -41,8 +42,8 @@ def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
 def proves_unbounded(qp: QP, v: Vector) -> bool:
     """Return True if the objective is unbounded below along the feasible direction v.
 
-    The conditions are Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, vᵢ ≥ 0 if lbᵢ is finite and vᵢ ≤
-    0 if ubᵢ is finite. They do not imply that a feasible point exists.
+    The conditions are Pv = 0, qᵀv < 0, Av = 0 and Gv ≤ 0, with vᵢ ≥ 0 if lbᵢ is finite
+    and vᵢ ≤ 0 if ubᵢ is finite. They do not imply that a feasible point exists.
     """
     if not v.any() or not np.isfinite(v).all():
         return False

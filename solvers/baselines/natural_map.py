@@ -1,8 +1,9 @@
-"""The natural map of a QP on convex sets, and the loop of methods that test its norm.
+"""Natural map of a QP on convex sets, and the iteration loop of methods that use it.
 
-With the projection Π on the product of sets and a curvature L, the natural map
-L(x − Π(x − g/L)) is zero exactly at solutions. Here g = Px + q. With v = x − g/L, the
-vector L(v − Π(v)) is normal to the sets at Π(v) and serves as the multipliers there.
+Let Π be the projection onto the product of the sets, L a curvature, and g = Px + q. The
+natural map L(x − Π(x − g/L)) is zero if and only if x is a solution. With v = x − g/L,
+the vector L(v − Π(v)) is normal to the sets at Π(v), so it is used as the vector of
+multipliers at Π(v).
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ import numpy as np
 
 from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 
-#: a point is reported as solved if its KKT residuals are ≤ this times tol
+#: a point is claimed as a solution if its KKT residuals are at most this factor times
+#: tol
 CLAIM_FACTOR = 5.0
-#: the solve gives up if its stopping bound falls below this times tol
+#: the solve fails if its stopping bound falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
 
 
 class Iterate(Protocol):
-    """A point, its gradient, and the curvature L for the natural map."""
+    """A point with its gradient and the curvature L of the natural map."""
 
     @property
     def x(self) -> Vector:
@@ -54,7 +56,7 @@ class Problem:
         return np.asarray(self.qp.P @ v)
 
     def project(self, v: Vector) -> Vector:
-        """Return Π(v), the point of the sets that is nearest to v."""
+        """Return Π(v), the point of the product of sets that is nearest to v."""
         for one in self.qp.sets:
             v = one.project(v)
         return v
@@ -72,11 +74,11 @@ class Problem:
         tol: float,
         max_iter: int,
     ) -> Solution:
-        """Take steps until the KKT residuals are within 5·tol.
+        """Take steps until all KKT residuals are at most 5·tol; return the solution.
 
         The residuals are evaluated when the norm of the natural map falls below
-        tol·‖q‖; if they are too large, this bound is lowered. Only a point within 5·tol
-        is reported as solved.
+        tol·‖q‖. If they are too large, the loop continues with a smaller bound. The
+        status is SOLVED only if all residuals are at most 5·tol.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x
@@ -95,7 +97,7 @@ class Problem:
                 self.counts["steps"] += 1
             v = at.x - at.g / at.most
             x = self.project(v)
-            # recompute g, which steps only update
+            # recompute g, because the steps only update it
             at = restarted(at, x, self.product(x) + qp.q)
             point = self._point(x, v, at.most)
             worst = kkt_residuals(qp, point).worst
@@ -103,11 +105,11 @@ class Problem:
                 return point
             tighter *= min(0.5, CLAIM_FACTOR * tol / worst)
             if tighter < MIN_TOL_FACTOR:
-                return _unsolved(point, "no further progress in rounding")
+                return _unsolved(point, "no further progress because of rounding")
 
     def _point(self, x: Vector, v: Vector, most: float) -> Solution:
-        """Return x with the multipliers L(v − Π(v)) and L = most."""
-        # the caller's evaluation of residuals takes one product
+        """Return x with the multipliers L(v − Π(v)), where L = `most`."""
+        # the evaluation of KKT residuals by the caller takes one product
         self.counts["P_products"] += 1
         return Solution(
             status=Status.SOLVED,

@@ -1,30 +1,31 @@
 """Primal-dual active set method: semismooth Newton for bounds and rows.
 
-The standard method of the mortar literature (Hintermüller, Ito and Kunisch 2003, SIAM
-J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an active set of
-bounds and inequality rows, a linear system determines x and the multipliers. The next
-active set consists of the active constraints whose multipliers have the right sign, and
-of the violated constraints. The iteration ends when the active set no longer changes.
-Three extensions handle QPs on which this fails:
+This is the standard method of the mortar literature (Hintermüller, Ito and Kunisch
+2003, SIAM J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an
+active set of bounds and inequality rows, a linear system determines x and the
+multipliers. The next active set consists of the active constraints whose multipliers
+have the right sign, and of the violated constraints. The iteration ends when the active
+set no longer changes. Three extensions handle QPs on which this iteration fails:
 
 1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
 
        ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h),
 
-   where the equation of z applies to active rows. Every face then has a solution even
-   if P is singular, rows are repeated, or more rows are active than components are
-   free. Once the active set no longer changes, the
-   centre (x_k, y_k, z_k) moves to the solution, and the factor of that face is reused.
-   δᵢ = 1e-9·Pᵢᵢ is small, and ρ = 1e4/(a D⁻¹aᵀ) for a row a, with D = diag P, is large;
-   so the active set of the first centre is usually the final one. If the residuals fall
-   too slowly, ρ grows: a row whose free variables are all stiff needs a larger ρ.
+   where the equation of z applies to active rows. The system of a face then has a
+   solution even if P is singular, rows are repeated, or there are more active rows than
+   free components. When the active set no longer changes, the centre (x_k, y_k, z_k)
+   moves to the solution, and the factor of the last face is reused. The weights δᵢ =
+   1e-9·Pᵢᵢ are small. The penalty ρ = 1e4/(a D⁻¹aᵀ) of a row a, with D = diag P, is
+   large. Therefore the active set for the first centre is usually the final one. If the
+   residuals decrease too slowly, ρ is increased. This is necessary for a row whose free
+   variables are all stiff.
 2. Block principal pivoting (Júdice and Pires 1994, Comput. Oper. Res. 21). After ten
    changes of the active set that did not reduce the number of wrong constraints, only
-   the last wrong constraint changes (Murty's rule), until that number falls below its
-   previous minimum. This terminates, because the systems of step 1 belong to a strictly
-   convex problem.
-3. After each change of the centre, the difference of the last two centres is tested as
-   a certificate (`solvers.baselines.infeasibility_certificate`).
+   the last wrong constraint is changed (Murty's rule), until the number of wrong
+   constraints falls below its previous minimum. This procedure terminates, because the
+   systems of extension 1 belong to a strictly convex problem.
+3. Certificates of infeasibility. After each change of the centre, the difference of the
+   last two centres is tested (`solvers.baselines.infeasibility_certificate`).
 """
 
 from __future__ import annotations
@@ -63,16 +64,18 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 )
 from mortarbench.solvers.common.conversion import check_positive
 
-#: Factor of ρ if two changes of the centre have not halved the residuals. With this
-#: growth all of 600 random QPs were solved, without it 522.
+#: Factor by which ρ increases after two changes of the centre that have not halved the
+#: residuals. With these increases, all of 600 random QPs were solved; without them,
+#: 522.
 RHO_GROWTH = 100.0
-MAX_KAPPA = 1e10  #: value of ρ·aD⁻¹aᵀ beyond which ρ no longer grows
-#: changes of the centre without halving the residuals after which the solve gives up
+MAX_KAPPA = 1e10  #: value of ρ·aD⁻¹aᵀ beyond which ρ is not increased
+#: the solve fails after this number of changes of the centre that have not halved the
+#: residuals
 PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
-CLAIM_FACTOR = (
-    5.0  #: a point is reported as solved if its KKT residuals are ≤ this times tol
-)
+#: a point is claimed as a solution if its KKT residuals are at most this factor times
+#: tol
+CLAIM_FACTOR = 5.0
 
 
 class Carry(NamedTuple):
@@ -86,16 +89,16 @@ class Carry(NamedTuple):
 class PDAS:
     """In-house primal-dual active set method with Cholesky factors of the faces.
 
-    `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
-    rounding prevents further progress, a point with residuals of up to 5·tol is
-    reported as solved. Iterations are linear solves. The adapter counts factorisations
-    (one per face, plus one if unbounded variables are condensed), constraints that
-    entered or left the active set, steps that exchanged a single constraint, proximal
-    centres, and products with P.
+    The iteration stops when the KKT residuals of the QP are at most tol. If rounding
+    prevents further progress, the solver also claims a point with residuals of at most
+    5·tol. It reports the number of linear solves as iterations. Its counts are:
+    factorisations (one per face, and one more if unbounded variables are condensed),
+    constraints that entered or left the active set, steps that exchanged a single
+    constraint, proximal centres, and products with P.
 
-    The starting point is the point of the box nearest to zero: no row is in contact, in
-    the primal and in the dual. (On the duals of contact problems, a start with all
-    variables free took from one solve fewer to seven solves more.)
+    The solver starts from the point of the box nearest to zero, which is a state
+    without contact in both the primal and the dual. On the duals of contact problems, a
+    start with all variables free took between one solve less and seven solves more.
     """
 
     max_iter: int = 5_000
@@ -105,13 +108,14 @@ class PDAS:
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="preparing assembles the penalised matrix; solving factorises faces",
-        sequence="active set and point",
+        phases="the preparation assembles the penalised matrix; the solve factorises "
+        "the matrices of the faces",
+        sequence="the iteration starts from the last active set and point",
         limits=(
-            "on one-dimensional obstacles the contact front moves by one node per "
-            "step: 323 solves for 1000 nodes",
-            "the symbolic analysis is repeated for every sparse face: 97 instead of 60 "
-            "ms per factor at Nr = 30, Nh = 15",
+            "On one-dimensional obstacle problems, the contact front moves by one node "
+            "per step, which takes 323 solves for 1000 nodes.",
+            "The symbolic analysis is repeated for every sparse face. At Nr = 30, Nh = "
+            "15, a factorisation takes 97 ms instead of 60 ms.",
         ),
     )
 
@@ -126,7 +130,7 @@ class PDAS:
         return lambda: run()[0]
 
     def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
-        """Return the function that prepares the factorisation of faces."""
+        """Return the function that sets up the factorisation of faces."""
         del qp, tol, counts
         return factoriser
 
@@ -172,7 +176,7 @@ class PDAS:
 
 
 def _start(qp: QP, carry: Carry | None) -> Carry:
-    """Return `carry` if its sizes fit `qp`, else the point of the box nearest to 0."""
+    """Return `carry` if it fits `qp`, otherwise the point of the box nearest to 0."""
     if carry is not None and [v.size for v in carry.centre] == [
         qp.q.size,
         qp.b.size,
@@ -217,19 +221,23 @@ def _proximal(
         centre, best, slack = run.at, min(best, worst), slack / 10
     if worst <= CLAIM_FACTOR * tol:
         return point, Carry(active, Point(point.x, point.y, point.z))
-    message = "no further progress in rounding" if run.settled else "step limit"
+    rounding = "no further progress because of rounding"
+    message = rounding if run.settled else "step limit"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
 
 
 def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Return why no solution exists; None unless the change (x, y, z) proves it."""
+    """Return the reason why no solution exists, if (x, y, z) certifies it, or None.
+
+    (x, y, z) : difference of the last two proximal centres
+    """
     if proves_infeasible(qp, y, z):
-        return "no point meets all constraints"
+        return "no point satisfies all constraints"
     return "the objective is unbounded below" if proves_unbounded(qp, x) else None
 
 
 def _point(problem: Problem, run: Run, centre: Point) -> Solution:
-    """Return the run's point with the multipliers of its active bounds."""
+    """Return the final point of `run`, with the multipliers of its active bounds."""
     counts, (x, y, z) = problem.counts, run.at
     force = DELTA * problem.D * (x - centre.x) - run.gradient
     z = np.maximum(z, 0)
@@ -237,7 +245,7 @@ def _point(problem: Problem, run: Run, centre: Point) -> Solution:
     z_box = np.where(run.active.side > 0, np.maximum(force, 0), z_box)
     fixed = problem.qp.lb == problem.qp.ub
     z_box = np.where(fixed, force, z_box)
-    counts["P_products"] += 1  # the caller's evaluation of residuals takes one product
+    counts["P_products"] += 1  # for the evaluation of KKT residuals by the caller
     other_counts = {k: v for k, v in counts.items() if k != "solves"}
     return Solution(
         status=Status.SOLVED,

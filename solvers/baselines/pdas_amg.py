@@ -1,10 +1,11 @@
-"""Primal-dual active set method with multigrid on the faces: `pdas` without factors.
+"""Primal-dual active set method with algebraic multigrid instead of Cholesky factors.
 
-The method is that of `solvers.baselines.pdas`. On each face, the Newton system is
-solved by conjugate gradients, preconditioned by smoothed aggregation (Vaněk, Mandel and
-Brezina 1996, Computing 56; pyamg). In the primal QP of floating elastic bodies, the
-kernel of the stiffness P contains the translations, which smoothed aggregation uses as
-near-kernel vectors. Rotations are not used, because a QP contains no coordinates.
+The outer iteration is the one of `solvers.baselines.pdas`. On each face, the Newton
+system is solved by conjugate gradients, preconditioned by smoothed aggregation (Vaněk,
+Mandel and Brezina 1996, Computing 56; pyamg). In the primal QP of floating elastic
+bodies, the kernel of the stiffness matrix P contains the translations. Smoothed
+aggregation uses them as near-kernel vectors. Rotations are not used, because a QP
+contains no coordinates.
 """
 
 from __future__ import annotations
@@ -29,16 +30,17 @@ from mortarbench.solvers.baselines.face import (
 )
 from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
-#: largest |Pt| of a translation t in the kernel, relative to the largest row sum of |P|
+#: a translation t counts as a vector of the kernel if ‖Pt‖∞ is at most this factor
+#: times ‖P‖∞
 KERNEL_ROUNDING = 1e-8
 #: Relative residual of conjugate gradients, divided by the tolerance of the QP. With
-#: 1e-3, the number of solves was the same (13 on beam-ring, 6 on cube-wall/n=16), with
-#: 17 to 34 % more CG steps.
+#: 1e-3 instead, the number of solves did not change (13 on beam-ring, 6 on
+#: cube-wall/n=16), but 17 to 34 % more CG steps were necessary.
 CG_SHARE = 0.1
-#: limit of steps per solve; small beam-ring and cube-wall cases take 9 to 80
+#: largest number of CG steps per solve; small beam-ring and cube-wall cases need 9 to
+#: 80
 MAX_CG = 1000
-#: largest number of unknowns on the coarsest level, which is factorised: pyamg's
-#: default, a pseudo-inverse, took seconds
+#: largest number of unknowns on the coarsest level
 COARSEST = 100
 
 
@@ -46,24 +48,27 @@ COARSEST = 100
 class PDASAMG(PDAS):
     """`pdas` with conjugate gradients and algebraic multigrid on the faces.
 
-    P must be sparse. The near-kernel consists of the translations if P annihilates
-    them, otherwise of a constant vector. The counts are defined as for `pdas`;
-    multigrid set-ups count as factorisations. The number of conjugate-gradient steps is
-    also counted.
+    P must be sparse. The near-kernel consists of the translations if they are in the
+    kernel of P, otherwise of a constant vector. The counts are the same as for `pdas`,
+    but a multigrid set-up counts as a factorisation. The number of conjugate-gradient
+    steps is counted in addition.
     """
 
     about: ClassVar[About] = About(
         title="PDAS with multigrid (ours)",
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
-        linear_solver="conjugate gradients, smoothed aggregation of pyamg",
-        phases="preparing assembles the penalised matrix; solving sets up multigrid",
-        sequence="active set and point",
+        linear_solver="conjugate gradients, preconditioned by smoothed aggregation "
+        "(pyamg)",
+        phases="the preparation assembles the penalised matrix; the solve sets up "
+        "multigrid for each face",
+        sequence="the iteration starts from the last active set and point",
         package="pyamg",
         limits=(
-            "the near-kernel contains no rotations, because a QP has no coordinates",
-            "rows that couple several nodes increase the number of CG steps: 30 to 80 "
-            "per solve on beam-ring, 9 to 22 on cube-wall",
+            "The near-kernel does not contain rotations, because a QP contains no "
+            "coordinates.",
+            "More CG steps are needed if rows couple several nodes: 30 to 80 per solve "
+            "on beam-ring, but 9 to 22 on cube-wall.",
         ),
     )
 
@@ -71,7 +76,7 @@ class PDASAMG(PDAS):
         if (reason := needs_matrices(qp)) is not None:
             return reason
         if isinstance(qp.P, np.ndarray):
-            return "P is dense; multigrid needs a sparse matrix"
+            return "P is dense, but multigrid needs a sparse matrix"
         return None
 
     def _set_up(
@@ -119,13 +124,13 @@ def _multigrid(
     rtol: float,
     counts: Counter[str],
 ) -> Faces:
-    import pyamg  # late: an optional package, and slow to import
+    import pyamg  # imported here because it is optional and slow to import
 
     d = kernel.shape[1]
 
     def face(free: Mask, active: Mask) -> Solve:
         F = M + G[active].T @ (diags_array(rho[active]) @ G[active])
-        # keep components that are not free as uncoupled rows, so that nodes still have
+        # keep components that are not free as uncoupled rows, so that every node keeps
         # d rows
         inside = diags_array(1.0 * free)
         F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
@@ -134,7 +139,7 @@ def _multigrid(
             B=kernel,
             symmetry="symmetric",
             max_coarse=COARSEST,
-            coarse_solver="splu",
+            coarse_solver="splu",  # the default, a pseudo-inverse, took seconds
         )
         precondition = levels.aspreconditioner()
 

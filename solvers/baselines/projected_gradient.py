@@ -1,4 +1,4 @@
-"""Spectral projected gradients on convex sets; P is used only through products.
+"""Spectral projected gradient method on convex sets, which needs only products with P.
 
 With the projection Π on the product of sets,
 
@@ -6,13 +6,14 @@ With the projection Π on the product of sets,
 
 where g = Px + q is the gradient, and α = sᵀs/sᵀPs is the step length of Barzilai and
 Borwein (1988) for the previous step s. The line search for t is nonmonotone: the
-objective may exceed its last value but not the largest of its last M values (Birgin,
+objective may exceed its last value, but not the largest of its last M values (Birgin,
 Martínez and Raydan, Nonmonotone spectral projected gradient methods on convex sets,
 SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective is quadratic along d, so one
-product Pd per iteration suffices for line search and α.
+product Pd per iteration suffices for both the line search and the next α.
 
-If α alternates with sᵀPs/‖Ps‖² (ABBmin), the number of steps is halved for a string on
-an obstacle, but multiplied by five to twenty on the duals of contact problems.
+An alternation of α with the step length sᵀPs/‖Ps‖² (ABBmin) halves the number of steps
+for a string on an obstacle. On the duals of contact problems, however, it multiplies
+the number of steps by five to twenty.
 
 The stopping test uses the natural map (`solvers.baselines.natural_map`).
 """
@@ -51,16 +52,17 @@ SUFFICIENT_DECREASE = 1e-4  #: fraction of the linear decrease that a step must 
 class ProjectedGradient:
     """In-house spectral projected gradient method.
 
-    The iteration stops when the norm of the natural map is at most tol·‖q‖. If the KKT
-    residuals at this point exceed 5·tol, the bound is lowered and the iteration
-    continues; only a point with residuals within 5·tol is reported as solved. The
-    starting point is the feasible point nearest to zero, and the first α is computed by
-    an exact line search. Iterations are steps; all products with P are counted.
+    The iteration stops when the norm of the natural map is at most tol·‖q‖. If a KKT
+    residual exceeds 5·tol at this point, the iteration continues with a smaller bound.
+    The solver claims a solution only if all KKT residuals are at most 5·tol. It starts
+    from the feasible point nearest to zero, and the first α is the length of an exact
+    line search. The solver reports the number of steps as iterations, and counts all
+    products with P.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    memory: int = 10  #: M of the line search; 1: monotone decrease
+    memory: int = 10  #: M of the line search; 1 for a monotone decrease
     max_iter: int = 50_000
 
     about: ClassVar[About] = About(
@@ -68,9 +70,10 @@ class ProjectedGradient:
         licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
-        phases="preparing takes no work; solving does all computations",
+        phases="the preparation does nothing; the solve includes all work",
         limits=(
-            "numbers of products vary: the load steps of the benchmark take 45 to 546",
+            "The number of products varies strongly, from 45 to 546 for the load steps "
+            "of the benchmark.",
         ),
     )
 
@@ -79,7 +82,9 @@ class ProjectedGradient:
 
     def declines(self, qp: QP) -> str | None:
         return (
-            "takes bounds, discs and cones, no rows" if qp.b.size or qp.h.size else None
+            "accepts bounds, discs and cones, but no rows"
+            if qp.b.size or qp.h.size
+            else None
         )
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -92,7 +97,7 @@ class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
     alpha: float
-    #: objectives of the last M iterates, minus that of the start
+    #: objectives of the last M iterates, relative to the objective of the first iterate
     costs: tuple[float, ...]
     most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if no curvature was positive
 
@@ -146,7 +151,7 @@ def _solve(problem: Problem, tol: float, options: ProjectedGradient) -> Solution
 
 
 def _proves_unbounded(qp: QP, d: Vector) -> bool:
-    """Return True if x + td is in all sets and the objective falls for all t > 0."""
+    """Return True if d is a feasible direction of unbounded decrease."""
     size = float(np.abs(d).max(initial=0.0))
     return all(
         np.abs(one.project(d) - d).max() <= ROUNDING * size for one in qp.sets[1:]

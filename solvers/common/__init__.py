@@ -1,1 +1,1 @@
-"""Tools shared by solvers: conversion of QPs, sequences of QPs, lists of backends."""
+"""Tools shared by solvers: conversion and sequences of QPs, and lists of backends."""

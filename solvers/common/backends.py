@@ -60,8 +60,8 @@ def reason_unavailable(
 ) -> str | None:
     """Return the reason why a backend cannot be used, or None.
 
-    None is also returned if the library itself is not installed; `prepare` then raises
-    ImportError.
+    None is also returned if the library itself is not installed, because `prepare` then
+    raises ImportError.
 
     files : result of `adapter_files`
     """
@@ -77,7 +77,7 @@ def reason_unavailable(
 
 
 def _missing_packages(adapter: Path) -> list[str]:
-    """Return the packages that an adapter file imports but that are not installed."""
+    """Return the packages that an adapter file imports and that are not installed."""
     return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 

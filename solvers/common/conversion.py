@@ -1,9 +1,10 @@
-"""Conversion between QPs and the forms of solver libraries: matrices and multipliers.
+"""Conversion of the matrices and multipliers of QPs to the forms of solver libraries.
 
-Libraries accept constraints in one of two forms, with rows R: `two_sided`, low ≤ Rx ≤
-high, and `to_cone`, Rx + s = r with the slack s in a product of cones. The multipliers
-of these rows are converted to those of the QP. Without discs and cones, the second form
-consists of equations Rx = r, followed by inequalities Rx ≤ r.
+Most libraries accept constraints in one of two forms with a matrix R. `two_sided`
+returns the form low ≤ Rx ≤ high. `to_cone` returns the form Rx + s = r with the slack s
+in a product of cones. Without discs and cones, the second form consists of equations
+Rx = r followed by inequalities Rx ≤ r. The multipliers of the rows of R are converted
+to multipliers of the QP.
 """
 
 from __future__ import annotations
@@ -22,23 +23,25 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
-#: absolute tolerance for solvers that require residual ≤ absolute + relative·size; so
-#: small that the relative tolerance decides
+#: absolute tolerance for solvers that require residual ≤ absolute + relative·size; it
+#: is so small that only the relative tolerance matters
 NEGLIGIBLE = 1e-14
 #: types of sets that have a conic form
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
-#: a claimed solution with a larger ‖x‖∞ counts as diverged: the terms of its residuals
-#: are so large that every relative residual is small
+#: A claimed solution with a larger ‖x‖∞ counts as diverged, because the terms of its
+#: residuals are so large that every relative residual is small.
 DIVERGED = 1e12
-#: ‖q‖∞ after scaling, for solvers that compare residuals with max(1, size): at sizes of
-#: about 1e4 the 1 has no effect, so their tests are relative, like those of the harness
+#: ‖q‖∞ after scaling, for solvers that compare residuals with max(1, size). At sizes of
+#: about 1e4 the 1 has no effect, so the tests of these solvers are relative, like the
+#: tests of the harness.
 OBJECTIVE_SIZE = 1e4
 
 
 def needs_dense(qp: QP, copies: float) -> str | None:
     """Return the reason to decline `qp` if its dense matrices are too large, or None.
 
-    copies : number of dense matrices of the size of P that the solver stores at once
+    copies : largest number of dense matrices, each as large as P, that the solver
+        stores at the same time
     """
     return needs_matrices(qp) or too_large(qp.q.size, copies)
 
@@ -70,7 +73,7 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`, or for "auto" the storage of P, "dense" or "sparse"."""
+    """Return `backend`; replace "auto" by "dense" or "sparse", as P is stored."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
@@ -82,7 +85,7 @@ def has_bound(qp: QP) -> NDArray[np.bool_]:
 
 
 def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
-    """Return R, low, high with low ≤ Rx ≤ high: rows of A, G and bounded x_j."""
+    """Return R, low, high with low ≤ Rx ≤ high, for rows of A, G and bounded x_j."""
     box = has_bound(qp)
     rows = vstack([csc(qp.A), csc(qp.G), eye_array(qp.q.size, format="csr")[box]])
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf), qp.lb[box]])
@@ -90,7 +93,7 @@ def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
 
 
 def from_two_sided(qp: QP, v: Vector) -> dict[str, Any]:
-    """Return y, z and z_box for multipliers v of `two_sided` rows (v ≥ 0 at `high`)."""
+    """Convert multipliers v of `two_sided` rows (v ≥ 0 at `high`) to y, z and z_box."""
     m, p = qp.b.size, qp.h.size
     z_box = np.zeros(qp.q.size)
     z_box[has_bound(qp)] = v[m + p :]
@@ -108,13 +111,17 @@ def to_two_sided(qp: QP, s: Solution) -> Vector:
 
 @dataclass(frozen=True, eq=False)
 class ConicForm:
-    """Constraints of a QP as  Rx + s = r  with s in a product of cones.
+    """Constraints of a QP in the form  Rx + s = r  with s in a product of cones.
 
-    The first components of s are zero (rows of A, and variables that a set fixes at 0).
-    The next ones are nonnegative (rows of G, x ≤ ub, −x ≤ −lb). The last ones are
-    blocks (t, w) with ‖w‖ ≤ t: (radius, x_I) for a disc of variables I, and (slope·x_N,
-    x_T) for a cone with normal and tangential components x_N and x_T. The vector v of
-    multipliers of the rows is in the dual cone, and Px + q + Rᵀv = 0 at a solution.
+    The components of s are, in this order:
+
+    - zeros (rows of A, and variables that a set fixes at 0),
+    - nonnegative numbers (rows of G, x ≤ ub, −x ≤ −lb),
+    - blocks (t, w) with ‖w‖ ≤ t: (radius, x_I) for a disc of variables I, and
+      (slope·x_N, x_T) for a cone with normal component x_N and tangential part x_T.
+
+    At a solution, the vector v of multipliers of the rows is in the dual cone, and
+    Px + q + Rᵀv = 0.
     """
 
     qp: QP
@@ -141,7 +148,7 @@ class ConicForm:
         return np.setdiff1d(np.arange(self.linear, self.rhs.size), self.heads)
 
     def multipliers(self, v: Vector) -> dict[str, Any]:
-        """Return y, z and z_box for the multipliers v of the rows."""
+        """Convert the multipliers v of the rows to y, z and z_box."""
         m, p, first = self.qp.b.size, self.qp.h.size, self.equalities
         is_row_of_set = np.ones(v.size, dtype=bool)
         is_row_of_set[:m] = is_row_of_set[first : first + p] = False
@@ -153,10 +160,14 @@ class ConicForm:
         }
 
     def point(self, s: Solution) -> tuple[Vector, Vector, Vector]:
-        """Return x, the multipliers v of the rows, and a slack in the cones."""
+        """Return x, multipliers v in the dual cone, and a slack in the cones.
+
+        s : point of the QP, whose multipliers are converted to v
+        """
         qp, first, last = self.qp, self.equalities, self.linear
-        # A row of a set has a single entry, ±1 or −slope. The product is therefore
-        # the multiplier times the square of the entry. The head row of a disc is empty.
+        # A row of a set has a single entry, ±1 or −slope. Its product with the
+        # multiplier is a component of z_box, so R z_box is the multiplier times the
+        # square of the entry. The head row of a disc has no entries.
         v = self.rows @ s.z_box
         squares = np.ravel(self.rows.multiply(self.rows).sum(axis=1))[self.heads]
         apex = np.divide(v[self.heads], squares, where=squares > 0, out=0 * squares)
@@ -181,9 +192,9 @@ class ConicForm:
 def to_cone(qp: QP) -> ConicForm:
     """Return the constraints of a QP in conic form.
 
-    A disc of radius 0 becomes equality rows: a second-order cone would leave no
-    interior, and interior-point methods would fail. A cone of slope 0 becomes rows x_T
-    = 0 and x_N ≥ 0.
+    A disc of radius 0 becomes equality rows. As a second-order cone, it would have no
+    interior, and interior-point methods would fail. A cone of slope 0 becomes rows
+    x_T = 0 and x_N ≥ 0.
     """
     up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
     eye = eye_array(qp.q.size, format="csr")
@@ -207,11 +218,11 @@ def to_cone(qp: QP) -> ConicForm:
 class _ConicBlocks(NamedTuple):
     """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]  for i < k."""
 
-    #: (k, d) indices of the variables bounded in norm, for each block
+    #: (k, d) indices of the variables whose norm is bounded, for each block
     tail: NDArray[np.int64]
-    side: Vector  #: (k,)
-    head: NDArray[np.int64]  #: (k,)
-    slope: Vector  #: (k,) zero for discs
+    side: Vector  #: (k,) radii of discs; zero for cones
+    head: NDArray[np.int64]  #: (k,) index of the normal component of each cone
+    slope: Vector  #: (k,) slopes of cones; zero for discs
     has_head: bool  #: False for discs, whose `head` is unused
 
     @property
@@ -221,7 +232,7 @@ class _ConicBlocks(NamedTuple):
         return flat
 
     def rows(self, n: int) -> tuple[csr_array, Vector]:
-        """Return R, r with blocks r − Rx = (side + slope·x_head, x_tail), not flat."""
+        """Return R, r with r − Rx = (side + slope·x_head, x_tail); omit flat blocks."""
         tail, side, head, slope = (part[~self.is_flat] for part in self[:4])
         k, d = tail.shape
         first = np.arange(k) * (d + 1)
@@ -268,10 +279,10 @@ def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
 
 
 def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
-    """Return z_box (n,) with zeros for multipliers of absent bounds.
+    """Return z_box (n,) with the multipliers of absent bounds set to zero.
 
-    Solvers may return rounding errors as such multipliers. If a larger value is set to
-    zero, the harness measures it as a residual of stationarity.
+    Solvers may return rounding errors for these multipliers. If a larger value is set
+    to zero, the harness measures it as a residual of stationarity.
     """
     return admissible(qp.sets, z_box)
 

@@ -1,4 +1,4 @@
-"""Polygons in place of discs and friction cones, for solvers without such sets."""
+"""Polygons that replace discs and friction cones, for solvers without these sets."""
 
 from __future__ import annotations
 
@@ -21,20 +21,21 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 class PolygonalQP:
     """Approximation of a QP in which polygons replace discs and sections of cones."""
 
-    qp: QP  #: QP whose G has a row for each side of a polygon, without discs and cones
-    #: 1 − cos(π/k) for k sides: a polygon contains the disc of (1 − error)·radius
+    qp: QP  #: QP without discs and cones; its G has a row for each side of a polygon
+    #: 1 − cos(π/k) for k sides; each polygon contains the disc of (1 − error)·radius
     error: float
-    #: maps a point of `qp` to a point of the original QP. Its `z_box` is normal to the
-    #: polygons, not to the circles, so its residuals on the original QP show the error
+    #: Maps a point of `qp` to a point of the original QP. The `z_box` of the result is
+    #: normal to the polygons rather than to the circles, so its residuals for the
+    #: original QP show the error of the approximation.
     recover: Callable[[Solution], Solution]
 
 
 def polygonal(qp: QP, sides: int) -> PolygonalQP:
     """Replace discs and friction cones by inscribed regular polygons and pyramids.
 
-    Every feasible point of the new QP is feasible in the original one. With the normals
-    n_j of the k sides, a disc becomes  n_jᵀx ≤ radius·cos(π/k),  and a cone  n_jᵀx_T ≤
-    slope·cos(π/k)·x_N  with x_N ≥ 0.
+    Every feasible point of the new QP is feasible for the original one. With the
+    normals n_j of the k sides, a disc is replaced by  n_jᵀx ≤ radius·cos(π/k),  and a
+    cone by  n_jᵀx_T ≤ slope·cos(π/k)·x_N  with x_N ≥ 0.
 
     sides : k, the number of sides of each polygon
 
@@ -79,7 +80,7 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
 
 
 def _sides(one: ConvexSet, sides: int, n: int) -> tuple[csr_array, Vector]:
-    """Return R, r such that Rx ≤ r are the sides of all polygons of a set."""
+    """Return R, r such that Rx ≤ r describes all polygons of a set."""
     if isinstance(one, Discs):
         tangents, radius, slope = one.index, one.radius, 0 * one.radius
     elif isinstance(one, Cones):

@@ -1,4 +1,4 @@
-"""Sequences of QPs: solver objects that are updated or start from the last point."""
+"""Sequences of QPs: solver objects that are updated, or that start from a point."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class Session(NamedTuple):
     """Operations on a library's solver object that has been set up for one QP."""
 
     solve: Callable[[], Solution]
-    #: replace the vectors of the QP, whose matrices and set of bounded variables are
-    #: unchanged; None if every QP needs a new session
+    #: replaces the vectors of the QP by those of a QP with the same matrices and the
+    #: same set of bounded variables; None if every QP needs a new session
     update: Callable[[QP], None] | None = None
-    #: start the next solve from this point; None if the library accepts no starting
-    #: point
+    #: sets the starting point of the next solve; None if the library does not accept a
+    #: starting point
     start: Callable[[Solution], None] | None = None
-    #: change the tolerance of all later solves; None if this requires a new session
+    #: changes the tolerance of all later solves; None if this requires a new session
     tighten: Callable[[float], None] | None = None
 
 
@@ -38,11 +38,11 @@ def tightening(
 ) -> Callable[[QP, float], Callable[[], Solution]]:
     """Return the `prepare` function for a sequence with a tolerance for each QP.
 
-    If only vectors have changed since the last QP, the session is updated, and a
-    library that supports warm starts continues from its last point. Otherwise `begin`
-    creates a new session, which starts from the last point if the library accepts a
-    start and the point has the right shape. A new tolerance also requires a new
-    session, unless the session has `tighten`.
+    If only vectors differ from the previous QP, the session is updated, and a library
+    that supports warm starts continues from its last point. Otherwise `begin` creates a
+    new session. The new session starts from the last point if the library accepts a
+    starting point and the sizes match. A new tolerance also requires a new session,
+    unless the session has `tighten`.
     """
     session: Session | None = None
     session_qp: QP
@@ -101,9 +101,9 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
-    """Return True if the point `s` of the QP `earlier` can be a start for `qp`."""
-    # if the QPs bound different variables, the rows of their conic forms, and thus the
-    # multipliers, do not correspond
+    """Return True if the point `s` of `earlier` can be a starting point for `qp`."""
+    # if the QPs bound different variables, the rows of their conic forms do not
+    # correspond, and neither do the multipliers
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))

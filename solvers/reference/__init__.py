@@ -1,1 +1,1 @@
-"""Reference solves, computed without code of the solvers under test."""
+"""Reference solvers, which share no code with the solvers under test."""

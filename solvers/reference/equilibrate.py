@@ -2,9 +2,10 @@
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
 largest entries until every largest entry is about one (Ruiz 2001, RAL-TR-2001-034).
-The scale of x relative to that of y and z remains free; it is chosen such that the
-largest entry of P is about one, whatever the unit of the objective. All factors are
-powers of two; hence scaling and scaling back cause no rounding errors.
+This leaves one common factor free, the scale of x relative to y and z. It is chosen
+such that the largest entry of P is about one, independently of the unit of the
+objective. All factors are powers of two, so the scaling and its inverse cause no
+rounding errors.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from scipy.sparse import csc_array, diags_array
 from mortarbench.harness import QP, Box, Matrix, Solution, Vector
 from mortarbench.harness.sets.blocks import Blocks
 
-#: limit of scaling rounds; fewer suffice for entries whose units differ by 1e±12
+#: largest number of scaling rounds; fewer rounds suffice if the units of the entries
+#: differ by factors from 1e-12 to 1e12
 ROUNDS = 20
 Exponents = NDArray[np.int64]
 
@@ -40,10 +42,11 @@ class ScaledQP:
 
 
 def equilibrate(qp: QP) -> ScaledQP:
-    """Scale a QP with an explicit P; all matrices become dense if P is, else sparse.
+    """Scale a QP with an explicit P.
 
-    Sets other than bounds must consist of blocks of variables; the variables of a block
-    receive a common scale.
+    The scaled P, A and G are dense if P is dense, and sparse otherwise. Sets other than
+    bounds must consist of blocks of variables; all variables of a block are scaled by
+    the same factor.
     """
     store = _dense if isinstance(qp.P, np.ndarray) else _sparse
     P, A, G = (store(M) for M in (qp.P, qp.A, qp.G))
@@ -52,7 +55,7 @@ def equilibrate(qp: QP) -> ScaledQP:
     for _ in range(ROUNDS):
         P_, A_, G_ = _times(d, P, d), _times(e, A, d), _times(h, G, d)
         columns = np.maximum.reduce([_largest(M, 0) for M in (P_, A_, G_)])
-        for one in blocks:  # one scale for all variables of a block
+        for one in blocks:  # one factor for all variables of a block
             columns[one.index] = columns[one.index].max(axis=1, keepdims=True)
         changes = [_root(v) for v in (columns, _largest(A_, 1), _largest(G_, 1))]
         if not any(c.any() for c in changes):

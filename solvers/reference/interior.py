@@ -1,22 +1,25 @@
 """Primal-dual interior-point method, which computes the start for refinement.
 
-Mehrotra's predictor-corrector method for  min ½xᵀPx + qᵀx,  Ax = b,  Cx + s = d,  s ≥ 0
+The method is Mehrotra's predictor-corrector method for the problem  min ½xᵀPx + qᵀx,
+Ax = b,  Cx + s = d,  s ≥ 0,  where C contains the rows of G and of the finite bounds
 (Nocedal and Wright 2006, Numerical Optimization, ch. 16.6; Gertz and Wright 2003, ACM
-Trans. Math. Softw. 29), where C contains the rows of G and of the finite bounds. With
-the diagonal matrix S/Z of sᵢ/zᵢ and the centring parameter σ, a step solves
+Trans. Math. Softw. 29). With the diagonal matrix S/Z of the entries sᵢ/zᵢ and the
+centring parameter σ, a step solves
 
     [P + δ  Aᵀ   Cᵀ ] [dx]   [−(Px + q + Aᵀy + Cᵀz)  ]
     [A      −δ      ] [dy] = [−(Ax − b)              ],  ds = −(Cx + s − d) − C dx,
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
-for r_sz = sz (predictor), then for r_sz = sz + ds dz − σμ (corrector), with
-componentwise products and μ = sᵀz/(number of rows of C). A step covers 0.995 of the
-distance to the boundary of s, z ≥ 0, with a common length for x, y, z and s. A disc
-‖x_I‖ ≤ r is the smooth constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the
-current x, and its multiplier adds z/r to the diagonal of P. δ is the parameter of a
-proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio 2021,
-Comput. Optim. Appl. 78). The solution does not depend on δ, which permits a singular P
-and linearly dependent rows.
+first for r_sz = sz (predictor), then for r_sz = sz + ds dz − σμ (corrector), where
+products are componentwise and μ = sᵀz/(number of rows of C). A step covers 0.995 of the
+distance to the boundary of s, z ≥ 0. The step length is the same for x, y, z and s.
+
+A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  Its row of C
+is x_I/r at the current x, and its multiplier adds z/r to the diagonal of P.
+
+δ is the parameter of a proximal method of multipliers centred at the iterate
+(Pougkakiotis and Gondzio 2021, Comput. Optim. Appl. 78). It permits a singular P and
+linearly dependent rows. The solution does not depend on δ.
 """
 
 from __future__ import annotations
@@ -43,11 +46,12 @@ from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
-#: KKT residual at which the iteration ends: small enough to identify the active
+#: KKT residual at which the iteration ends; it is small enough to identify the active
 #: constraints, which `polish` then treats as equations
 STOP_RESIDUAL = 1e-11
 MAX_ITERATIONS = 100
-#: number of iterations without halving the residual after which the loop ends
+#: the iteration ends after this number of consecutive iterations that have not halved
+#: the residual
 PATIENCE = 12
 #: fraction of the distance to the boundary that a step covers
 BOUNDARY_FRACTION = 0.995
@@ -64,7 +68,10 @@ class Iterate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """QP with rows of A for fixed variables; C stacks discs, G and bounds."""
+    """QP in the form  Ax = b,  Cx + s = d.
+
+    A contains rows for fixed variables. C contains the discs, G and the finite bounds.
+    """
 
     qp: QP
     A: Matrix
@@ -75,8 +82,8 @@ class _Problem:
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
     discs: tuple[Discs, ...]  #: discs of positive radius
-    #: maps the rows of discs and G to a function that factorises [P + D Bᵀ; B −W] with
-    #: B = [A; these rows]
+    #: maps the rows C₁ of discs and G to a function that factorises [P + D Bᵀ; B −W]
+    #: with B = [A; C₁]
     saddle: Callable[[Matrix], Factorise]
     delta: float
 
@@ -86,12 +93,15 @@ class _Problem:
         return int(self.qp.h.size) + sum(len(one.index) for one in self.discs)
 
     def C(self, x: Vector) -> Vector:
-        """Return ‖x_I‖²/2r for the discs, then Cx for the other rows."""
+        """Return ‖x_I‖²/2r for the discs, followed by Cx for the other rows."""
         of_discs = [norms(x[one.index]) ** 2 / one.radius / 2 for one in self.discs]
         return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
     def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
-        """Return the rows of discs (at x) and G, and the terms of discs in diag P."""
+        """Return the rows of discs (at x) and G, and the terms of discs in diag P.
+
+        z : multipliers of all rows of C, starting with the discs
+        """
         n, first = x.size, 0
         rows, curvature = list[Matrix](), np.zeros(n)
         for one in self.discs:
@@ -115,11 +125,11 @@ class _Problem:
         return start
 
     def factorise(self, w: Vector, rows: Matrix, curvature: Vector) -> Solve:
-        """Factorise the system of a step, diag(w) = S/Z; return the solution operator.
+        """Factorise the matrix of a step with S/Z = diag(w); return the solve function.
 
-        The rows of bounds are eliminated: they add 1/w to the diagonal of P.
+        The rows of bounds are eliminated, which adds 1/w to the diagonal of P.
 
-        rows, curvature : see `at`
+        rows, curvature : results of `at`
         """
         m, p = self.b.size, self.rows
         w_box = w[p:]
@@ -158,9 +168,10 @@ class _Problem:
 def interior_point(qp: QP, delta: float = DELTA) -> Solution:
     """Run the interior-point method; return the iterate with the smallest KKT residual.
 
-    The slacks and multipliers of all inequalities are positive. The constants suit a
-    QP whose largest entries are about one (`equilibrate`). No exception is raised if
-    the QP has no solution; the caller checks the residual.
+    At this iterate, the slacks and multipliers of all inequalities are positive. The
+    constants are chosen for a QP whose largest entries are about one (`equilibrate`).
+    If the QP has no solution, no exception is raised, so the caller must check the
+    residual.
     """
     problem = _problem(qp, delta)
     best, least, stalled = Solution.without_point(qp, Status.FAILED), np.inf, 0
@@ -226,10 +237,10 @@ def _stacked(A: Matrix, rows: Matrix) -> Matrix:
 
 
 def _start(problem: _Problem) -> Iterate:
-    """Minimise with ½‖Cx − d‖² in place of Cx ≤ d; shift s and z to be positive.
+    """Return the first iterate: a penalised minimiser with s and z shifted to s, z > 0.
 
-    Source: Vandenberghe (2010), The CVXOPT linear and quadratic cone program solvers,
-    section 5.3.
+    The term ½‖Cx − d‖² replaces the constraint Cx ≤ d (Vandenberghe 2010, The CVXOPT
+    linear and quadratic cone program solvers, section 5.3).
     """
     qp, m = problem.qp, problem.b.size
     solve = problem.factorise(
@@ -239,15 +250,15 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    # if x started far outside a disc, the slack of the disc would shrink before x came
-    # near the disc
+    # if x started far outside a disc, the slack of this disc would become small before
+    # x reached the disc
     for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)
 
 
 def _step(problem: _Problem, at: Iterate) -> Iterate:
-    """Return the next iterate, after a predictor and a centring corrector."""
+    """Return the next iterate, computed by a predictor and a centring corrector."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
     rows, curvature = problem.at(x, z)
@@ -272,6 +283,6 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
 
 
 def _step_length(at: Iterate, step: Iterate) -> float:
-    """Return the longest step length with s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
+    """Return the largest step length with s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
     lengths = [-v[dv < 0] / dv[dv < 0] for v, dv in ((at.s, step.s), (at.z, step.z))]
     return float(np.concatenate(lengths).min(initial=1 / BOUNDARY_FRACTION))

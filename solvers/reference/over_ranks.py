@@ -1,28 +1,30 @@
 """Reference solve of duals distributed over MPI ranks: active sets with CG on faces.
 
-Minimises ½xᵀFx + qᵀx subject to Gx = e, l ≤ x ≤ u and ‖x_I‖ ≤ r on discs, with the
-components of x distributed over the ranks (`harness.distributed`). The equality rows
-must be linearly independent on the components without bounds, as they are if all bodies
-are supported.
+The problem is to minimise ½xᵀFx + qᵀx subject to Gx = e, l ≤ x ≤ u and ‖x_I‖ ≤ r on
+discs. The components of x are distributed over the ranks (`harness.distributed`). The
+equality rows must be linearly independent on the components without bounds, which is
+the case if all bodies are supported.
 
 1. On a face, some components are fixed at bounds, and the free components x_𝓕 solve a
-   linear system. It is solved by projected preconditioned conjugate gradients with the
-   projector 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted from the true residual until only
-   rounding remains (iterative refinement). If x is on the boundary of a disc, with the
-   multipliers z_I = ηx_I, the disc is linearised there, as in Newton's method: with the
-   outward normal n, nᵀx_I = r, and x_I varies along the tangents, on which the
-   curvature of the boundary adds η to F.
-2. Primal-dual active sets (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13):
-   components with a multiplier of the wrong sign are freed, and components beyond a
-   bound are fixed there. Discs are treated likewise, with n and η computed from
-   w = x_I + γz_I (for friction: Hüeber, Stadler and Wohlmuth 2008, SIAM J. Sci. Comput.
-   30). The active sets may cycle. After ten consecutive changes that did not reduce the
-   number of wrong components, only the last wrong component changes, until there are
-   fewer of them (block principal pivoting, Júdice and Pires 1994, Comput. Oper. Res.
-   21). Without discs, this ends after finitely many changes.
+   linear system. The system is solved by projected preconditioned conjugate gradients
+   with the projector 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted from the true residual
+   until only rounding errors remain (iterative refinement). If x is on the boundary of
+   a disc, with the multipliers z_I = ηx_I, the disc is linearised as in Newton's
+   method: the normal component of x_I is fixed by nᵀx_I = r with the outward normal n,
+   and x_I varies along the tangents. The curvature of the boundary adds η to F along
+   the tangents.
+2. The active sets are updated by the primal-dual method (Hintermüller, Ito and Kunisch
+   2003, SIAM J. Optim. 13): components with a multiplier of the wrong sign are
+   released, and components that violate a bound are fixed at this bound. Discs are
+   treated in the same way, with n and η computed from w = x_I + γz_I (for friction, see
+   Hüeber, Stadler and Wohlmuth 2008, SIAM J. Sci. Comput. 30). The active sets may
+   cycle. After ten consecutive changes that did not reduce the number of wrong
+   components, only the last wrong component changes, until the number of wrong
+   components decreases (block principal pivoting, Júdice and Pires 1994, Comput. Oper.
+   Res. 21). Without discs, the algorithm ends after finitely many changes.
 
-The result is the solution, up to about rounding, for an active set that has no
-multiplier of the wrong sign and no violated bound. None of the solvers under test is
+The result belongs to an active set without multipliers of the wrong sign and without
+violated bounds. It is accurate to about rounding. No code of the solvers under test is
 used.
 """
 
@@ -44,34 +46,37 @@ from mortarbench.harness.sets.blocks import norms
 Mask = NDArray[np.bool_]
 
 MAX_FACES = 300
-#: number of consecutive changes of the active set that may fail to reduce the number of
-#: wrong components; after these, single components change
+#: Largest number of consecutive changes of the active set that do not reduce the number
+#: of wrong components. Afterwards, components change one at a time.
 PATIENCE = 10
 CG_REDUCTION = 1e-6  #: reduction of the projected residual in each round of CG
-MAX_CG_ROUNDS = 3  #: limit of CG rounds on a face
-MAX_CG_STEPS = 300  #: limit of CG steps in a round
-#: CG ends at this norm of the projected residual, relative to that of the projected q
+MAX_CG_ROUNDS = 3  #: largest number of CG rounds on a face
+MAX_CG_STEPS = 300  #: largest number of CG steps in a round
+#: no further CG round starts if the norm of the projected residual is at most this
+#: factor times the norm of the projected q
 ROUNDING_RESIDUAL = 1e-14
-#: Multipliers of the wrong sign and violations of bounds count as rounding below this
-#: value, relative to the largest multiplier or component.
+#: multipliers of the wrong sign and violations of bounds count as rounding errors below
+#: this value, relative to the largest multiplier or component
 SIGN_ROUNDING = 1e-12
 #: largest final angle in radians between x and the normal at which a disc was
-#: linearised; the remaining error of Newton's method is about its square
+#: linearised; the remaining error of Newton's method is about the square of the angle
 MAX_TURN = 1e-7
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 
 
 def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
-    """Solve a distributed dual to about rounding; collective over all ranks.
+    """Solve a distributed dual, accurate to about rounding.
+
+    The call is collective over all ranks.
 
     qp : the dual, with the local components of this rank
-    start : solution of a dual that differs only in its bounds; its active set is tried
-        first
+    start : solution of a dual that differs only in its bounds; the active set of this
+        solution is tried first
 
     Raises
     ------
     ArithmeticError
-        If no active set is confirmed within 300 faces, if the point of the confirmed
+        If no active set is confirmed after 300 faces, if the point of the confirmed
         active set has a KKT residual above 1e-9, or if the equality rows are linearly
         dependent on a face.
 
@@ -93,7 +98,8 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
             wrong = task.only_last(wrong)
         face = following._replace(state=np.where(wrong, following.state, face.state))
     raise ArithmeticError(
-        f"the reference solve over ranks found no active set in {MAX_FACES} trials"
+        "the reference solve over ranks did not find the optimal active set among "
+        f"{MAX_FACES} trials"
     )
 
 
@@ -110,8 +116,8 @@ def _check_residual(qp: QP, task: _Task, point: _Point, faces: int) -> Solution:
     worst = kkt_residuals(qp, s).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
         raise ArithmeticError(
-            f"the reference solve over ranks left a residual of {worst:.1e}, more than "
-            f"{MAX_REFERENCE_RESIDUAL:g}"
+            f"the reference solve over ranks left a KKT residual of {worst:.1e}, more "
+            f"than {MAX_REFERENCE_RESIDUAL:g}"
         )
     return s
 
@@ -121,7 +127,7 @@ class _Point(NamedTuple):
 
     x: Vector  #: (n,)
     y: Vector  #: (r,) multipliers of Gx = e, replicated on every rank
-    z: Vector  #: (n,) multipliers, normal to the sets: negative at a lower bound
+    z: Vector  #: (n,) multipliers, normal to the sets; negative at a lower bound
 
     @classmethod
     def of(cls, s: Solution) -> _Point:
@@ -130,7 +136,7 @@ class _Point(NamedTuple):
 
 
 class _Face(NamedTuple):
-    """Components at bounds, and discs that are linearised on their boundary."""
+    """Face: components at bounds, and discs that are linearised on their boundary."""
 
     #: (n + k,): for components, −1 at the lower bound, 1 at the upper bound, else 0;
     #: for discs, 1 on the boundary, else 0
@@ -184,7 +190,7 @@ class _Task:
         return float(self.G.ranks.total(np.array([part]))[0])
 
     def only_last(self, which: Mask) -> Mask:
-        """Keep only the last True over all ranks, in ascending order of ranks."""
+        """Return a mask with only the last True of all ranks, in order of ranks."""
         ranks = self.G.ranks
         local = np.flatnonzero(which)
         last_rank = ranks.extreme(float(ranks.rank if local.size else -1), np.max)
@@ -202,10 +208,9 @@ class _Task:
         return self.F(x) + self.q
 
     def moving(self, face: _Face) -> tuple[csr_array, Vector]:
-        """Return the projector (n, n) along a face and the origin (n,) of the face.
+        """Return the projector (n, n) along the face, and the origin (n,) of the face.
 
-        The origin contains the fixed components of x; its projection onto these
-        directions is zero.
+        The origin contains the fixed components of x; its projection is zero.
         """
         n, (index, radius) = self.q.size, (self.discs.index, self.discs.radius)
         at_bound, sliding = face.state[:n], self.on_disc(face)
@@ -221,10 +226,7 @@ class _Task:
         return csr_array(diags_array(free) - across), origin
 
     def minimise_on_face(self, x: Vector, face: _Face) -> _Point:
-        """Minimise on a face.
-
-        x : start
-        """
+        """Return the minimiser on a face, computed by CG from the start x."""
         moving, origin = self.moving(face)
         curvature, on_disc = np.zeros(x.size), self.on_disc(face)
         curvature[self.discs.index] = (face.curvature * on_disc)[:, None]
@@ -234,7 +236,7 @@ class _Task:
         except CholmodNotPositiveDefiniteError:
             raise ArithmeticError(
                 "the reference solve over ranks reached a face with linearly dependent "
-                "equality rows: with these contacts open, some body is not supported"
+                "equality rows; some body is not supported if these contacts are open"
             ) from None
 
         def spread(t: Vector) -> Vector:
@@ -246,25 +248,25 @@ class _Task:
             return np.asarray(v - spread(self.G @ v))
 
         def bent(v: Vector) -> Vector:
-            """Return the product of v with the curvature of the boundary of discs."""
+            """Return the curvature terms of the boundaries of discs, times v."""
             return np.asarray(curvature * (moving @ v))
 
-        # M ≈ F⁻¹ is too large if the curvature exceeds F, as on small discs. It is zero
-        # along redundant rows (friction on supported nodes), although the curvature
-        # acts there too
+        # M ≈ F⁻¹ is too large if the curvature exceeds F, as on small discs. Along
+        # redundant rows (friction on supported nodes), M is zero although the curvature
+        # is not.
         length = np.zeros(x.size)
         length[self.discs.index] = (self.length * on_disc)[:, None]
         soft = 1 / np.sqrt(1 + length * curvature)
 
         def precondition(v: Vector) -> Vector:
-            """Return an approximation of (F + curvature)⁻¹v in the face."""
+            """Return an approximation of (F + curvature)⁻¹v along the face."""
             return project(soft * (self.M(soft * v) + length * (soft * v)))
 
         x = origin + moving @ x
         x += spread(self.e - self.G @ x)
         size = self.norm(project(self.q))
         for _ in range(MAX_CG_ROUNDS):
-            # the second projection removes the rounding of the first
+            # the second projection removes the rounding errors of the first
             w = project(project(-self.gradient(x) - bent(x)))
             if self.norm(w) <= ROUNDING_RESIDUAL * size:
                 break
@@ -283,7 +285,7 @@ class _Task:
         precondition: Callable[[Vector], Vector],
         bent: Callable[[Vector], Vector],
     ) -> Vector:
-        """Return d in the face such that 𝒫(w − Fd − bent(d)) is small, by CG."""
+        """Return a d along the face such that 𝒫(w − Fd − bent(d)) is small, by CG."""
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
         p = y = precondition(w)
         wy = self.total(float(w @ y))
@@ -291,7 +293,7 @@ class _Task:
             Fp = self.F(p) + bent(p)
             self.products += 1
             curvature = self.total(float(p @ Fp))
-            if not min(wy, curvature) > 0:  # only rounding along redundant rows is left
+            if not min(wy, curvature) > 0:  # only rounding errors along redundant rows
                 break
             alpha = wy / curvature
             d += alpha * p
@@ -307,8 +309,8 @@ class _Task:
         """Return the face that contains `point`, the solution of a similar problem."""
         x, z, index = point.x, point.z, self.discs.index
         at_bound = (z != 0) | (self.lower == self.upper)
-        # use the nearer bound, not the sign of z: a multiplier near zero may have
-        # either sign
+        # use the nearer bound instead of the sign of z, because rounding may change the
+        # sign of a multiplier near zero
         below = x - self.lower <= self.upper - x
         at_bound[index] = False
         state = np.where(at_bound, np.where(below, -1, 1), 0)
@@ -322,7 +324,7 @@ class _Task:
         )
 
     def next_face(self, point: _Point, face: _Face) -> _Face:
-        """Return the face predicted from signs of multipliers and violated bounds."""
+        """Return the face predicted by the signs of multipliers and violated bounds."""
         x, _, z = point
         n, radius = x.size, self.discs.radius
         largest = [
@@ -345,7 +347,7 @@ class _Task:
         return np.asarray(face.state[self.q.size :] > 0)
 
     def is_normal(self, point: _Point, face: _Face) -> bool:
-        """Return True if x is normal to the linearised discs, up to `MAX_TURN`."""
+        """Return True if x_I is normal to each linearised disc, up to `MAX_TURN`."""
         on, across = self.on_disc(face), np.asarray(self.moving(face)[0] @ point.x)
         turn = norms(across[self.discs.index])[on] / self.discs.radius[on]
         return self.G.ranks.extreme(float(turn.max(initial=0.0)), np.max) <= MAX_TURN

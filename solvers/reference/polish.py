@@ -1,18 +1,20 @@
 """Refinement of a solution in extended precision, with active constraints as equations.
 
-For a fixed active set the KKT conditions are linear. They are solved by iterative
-refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) with
+For a fixed active set, the KKT conditions are linear. They are solved by iterative
+refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12), with
 residuals evaluated in `numpy.longdouble` and a factorisation of
 
     [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
     [B_F       −δ  ]     B: A and the active rows of G.
 
-δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
-are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1).
-If the solution or its multipliers are not unique, the steps converge to a solution near
-the start. After convergence, violated constraints enter the active set and constraints
-with a multiplier of the wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM
-J. Optim. 13), until the active set no longer changes.
+The shift δ makes the matrix regular for every P and B. The limit of the refinement does
+not depend on δ, because its steps are those of the proximal method of multipliers
+(Rockafellar 1976, Math. Oper. Res. 1). If the solution or its multipliers are not
+unique, the steps converge to a solution near the start.
+
+After convergence, violated constraints enter the active set, and constraints with a
+multiplier of the wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J.
+Optim. 13). This is repeated until the active set no longer changes.
 """
 
 from __future__ import annotations
@@ -30,15 +32,16 @@ from mortarbench.solvers.reference.saddle import saddle
 
 Extended = NDArray[np.longdouble]
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
-MAX_REFINEMENTS = 40  #: limit of refinement steps per active set
-#: refinement ends if a step is longer than this times the previous step
+MAX_REFINEMENTS = 40  #: largest number of refinement steps per active set
+#: the refinement ends if the ratio of the lengths of two successive steps is not below
+#: this value
 MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
-#: number of updates of the whole active set, after which only the worst constraint
-#: changes
+#: number of updates of the whole active set; in later updates, only the constraint with
+#: the largest error changes
 FULL_CHANGES = 10
-#: Multipliers of the wrong sign and violations count as rounding below this value,
-#: relative to the largest component.
+#: multipliers of the wrong sign and violations count as rounding errors below this
+#: value, relative to the largest component
 SIGN_ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -68,12 +71,12 @@ class _Problem:
         return np.asarray(g, dtype=np.longdouble)
 
 
-@np.errstate(all="ignore")  # residuals that overflow are not finite; callers check that
+@np.errstate(all="ignore")  # the caller rejects points whose residuals overflow
 def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
-    """Yield a refined point for each active set that is tried, often just one.
+    """Yield a refined point for each active set that is tried (often only one).
 
     qp : QP whose largest entries are about one, with P, A and G all dense or all sparse
-    start : point near a solution, such as that of an interior-point method
+    start : point near a solution, for example the result of an interior-point method
     delta : δ; a smaller value resolves weaker curvature and more nearly parallel rows,
         but brings the matrix closer to singularity
     """
@@ -123,14 +126,14 @@ def _solve_active_set(
 def _update_active_set(
     problem: _Problem, active: _Active, at: _Point, *, one: bool
 ) -> _Active:
-    """Add violated constraints; drop those with a multiplier of the wrong sign.
+    """Activate violated constraints; release those with a multiplier of wrong sign.
 
-    Nearly dependent active rows cannot all be satisfied unless their multipliers are
-    huge. So if no other constraint is wrong, active rows with a remaining slack are
-    dropped.
+    Nearly dependent active rows can all be satisfied only with huge multipliers.
+    Therefore, if no other constraint is wrong, active rows with a remaining slack are
+    released.
 
-    one : change only the constraint with the largest error, relative to the size of x
-        (violations) or of the gradient (signs)
+    one : True to change only the constraint with the largest error, relative to the
+        size of x (violations) or of the gradient (signs)
     """
     qp, side = problem.qp, active.side
     g = problem.gradient(at)

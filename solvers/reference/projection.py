@@ -1,19 +1,21 @@
 """Reference solve of QPs over arbitrary convex sets, which uses only projections.
 
-With M = [A; G; I], the product S of the sets and C = {b} × {w ≤ h} × S, a QP is  min
-½xᵀPx + qᵀx,  Mx ∈ C. With the projection Π onto C, a point t of the space of Mx defines
-both w = Π(t) in C and multipliers λ = R(t − w) normal to C at w, if R > 0 is diagonal
-and constant within each set. The remaining KKT conditions state that the normal map is
-zero (Robinson 1992, Math. Oper. Res. 17),
+Let M = [A; G; I], and C = {b} × {w ≤ h} × S with the product S of the sets. The QP is
+to minimise ½xᵀPx + qᵀx subject to Mx ∈ C. Let Π be the projection onto C, and R > 0 a
+diagonal matrix that is constant within each set. Then a point t of the space of Mx
+defines both w = Π(t) in C and multipliers λ = R(t − w), which are normal to C at w. The
+remaining KKT conditions state that the normal map is zero (Robinson 1992, Math. Oper.
+Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, approaches a zero
-   of (1) from any start. Anderson acceleration with a safeguard (Zhang, O'Donoghue and
-   Boyd 2020, SIAM J. Optim. 30) is needed for a singular P.
-2. Newton's method converges to this zero, with Π' from difference quotients and
-   residuals in extended precision. The error √ε of the quotients limits only the rate
-   of convergence: each step reduces the residual by about this factor.
+1. ADMM with penalty R approaches a zero of (1) from any start (Stellato et al. 2020,
+   Math. Prog. Comp. 12). If P is singular, it needs Anderson acceleration with a
+   safeguard (Zhang, O'Donoghue and Boyd 2020, SIAM J. Optim. 30).
+2. Newton's method then converges to this zero. The derivative of Π is approximated by
+   difference quotients, and residuals are evaluated in extended precision. The error √ε
+   of the quotients limits only the rate of convergence: each step reduces the residual
+   by about the factor √ε.
 """
 
 from __future__ import annotations
@@ -34,11 +36,11 @@ MEMORY = 10  #: number of iterates per acceleration, and between two acceleratio
 #: shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
-#: penalty of rows of A relative to that of all others, as in OSQP
+#: penalty of rows of A relative to all other penalties, as in OSQP
 EQUALITY_PENALTY = 1e3
-MAX_PENALTY_CHANGE = 10.0  #: largest factor between the penalties of two rounds
-DIFFERENCE_STEP = 2.0**-26  #: √ε, step of difference quotients relative to t
-#: relative diagonal shift of the Newton matrix: it regularises dependent rows and
+MAX_PENALTY_CHANGE = 10.0  #: largest ratio of the penalties of two successive rounds
+DIFFERENCE_STEP = 2.0**-26  #: √ε, the step of difference quotients relative to t
+#: relative diagonal shift of the Newton matrix, which regularises dependent rows; it
 #: perturbs the steps, but not the zero of (1)
 SHIFT = 1e-15
 
@@ -50,7 +52,7 @@ class _Problem:
     qp: QP
     P: Any
     M: Any  #: (r, n) normalised rows of A and G, then I
-    size: Vector  #: (m + p,) lengths of these rows
+    size: Vector  #: (m + p,) norms of the rows of A and G; 1 for a zero row
 
     @classmethod
     def of(cls, qp: QP) -> _Problem:
@@ -96,7 +98,7 @@ class _Problem:
 
 
 def refine(qp: QP, start: Solution) -> Solution:
-    """Refine a point near the solution by Newton's method."""
+    """Refine a point near a solution by Newton's method; return the refined point."""
     problem = _Problem.of(qp)
     R = problem.penalty(problem.largest)
     forces = np.concatenate([np.append(start.y, start.z) * problem.size, start.z_box])
@@ -129,7 +131,7 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
         x, w = primal_point(t), project(t)
         multipliers = R * (t - w)
         yield problem.solution(_newton(problem, R, t), R)
-        # balance the relative residuals by the factor √(primal/dual), as OSQP does
+        # multiply the penalty by √(primal/dual) to balance the residuals, as in OSQP
         primal = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
         forces = [P @ x, q, M.T @ multipliers]
         dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
@@ -138,11 +140,11 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
 
 
 def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vector:
-    """Iterate t ← step(t), accelerated every `MEMORY` of `count` iterations.
+    """Iterate t ← step(t) `count` times, with an acceleration every `MEMORY` steps.
 
-    An accelerated point is used only if its residual ‖step(t) − t‖ is not larger;
-    without acceleration the residual never increases, since the step is an averaged
-    operator.
+    An accelerated point is used only if its residual ‖step(t) − t‖ is not larger than
+    the last one. The residual of plain steps never increases, because `step` is an
+    averaged operator.
     """
     images, changes = list[Vector](), list[Vector]()
     for _ in range(count // MEMORY):
@@ -169,10 +171,10 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop
 def _newton(problem: _Problem, R: Vector, t: Vector) -> Any:
-    """Return the Newton iterate, starting from t, with the least residual of (1).
+    """Run Newton's method from t; return the iterate with the smallest residual of (1).
 
-    x is eliminated, as the components of Π(t) in the rows of I, so that t is the only
-    unknown.
+    x is eliminated: it consists of the components of Π(t) for the rows of I. Therefore
+    t is the only unknown.
     """
     P, M, q, k = problem.P, problem.M, problem.qp.q, problem.size.size
     t, rows = t.astype(np.longdouble), M[:k]

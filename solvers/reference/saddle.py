@@ -1,9 +1,10 @@
 """Saddle-point systems [P + D Bᵀ; B −W] with diagonal D, W > 0, solved by LU factors.
 
-If P is positive semidefinite, such a matrix is quasidefinite: it is regular and has
+If P is positive semidefinite, the matrix is quasidefinite: it is regular and has
 triangular factors for every symmetric permutation (Vanderbei 1995, SIAM J. Optim. 5).
-So a sparse matrix is ordered for least fill and factorised without pivoting. If D and W
-are so small that rounding spoils these factors, partial pivoting is used instead.
+A sparse matrix is therefore ordered to reduce fill and factorised without pivoting. If
+D and W are so small that these factors are inaccurate because of rounding, partial
+pivoting is used instead.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import Matrix, Vector
 
-#: arguments of `splu` for a symmetric ordering of least fill, without pivoting
+#: arguments of `splu` for a symmetric fill-reducing ordering without pivoting
 LEAST_FILL = dict(
     permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)
 )
 PIVOTED = dict(permc_spec="COLAMD", diag_pivot_thresh=1.0)
-#: largest relative residual of a solve at which one step of refinement still suffices
+#: largest relative residual of a solve for which one step of refinement suffices
 MAX_SOLVE_RESIDUAL = 1e-6
 
 Solve = Callable[[Vector, Vector], tuple[Vector, Vector]]
@@ -32,7 +33,7 @@ Factorise = Callable[[Vector, Vector], Solve]
 def saddle(P: Matrix, B: Matrix) -> Factorise:
     """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    That function returns the solution operator (r, t) ↦ (u, v), and raises
+    The returned function returns the solution operator (r, t) ↦ (u, v). It raises
     ArithmeticError if an entry of D or W is not finite or a pivot is zero.
 
     P, B : (n, n) and (r, n) matrices, both dense or both sparse
@@ -44,9 +45,7 @@ def saddle(P: Matrix, B: Matrix) -> Factorise:
 
     def factorise(D: Vector, W: Vector) -> Solve:
         if not (np.isfinite(D).all() and np.isfinite(W).all()):
-            raise ArithmeticError(
-                "the saddle-point matrix has entries that are not finite"
-            )
+            raise ArithmeticError("the saddle-point matrix has infinite or NaN entries")
         K = with_diagonal(np.append(D, -W))
         once = _factorise(K)
 
@@ -113,6 +112,6 @@ def _factorise(K: Matrix) -> Callable[[Vector], Vector]:
 
 
 def _is_accurate(solve: Callable[[Vector], Vector], K: Matrix) -> bool:
-    """Return True if the factors solve a test system to MAX_SOLVE_RESIDUAL."""
+    """Return True if the residual of a test system is at most MAX_SOLVE_RESIDUAL."""
     v = K @ np.linspace(1, 2, K.shape[0])
     return bool(np.abs(K @ solve(v) - v).max() <= MAX_SOLVE_RESIDUAL * np.abs(v).max())

@@ -1,19 +1,19 @@
 """Reference solutions of QPs, computed without any of the solvers under test.
 
-With lower bounds only and a dense positive definite P = LLᵀ, min ½xᵀPx + qᵀx over
-x ≥ lb is the nonnegative least-squares problem min ½‖Lᵀy + L⁻¹(q + P lb)‖² over
-y = x − lb ≥ 0. Lawson and Hanson's active-set method ends after finitely many steps
-with the exact active set; the free components are then recomputed by a direct solve
-with one step of iterative refinement.
+If P = LLᵀ is dense and positive definite and x ≥ lb is the only constraint, the QP is
+equivalent to the nonnegative least-squares problem min ½‖Lᵀy + L⁻¹(q + P lb)‖² over
+y = x − lb ≥ 0. The active-set method of Lawson and Hanson ends after finitely many
+steps with the exact active set. The free components are then recomputed by a direct
+solve with one step of iterative refinement.
 
-Any other QP is scaled (`equilibrate`) and solved by an interior-point method until the
-active constraints can be identified (`interior`). The equations of the active set are
-then solved with refinement in extended precision (`polish`). The result is the point
-with the smallest KKT residual, as the harness measures it on the original QP.
+Every other QP is scaled (`equilibrate`) and solved by an interior-point method until
+the active constraints can be identified (`interior`). The equations of the active set
+are then solved with refinement in extended precision (`polish`). The result is the
+point with the smallest KKT residual, as the harness measures it on the original QP.
 
 If the sets are bounds and discs, the point of the interior-point method is refined by a
-method that uses projections (`projection`). A QP with other sets is solved by that
-method alone.
+method that uses projections (`projection`). A QP with other sets is solved by the
+projection method alone.
 """
 
 from __future__ import annotations
@@ -34,27 +34,29 @@ from mortarbench.solvers.reference.interior import DELTA, interior_point
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates, refine
 
-#: largest KKT residual of a reliable start for refinement. From a start with a larger
-#: residual, refinement of a QP with many solutions ended at a solution of size 1e10,
-#: whose rounding hid errors of the optimal value; in this case, other starts are tried
+#: Largest KKT residual of a reliable start for refinement; if the residual is larger,
+#: other starts are tried. From such a start, the refinement of a QP with many solutions
+#: ended at a solution of size 1e10, whose rounding hid errors of the optimal value.
 MAX_START_RESIDUAL = 1e-3
-#: number of rounds of `projection` without a smaller residual after which it may end
+#: number of rounds of `projection` without a smaller residual after which a residual of
+#: at most MAX_REFERENCE_RESIDUAL is accepted
 MAX_IDLE_ROUNDS = 1
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
-#: δ of the interior-point method for discs and a singular P: with a smaller δ, steps
-#: along the kernel of P end far outside discs, where their linearisation fails
+#: δ of the interior-point method for discs and a singular P; with a smaller δ, steps
+#: along the kernel of P end so far outside discs that the linearisation fails
 SINGULAR_DELTA = 1e-7
-#: data of a scaled QP larger than this times their median count as outliers
+#: data of a scaled QP count as outliers above this factor times their median
 OUTLIER_FACTOR = 1e4
 
 
 def reference_solution(qp: QP) -> Solution:
-    """Solve a convex QP; x and its multipliers are accurate to about rounding.
+    """Return a solution of a convex QP, with x and multipliers accurate to rounding.
 
-    `iterations` counts the steps of the interior-point method, if it ran. The remaining
-    residual is due to rounding x to double precision: about 1e-16·|P||x| relative to
-    |Px|, a few times 1e-12 for the displacements of stiff bodies. P must be positive
-    semidefinite, which is not checked.
+    The field `iterations` contains the number of steps of the interior-point method, if
+    it ran. The remaining residual is due to the rounding of x to double precision. It
+    is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for the
+    displacements of stiff bodies. P must be positive semidefinite, which is not
+    checked.
 
     Raises
     ------
@@ -76,9 +78,9 @@ def reference_solution(qp: QP) -> Solution:
     if not qp.is_explicit and is_small(qp):
         qp = replace(qp, P=assembled(qp.P))
     if not qp.is_explicit:
-        raise ValueError("the reference solve needs P as a matrix, got an operator")
+        raise ValueError("the reference solve needs P as a matrix; got an operator")
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
-        raise ValueError("the reference solve needs finite matrices, got NaN or inf")
+        raise ValueError("the reference solve needs finite matrices; got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
     ways: tuple[Iterator[Solution], ...] = (
         _candidates(qp),
@@ -106,8 +108,8 @@ def reference_solution(qp: QP) -> Solution:
     if least <= MAX_REFERENCE_RESIDUAL:
         return best
     raise ArithmeticError(
-        "the reference solve found no optimal point, the least KKT residual is "
-        f"{least:.1e}: the QP may be infeasible or unbounded"
+        "the reference solve found no optimal point (smallest KKT residual: "
+        f"{least:.1e}); the QP may be infeasible or unbounded"
     )
 
 
@@ -118,9 +120,9 @@ def _residual(qp: QP, s: Solution) -> float:
 
 
 def _candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points, each usually more accurate than the previous one."""
+    """Yield points, each of them usually more accurate than the previous one."""
     if _is_nonnegative(qp):
-        # LinAlgError: P is singular; RuntimeError: scipy's nnls reached its step limit
+        # LinAlgError if P is singular; RuntimeError if nnls reached its step limit
         with suppress(np.linalg.LinAlgError, RuntimeError):
             yield (point := _nonnegative(qp))
             if _residual(qp, point) <= MAX_RESIDUAL:
@@ -132,7 +134,7 @@ def _candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
-    """Yield an interior point of a QP over bounds and discs, then its refinement."""
+    """Yield the interior-point solution for bounds and discs, then its refinement."""
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp, delta)
     yield scaled.recover(start)
@@ -165,7 +167,10 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 
 
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points for a smaller δ: weak curvature or nearly parallel rows need it."""
+    """Yield points computed with a smaller δ.
+
+    Weak curvature and nearly parallel rows require a smaller δ.
+    """
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     for delta in (1e-13, 1e-16):
@@ -180,13 +185,14 @@ def _outlier_size(qp: QP) -> float:
 
 
 def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
-    """Drop or clip the outliers among the data of a scaled QP, to compute a start.
+    """Return a scaled QP without the outliers among its data, to compute a start.
 
-    Bounds and rows with outliers are assumed to be inactive, and an objective
-    coefficient that is an outlier is assumed to keep its variable at a bound even after
-    clipping. The residual on the original QP checks both assumptions.
+    Bounds and rows with outliers are omitted, on the assumption that they are inactive.
+    Coefficients of the objective that are outliers are clipped, on the assumption that
+    their variables stay at a bound. The residual on the original QP shows whether both
+    assumptions are true.
 
-    near : (p,) rows to keep
+    near : (p,) mask of the rows to keep
     """
     most = _outlier_size(qp)
     tamed = replace(qp, q=np.clip(qp.q, -most, most), G=qp.G[near], h=qp.h[near])
@@ -207,7 +213,7 @@ def _is_nonnegative(qp: QP) -> bool:
 
 def _nonnegative(qp: QP) -> Solution:
     """Minimise ½xᵀPx + qᵀx over x ≥ lb by nonnegative least squares."""
-    # imported here because it is slow and workers do not need it
+    # imported here because the import is slow and workers do not need nnls
     from scipy.optimize import nnls
 
     P, gradient_at_lb = qp.P, qp.q + qp.P @ qp.lb

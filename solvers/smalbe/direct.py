@@ -1,9 +1,9 @@
-"""SMALBE for small problems: Cholesky factors of faces instead of iterations.
+"""SMALBE for small problems, with Cholesky factors of faces instead of iterations.
 
-Minimises ½xᵀPx + qᵀx subject to Gx = e and l ≤ x ≤ u by the proximal method of
-multipliers (Rockafellar, Math. Oper. Res. 1, 1976, 97-116). With orthonormal rows C
-that span the rows of G, the shortest x̃ with Gx̃ = e, and the diagonal D of P, for k =
-0, 1, …:
+The method minimises ½xᵀPx + qᵀx subject to Gx = e and l ≤ x ≤ u by the proximal method
+of multipliers (Rockafellar, Math. Oper. Res. 1, 1976, 97-116). Let C be orthonormal
+rows that span the rows of G, x̃ the shortest vector with Gx̃ = e, and D the diagonal of
+P. The following steps are repeated for k = 0, 1, …:
 
 1. x ← argmin over the box of
    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2 ‖C(x − x̃)‖² + δ/2 ‖x − x_k‖²_D,
@@ -11,8 +11,9 @@ that span the rows of G, the shortest x̃ with Gx̃ = e, and the diagonal D of P
 2. a ← a + ρC(x − x̃), x_{k+1} = x.
 
 This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with exact
-inner solves, M = 0. If P is singular on a face, the proximal term makes P + ρCᵀC + δD
-positive definite; this term vanishes at the solution, where x = x_k.
+inner solves, that is, M = 0. If P is singular on a face, the proximal term makes
+P + ρCᵀC + δD positive definite. The proximal term is zero at the solution, where x =
+x_k.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: largest number of unknowns; a face costs O(n³), and `smalbe` is faster even
-#: for fewer unknowns
+#: largest number of unknowns; a face costs O(n³), so `smalbe` is faster already for
+#: fewer unknowns
 MAX_UNKNOWNS = 2000
 INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
-MAX_RHO = 1e9  #: limit of ρ/‖P‖; ρ grows if ‖C(x − x̃)‖ decreases slowly
+MAX_RHO = 1e9  #: largest ρ/‖P‖; ρ is increased if ‖C(x − x̃)‖ decreases slowly
 DELTA = 1e-10  #: weight δ of the proximal term
 
 
@@ -44,22 +45,24 @@ DELTA = 1e-10  #: weight δ of the proximal term
 class Direct:
     """In-house SMALBE for small problems, with updated Cholesky factors of faces.
 
-    The outer loop ends when the KKT residuals of the QP are within `tol` or no longer
-    decrease. The point is reported as solved if its residuals are within 5·tol.
+    The loop ends when all KKT residuals of the QP are at most `tol`, or when they no
+    longer decrease. The solver claims a solution if all residuals are at most 5·tol.
     """
 
-    max_solves: int = 10_000  #: limit of the number of solves with factors of faces
+    max_solves: int = 10_000  #: largest total number of solves with factors of faces
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",
         licence="BSD-3-Clause",
-        method="augmented Lagrangian with an exact inner active-set method",
-        linear_solver="dense Cholesky factor, updated as the active set changes",
-        phases="preparing orthonormalises rows and factorises the free block",
+        method="augmented Lagrangian with an exact active-set method inside",
+        linear_solver="dense Cholesky factor, updated when the active set changes",
+        phases="the preparation orthonormalises the equality rows and factorises the "
+        "block of unbounded variables; the solve iterates",
         limits=(
-            "inequality rows are declined; the dual forms of a problem have none",
-            f"QPs with more than {MAX_UNKNOWNS} unknowns are declined; with a sparse "
-            "P, `smalbe` is faster above 100 to 200 unknowns",
+            "QPs with inequality rows are declined; the dual forms of a problem do not "
+            "have such rows.",
+            f"QPs with more than {MAX_UNKNOWNS} unknowns are declined. If P is sparse, "
+            "`smalbe` is faster for more than 100 to 200 unknowns.",
         ),
     )
 
@@ -68,9 +71,9 @@ class Direct:
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
-            return "takes bounds and equality rows, no inequality rows"
+            return "accepts bounds and equality rows, but no inequality rows"
         if qp.q.size > MAX_UNKNOWNS:
-            return f"is for small problems; takes at most {MAX_UNKNOWNS} unknowns"
+            return f"is for small problems; accepts at most {MAX_UNKNOWNS} unknowns"
         return needs_dense(qp, 3)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -102,11 +105,11 @@ class _Task:
     faces: Faces
 
     def point(self, *, fitted: bool) -> _Point:
-        """Return the current x with its multipliers and a bound of its KKT residuals.
+        """Return the current x with its multipliers and a bound on its KKT residuals.
 
-        fitted : True to fit a to the gradient on the free components, by least squares;
-            the rounding error of an updated a is ρ times that of Cν, which may be too
-            large
+        fitted : True to fit a to the gradient on the free components by least squares.
+            The rounding error of an a that is updated is ρ times the rounding error of
+            C(x − x̃), which may be too large.
         """
         qp, faces, a = self.qp, self.faces, self.faces.a
         x, Px, z_box = faces.at(a)
@@ -163,16 +166,16 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
         if point.residual <= tol:
             break
         if not gains and infeasible(rows, bounds, point.x - rows.x_tilde):
-            message = "no point within the bounds meets the equality rows"
+            message = "no point within the bounds satisfies the equality rows"
             return Solution.without_point(qp, Status.INFEASIBLE, message)
         if error > before / 10 and faces.rho < most_rho:
             most_rho = _penalised(faces, most_rho)
-    message = "no further progress: rounding, or the cost is unbounded"
+    message = "no further progress because of rounding, or the objective is unbounded"
     return _claimed(task, best, tol, message if settled else "step limit", outer)
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Multiply ρ by 100 if the factorisation succeeds; return the new limit of ρ."""
+    """Multiply ρ by 100 if the factorisation succeeds; return the new largest ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)
@@ -185,7 +188,12 @@ def _penalised(faces: Faces, most: float) -> float:
 def _claimed(
     task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
 ) -> Solution:
-    """Claim success if the KKT residuals, or a bound of them, are within 5·tol."""
+    """Return the final point, with status SOLVED if all KKT residuals are ≤ 5·tol.
+
+    If the bound of the residuals exceeds 5·tol, the residuals themselves are evaluated.
+
+    otherwise : message if the point is not a solution
+    """
     faces, checked = task.faces, False
     if point is None:
         return Solution.without_point(task.qp, Status.ITERATION_LIMIT, otherwise)

@@ -1,7 +1,7 @@
 """Elimination of the variables without bounds from a QP, and their recovery.
 
-Let E be the variables without bounds and I the others. Stationarity in E and the
-equality rows that involve E,
+Let E be the variables without bounds and I the other variables. The stationarity
+conditions of E and the equality rows that involve E,
 
     [P_EE G_Eᵀ] [x_E]   [−q_E − P_EI x_I]
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
@@ -10,10 +10,11 @@ determine x_E and the multipliers y of these rows as affine functions of x_I. Th
 reduced problem is a QP in x_I with the bounds, the equality rows that do not involve E,
 and the Schur complement
 
-    P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I,
+    P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I.
 
-whose assembly costs about as much as the factorisation of P_EE. In duals of contact
-problems, E contains the support forces, and P_EE = F_EE is the same in every load step.
+The assembly of the Schur complement costs about as much as the factorisation of P_EE.
+In duals of contact problems, E contains the support forces, and P_EE = F_EE is the same
+in every load step.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
-#: thresholds for the singular values of orthonormal rows, restricted to E: values below
-#: the first count as zero, and values above the second are accepted. The reciprocals of
-#: values in between would enter the reduced matrix, whose rounding would exceed the
-#: tolerance
+#: Thresholds for the singular values of the orthonormal rows restricted to E. Values of
+#: at most RANK_ZERO count as zero, and values of at least RANK_GOOD are accepted. With
+#: values in between, there is no elimination, because their reciprocals would enter the
+#: reduced matrix and cause rounding errors above the tolerance.
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
@@ -85,13 +86,13 @@ class _Saddle:
 
 
 def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
-    """Eliminate the variables without bounds; return None if that is impossible.
+    """Eliminate the variables without bounds; return None if this is not possible.
 
     Elimination requires an explicit P with positive definite P_EE, variables with and
     without bounds, no inequality rows, and consistent equality rows whose restrictions
     to E are either zero or well conditioned.
 
-    previous : block of an earlier problem, used if P_EE is the same
+    previous : block of an earlier problem, used if P_EE has not changed
     """
     free = np.isinf(qp.lb) & np.isinf(qp.ub)
     if free.all() or not free.any() or not qp.is_explicit or qp.h.size:

@@ -1,14 +1,14 @@
 """Protocol for user-defined preconditioners and step rules in SMALBE.
 
 A subclass of `solvers.smalbe.solver.SMALBE` overrides `preconditioner_for`,
-`step_rule_for`, or both. Each method is called once while a QP is prepared, and returns
+`step_rule_for`, or both. Each method is called once while a QP is prepared. It returns
 a function for this QP, or None to keep the built-in choice. Fields of the subclass are
-options like those of SMALBE.
+options like the fields of SMALBE.
 
-Neither function can cause SMALBE to claim a wrong solution: a preconditioner changes
-only the directions of conjugate gradients, and the trial point of a step rule is
-projected onto the bounds and accepted only if the cost decreases sufficiently
-(`StepRule`). The harness measures the KKT residuals in any case.
+Neither function can cause SMALBE to claim a wrong solution. A preconditioner changes
+only the directions of conjugate gradients. The trial point of a step rule is projected
+onto the bounds, and it is accepted only if the cost decreases sufficiently
+(`StepRule`). In addition, the harness measures the KKT residuals of every claim.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ class Step(NamedTuple):
     alpha_bar: float  #: length ᾱ of a gradient projection step, 1.9/‖H‖ by default
 
 
-#: function of a `Step` that returns a trial point (n,). It is projected onto the
-#: bounds, and accepted if the cost decreases by at least φ̃ᵀφ/(2‖H‖), on which the
-#: convergence rate of MPRGP is based (Dostál and Schöberl 2005); otherwise the standard
-#: expansion is taken.
+#: Function of a `Step` that returns a trial point (n,). The trial point is projected
+#: onto the bounds. It is accepted if the cost decreases by at least φ̃ᵀφ/(2‖H‖), the
+#: decrease from which the convergence rate of MPRGP follows (Dostál and Schöberl 2005).
+#: Otherwise MPRGP takes its standard expansion step.
 StepRule: TypeAlias = Callable[[Step], Vector]
 
 
 def checked(M: Operator) -> Operator:
-    """Return M with a check that vᵀMv is positive in each product.
+    """Return M with a check that vᵀMv is positive for each vector v.
 
-    Conjugate gradients would increase the cost along a direction with vᵀMv < 0.
+    If vᵀMv < 0, conjugate gradients would increase the cost.
 
     Raises
     ------

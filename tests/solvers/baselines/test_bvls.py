@@ -58,11 +58,14 @@ def test_qps_outside_its_scope_are_declined(manufactured, monkeypatch):
     operator = replace(qp, P=aslinearoperator(qp.P))
     singular = replace(qp, P=csr_array(np.diag([0.0] + [1.0] * 19)))
 
-    assert BVLS().declines(manufactured("equalities")[0]) == "takes bounds only"
+    assert BVLS().declines(manufactured("equalities")[0]) == "accepts bounds only"
     assert BVLS().declines(operator) == "needs explicit matrices"
     assert BVLS().declines(singular) == "needs a positive definite P"
     monkeypatch.setattr(bvls, "MAX_COMPONENTS", 19)
-    assert BVLS().declines(qp) == "converts P to dense; takes at most 19 components"
+    assert (
+        BVLS().declines(qp)
+        == "converts P to a dense matrix; accepts at most 19 components"
+    )
 
 
 @pytest.mark.parametrize("shape", ["bounds", "box"])

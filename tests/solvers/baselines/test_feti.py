@@ -132,7 +132,7 @@ def test_qps_outside_its_scope_are_declined(random):
     assert FETI().declines(random) is None
     assert "equality rows only" in FETI().declines(replace(random, lb=lower))
     assert "dirichlet" in FETI(preconditioner="dirichlet").declines(random)
-    assert "offers" in FETI(Q="preconditioner").declines(random)
+    assert "provides" in FETI(Q="preconditioner").declines(random)
     assert FETI(Q="preconditioner").declines(small) is None
     assert "none" in FETI(Q="preconditioner", preconditioner="none").declines(small)
 

@@ -36,7 +36,7 @@ def test_steps_in_space_hardly_grow_with_the_size():
 
 def test_dense_problems_are_declined():
     reason = PDASAMG().declines(mb.build("cube-wall/n=2/dual").qp)
-    assert reason == "P is dense; multigrid needs a sparse matrix"
+    assert reason == "P is dense, but multigrid needs a sparse matrix"
 
 
 def test_conjugate_gradients_that_do_not_converge_end_the_solve(monkeypatch):

@@ -122,11 +122,11 @@ def test_operators_are_taken_and_rows_are_not(manufactured):
     assert as_operator.x == pytest.approx(solve(qp).x, abs=1e-8)
     assert (
         ProjectedGradient().declines(manufactured("equalities")[0])
-        == "takes bounds, discs and cones, no rows"
+        == "accepts bounds, discs and cones, but no rows"
     )
     assert (
         ProjectedGradient().declines(manufactured("inequalities")[0])
-        == "takes bounds, discs and cones, no rows"
+        == "accepts bounds, discs and cones, but no rows"
     )
 
 
