@@ -400,8 +400,8 @@ def _with_options(
         where, kind = f"{spec.name}: {name}", annotated.get(name)
         changes[name] = _option(where, value, known[name], kind)
     if not changes:
-        # type: ignore[no-any-return]  # without options, it need not be a dataclass
-        return solver
+        # without options, the solver need not be a dataclass
+        return solver  # type: ignore[no-any-return]
     try:
         configured: Solver = replace(solver, **changes)
     except (TypeError, ValueError) as e:  # raised by the solver's check of its options
