@@ -15,7 +15,7 @@ from mortarbench.harness.mechanics import Real
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 from tests.support.disturbed import disturbed
 from tests.support.exact_solutions import exact_solution
-from tests.support.fooled_on_ranks import posed, problem_of
+from tests.support.fooled_on_ranks import problem_and_build, problem_of
 
 ROUNDED = 1 + 1e-9
 SHARP = (1e-7, 0.1)
@@ -23,7 +23,7 @@ SHARP = (1e-7, 0.1)
 
 def certified(name, count, ranks):
     """Return faults, and the ratios of bound to error, on the first rank."""
-    problem, build = posed(f"{name}/dual")
+    problem, build = problem_and_build(f"{name}/dual")
     mechanics = build().mechanics if ranks.rank == 0 else None
     exact = exact_solution(mechanics) if ranks.rank == 0 else None
     own = problem_of(problem, ranks)

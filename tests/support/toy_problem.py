@@ -27,7 +27,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Well:
-    """A parabola over a half line, for tests."""
+    """A parabola over a half line."""
 
     name: str = "well"
     defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})

@@ -124,9 +124,9 @@ OUTCOMES = {
     "raises": (
         Verdict.FAILED,
         "failed",
-        "ValueError: first line second line (adversaries.py:125)",
+        "ValueError: first line second line (adversaries.py:127)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:130)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:132)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -151,7 +151,7 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:377)",
+        "ValueError: assignment destination is read-only (adversaries.py:382)",
     ),
     "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),

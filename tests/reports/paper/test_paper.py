@@ -20,7 +20,7 @@ from mortarbench.harness.files.experiment import (
 )
 from mortarbench.harness.results.journal import Journal
 from mortarbench.problems.experiments import QUICK, paper_experiment
-from mortarbench.problems.experiments.analysis import WAYS, analyse
+from mortarbench.problems.experiments.analysis import VARIANTS, analyse
 from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.physics import stepping
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
@@ -273,7 +273,7 @@ def test_both_methods_give_the_same_final_displacement():
         analyse(
             2, 2, solve=lambda qp: SMALBE().prepare(qp, 1e-11)(), condense=c, steps=3
         )
-        for c in WAYS.values()
+        for c in VARIANTS.values()
     )
 
     assert one.solution.x == pytest.approx(other.solution.x, abs=1e-9)
@@ -290,7 +290,7 @@ def test_only_the_papers_method_solves_for_all_rows_in_each_step(
     monkeypatch.setattr(
         CholeskyInverse, "congruence", lambda s, B: calls.append(B) or congruence(s, B)
     )
-    done = analyse(1, 1, solve=solve, condense=WAYS[way], steps=3)
+    done = analyse(1, 1, solve=solve, condense=VARIANTS[way], steps=3)
 
     assert len(calls) == (solves + 1 if solves else 0)  # one more solve to recover u
     assert all(B.shape[0] == done.dual.q.size for B in calls)
