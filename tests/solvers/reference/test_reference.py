@@ -368,7 +368,7 @@ def test_a_large_operator_is_refused_in_one_line_and_a_small_one_multiplied_out(
     assert s.x == pytest.approx(point.x)
 
     qp, _ = manufactured("box", n=801)
-    with pytest.raises(ValueError, match="needs P as a matrix, got an operator") as e:
+    with pytest.raises(ValueError, match="needs P as a matrix; got an operator") as e:
         reference_solution(replace(qp, P=aslinearoperator(qp.P)))
     assert "\n" not in str(e.value)
 
