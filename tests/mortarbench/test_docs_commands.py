@@ -122,12 +122,13 @@ ELSEWHERE = {
     "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
     "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
     "gmsh -2 -order 1 press.geo": "gmsh is not here; what it makes is in tests/data",
+    "gmsh -3 -order 1 blocks.geo": "gmsh is not here; what it makes is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
         "the environment is there"
     ),
 }
 #: what a page needs of programs that are not here
-SUPPLIED = {"own-geometry": ("press.msh",)}
+SUPPLIED = {"own-geometry": ("press.msh",), "solids": ("blocks.msh",)}
 #: what a page promises of the files that its commands leave
 PROMISED = {
     "tutorial": {
@@ -140,6 +141,11 @@ PROMISED = {
         "press.png": "",
         "press.vtu": r'Name="pressure"',
         "press-disc-on-upper.csv": "pressure_Pa",
+    },
+    "solids": {
+        "blocks.png": "",
+        "blocks.vtu": r'Name="pressure"',
+        "blocks-upper-on-lower.csv": "pressure_Pa",
     },
     "howto": {
         "out/scaling/report/tables/scaling.tex": r"\d\.\d\d \[-?\d+\.\d+, \d+\.\d+\]",

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import QP, Solution, Status, kkt_residuals
+from mortarbench.harness.verify.kkt import own_sizes
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.harness.verify.optimum import proven_optimum
 from mortarbench.harness.verify.rational import rational
+from mortarbench.harness.verify.scales import TERMS_FACTOR
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.test_sets import with_solution
 from tests.harness.verify.test_proven_optimum import Attack
@@ -111,9 +113,17 @@ class AttackOverSets(Attack):
         return replace(s, x=self.project(s.x))
 
     def violation(self, x, at):
+        """Return the largest violation of a row, bound or ball, relative to its terms.
+
+        The terms of a ball include the shifts of its variables by other variables, as
+        in `own_sizes`. Near the edge of a contact zone, the radius of a friction disc
+        vanishes. Errors relative to that radius alone would refute every answer that a
+        conic solver computes in double precision.
+        """
         balls = self.qp.sets[1]
+        own = np.maximum(own_sizes(self.qp, self.s.x) / TERMS_FACTOR, at)
         off = np.linalg.norm(x[balls.index], axis=1) - balls.radius
-        size = balls.radius + np.linalg.norm(at[balls.index], axis=1)
+        size = balls.radius + np.linalg.norm(own[balls.index], axis=1)
         has_size = size > 0
         worst = (off[has_size] / size[has_size]).max(initial=0.0)
         return max(worst, super().violation(x, at))

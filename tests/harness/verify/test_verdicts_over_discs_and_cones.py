@@ -343,6 +343,15 @@ def _shorten_normal(z, one, block):
     return np.append(-0.9 * slope * np.linalg.norm(z[1:]), z[1:])
 
 
+@pytest.mark.parametrize(("length", "accepted"), [(1e-10, True), (1e-5, False)])
+def test_a_disc_of_tiny_radius_is_judged_by_its_neighbour(length, accepted):
+    """At the edge of a contact zone, a friction bound is far below rounding."""
+    P = np.eye(4) + np.kron(np.ones((2, 2)), np.eye(2))
+    qp = QP.from_arrays(P, [-3, 0, -3, 0], sets=[Discs([[0, 1], [2, 3]], [1, 1e-12])])
+    found = mb.verify(qp, np.array([1.0, 0, length, 0]), tol=1e-8)
+    assert (found.verdict is mb.Verdict.VERIFIED) == accepted
+
+
 @pytest.mark.parametrize("trap", ["", *TRAPS])
 def test_further_measures_vanish_at_solutions_and_are_of_first_order(trap):
     for seed in range(10):
