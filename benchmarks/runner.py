@@ -35,8 +35,8 @@ class Watch:
 
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
-        # total time of solves per record, in s, including the first one, which is
-        # performed separately if there are several inner loops
+        # estimated time of all solves of each record, in s: mean time × number of
+        # solves. Several inner loops are preceded by one more solve.
         self.solving = []
         self._fsync, self._fsync_seconds = os.fsync, 0.0
         os.fsync = self._timed_fsync
@@ -120,7 +120,7 @@ def growth(n=10_000):
 
 
 def null(trials=40, blocks=10):
-    """Print how often the 95 % interval of an A/A ratio contains 1, and its width."""
+    """Count A/A ratios whose 95 % interval contains 1; print the median half-width."""
     hits, widths = 0, []
     for _ in range(trials):
         with tempfile.TemporaryDirectory() as out:

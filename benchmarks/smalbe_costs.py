@@ -3,15 +3,16 @@
     python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
-* dense: times to prepare and solve dense duals, beside the time of a product with F.
-  The time of a solve is compared with the bound 1.5·T + 100 µs, where T is the time of
-  its products, by `smalbe` or by `dsymv` of BLAS, whichever is faster.
+* dense: times to prepare and to solve dense duals, and the time of a product with F.
+  The time of a solve is compared with the bound 1.5·T + 100 µs. T is the number of
+  products times the time of a product in `smalbe` or in `dsymv` of BLAS, whichever is
+  smaller.
 * sparse: time of a solve without a preconditioner, divided by its number of products,
   in units of one product plus five vector operations w += v.
 * incomplete: sparse problems with and without incomplete factors.
-* subdomains: duals of bodies in subdomains, after an earlier solve with the same
-  operator has assembled the blocks; the unit is the time of all products and all
-  applications of the preconditioner.
+* subdomains: times to prepare and solve duals of bodies in subdomains, relative to the
+  time of all products and all applications of the preconditioner. An earlier solve
+  with the same operator has assembled the blocks.
 * kept: solves with and without recycling of CG directions.
 * race: times to prepare and solve a case with several solvers; answers are verified.
 

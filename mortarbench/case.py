@@ -79,7 +79,7 @@ class Case(plugin.Case):
 
     @property
     def constant(self) -> float:
-        """Energy in SI units for which the objective of the QP is zero."""
+        """Constant c of energy = scale · objective + c, in SI units."""
         return self.family_case.constant
 
     @property

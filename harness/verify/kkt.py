@@ -1,7 +1,8 @@
 """Measures of the optimality of a primal-dual point, independent of the solver.
 
-All residuals are scale-free: they do not change if the objective, a row or the unit of
-a variable is multiplied by a constant, so that one threshold suits every problem.
+All residuals are scale-free: they do not change if the objective or a row is multiplied
+by a constant, so that one threshold suits every problem. A change of the unit of a
+variable can change only the dual residual, through the scale S of all components.
 All four residuals vanish if and only if the point is a KKT point. A KKT point is a
 solution if P is positive semidefinite, which is not checked here. docs/verdicts.md
 states what small residuals prove about the objective. If residuals do not suffice for a

@@ -58,13 +58,14 @@ from mortarbench.harness.verify.products import times_columns
 #: estimated at û. The relative difference is largest for displacements of low energy,
 #: such as û.
 SAFETY = 16
-#: Error of the sum over a row of K in `sample`, with a random sign, in units in the
-#: last place. The measured standard deviation is 0.4 to 0.5 for sums in extended
-#: precision, and 0.2 to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
+#: Amplitude of the rounding errors of random sign that `sample` simulates in Ku, per
+#: row in units of eps times the root of the sum of its squared terms. The measured
+#: standard deviation is 0.4 to 0.5 for sums in extended precision, and 0.2 to 3.6 for
+#: the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
-#: Error of a sum over a row of K in `sample`, with the sign of u, in units in the last
-#: place. Random signs alone may fail to excite the few soft modes of a slender body.
-#: With 0.25, the error for a plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
+#: Amplitude of the simulated errors with the sign of u, in the same units. Random signs
+#: alone may fail to excite the few soft modes of a slender body. With 0.25, the error
+#: for a plate of aspect ratio 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
 MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative norm of a correction of d below which the refinement ends. Bounds are

@@ -102,7 +102,8 @@ class HertzCylinder(ContactFamily):
             )
         if proportional and not (has_shear and params["Q"] == params["peak"]):
             raise InputError(
-                f"{self.name}: programme=proportional needs Q, and no peak above it"
+                f"{self.name}: programme=proportional requires Q > 0 and peak=Q "
+                "(the default), that is, no unloading"
             )
         if params["steps"] != self.defaults["steps"] and not proportional:
             raise InputError(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class HertzSphere(ContactFamily):
-    """Hertz contact in space: an elastic sphere on a rigid plane or an equal sphere."""
+    """Hertzian point contact: an elastic sphere on a rigid plane or an equal sphere."""
 
     name = "hertz-sphere"
     keys = schema(

@@ -138,7 +138,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
-    """Raise InputError if bodies in space are combined with keys of plane bodies."""
+    """Raise InputError if a description of solids has keys of plane bodies."""
     if elastic.shape.dim > 2:
         check_plane_only("bodies", params, "volumes")
 

@@ -9,7 +9,7 @@ Both intervals are unpaired between the folders, which are different sessions.
 - Solver: mean of the logarithms over its cases (at least three), with Student's
   interval. The scatter over cases includes the differences between runs on one case.
 - Single cell: its standard error is the larger of Welch's error over the repeats and
-  the scatter of the cells about the means of their solvers (1.4826 times the median
+  the scatter of the cells about the medians of their solvers (1.4826 times the median
   distance, which is the standard deviation of a normal law). At least `CELLS` cells are
   needed to estimate the scatter.
 

@@ -214,7 +214,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 
 def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
-    """Draw the surface of bodies in space, and the pressure on each contact side.
+    """Draw the surface of solids, and the pressure on each contact side.
 
     Several bodies are seen from above, since sides between them are hidden from every
     direction. A single body is seen from the side that touches a rigid body.

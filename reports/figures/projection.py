@@ -1,4 +1,4 @@
-"""Surfaces of bodies in space, projected orthographically onto the picture."""
+"""Surfaces of three-dimensional bodies, projected orthographically onto the picture."""
 
 from __future__ import annotations
 

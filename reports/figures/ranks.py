@@ -55,7 +55,7 @@ _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 
 def strong_figure(series: Sequence[StrongSeries]) -> Figure:
-    """Plot speed-ups of ranks and of simultaneous copies against ranks, by phase."""
+    """Plot speed-ups of runs and of copies against the number of ranks, by phase."""
     shown = sorted({n for s in series for n in s.answers})
     panels, keys = [], []
     for phase in PHASES:

@@ -118,7 +118,7 @@ def _panel(
 
 
 def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the answers of one solver; markers of unverified answers are hollow."""
+    """Plot residual against time of a solver; hollow markers: unverified answers."""
     points = [
         (t.value, max(o.worst, _LEAST), o)
         for o in outcomes

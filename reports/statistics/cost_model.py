@@ -142,21 +142,21 @@ def cost_model(
 ) -> CostModel:
     """Fit W and C ≥ 0 to the times of one solve by least squares of relative errors.
 
-    Repeats are averaged by geometric means. Each draw resamples the repeats on every
+    Repeats are averaged by geometric means. Each draw resamples the repeats for each
     number of ranks, the repeats of the copies, and the communication.
 
     Parameters
     ----------
-    seconds : times of every repeat by number of ranks, which includes one rank
-    copies : times of simultaneous copies of the job on one rank, by number of copies;
+    seconds : times of all repeats by number of ranks; must contain one rank
+    copies : times of simultaneous copies of the single-rank job, by number of copies;
         they give an upper bound of s; without copies, s = 1
     communication : one item per repeat on the largest number of ranks
 
     Raises
     ------
     ValueError
-        If there are no times on one rank or on several, or no communication on the
-        largest number of ranks.
+        If `seconds` does not contain one rank and a larger number of ranks, or if
+        `communication` does not refer to the largest number of ranks.
 
     """
     ranks = sorted(seconds)

@@ -226,7 +226,7 @@ class _Task:
         return csr_array(diags_array(free) - across), origin
 
     def minimise_on_face(self, x: Vector, face: _Face) -> _Point:
-        """Return the minimiser on a face, computed by CG from the start x."""
+        """Return the minimiser on a face, computed by CG with the starting point x."""
         moving, origin = self.moving(face)
         curvature, on_disc = np.zeros(x.size), self.on_disc(face)
         curvature[self.discs.index] = (face.curvature * on_disc)[:, None]

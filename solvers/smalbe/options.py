@@ -51,9 +51,11 @@ class Options:
     beta: float = 0.5  #: factor of M if the Lagrangian grows too little
     eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
-    # for a sparse P, conjugation to all directions would cost more than a product
-    recycle: bool = True  #: keep CG directions conjugate on a face if P is not sparse
-    reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
+    # if P is sparse, conjugation against stored directions costs more than a product
+    #: store the CG directions of a face and make new ones conjugate to them, unless P
+    #: is sparse
+    recycle: bool = True
+    reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 applies to bounds alone

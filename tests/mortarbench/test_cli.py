@@ -903,7 +903,7 @@ def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypat
         "inequality rows\n"
     )
     assert "dualise" not in declined(f"{case}/primal", "feti")
-    sliding = "greco/n=2/dim=3"  # friction in space: cones, and discs in the dual
+    sliding = "greco/n=2/dim=3"  # friction on cones, and on discs in the dual
     for solver, is_named in (("smalbe", True), ("osqp", False)):
         message = declined(f"{sliding}/primal", solver)
         assert "sets of the class Cones" in message

@@ -10,8 +10,10 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
+#: default cases that take seconds, and whose duals are solved in every run
+LARGE = [("hertz-sphere", "primal")]
 CASES = [
-    (name, form)
+    pytest.param(name, form, marks=[pytest.mark.slow] * ((name, form) in LARGE))
     for name, family in PROBLEMS.items()
     if "path" not in family.defaults
     for form in family.forms

@@ -73,6 +73,7 @@ def test_the_copy_has_every_compiled_module(tmp_path):
         assert list((tmp_path / source).parent.glob(f"{source.stem}.*.so")), source
 
 
+@pytest.mark.slow
 def test_the_list_names_modules_tests_and_mutants_that_there_are():
     plan = mutants.read_plan()
     for module, tests in plan.tests.items():

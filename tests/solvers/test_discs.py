@@ -61,8 +61,8 @@ def test_planted_solutions_on_cones_are_reached(name, seed):
 @pytest.mark.parametrize("name", ON_DISCS)
 @pytest.mark.parametrize("seed", range(4))
 def test_discs_that_x_touches_without_a_multiplier(name, seed):
-    """Complementarity is not strict, so x has half as many correct digits as the
-    residuals.
+    """Without strict complementarity, the error of x is of the order of the square
+    root of the residuals.
     """
     qp, x = qp_on_discs(seed + 100, touching=True)
     assert_solved(name, qp, x, digits=1e-4)

@@ -38,7 +38,7 @@ _SOLIDS, _FACES = {4: 4, 6: 6, 8: 5}, {3: 2, 4: 3}
 
 
 def solids22(points, bodies, faces):
-    """Return a file in the ASCII format 2.2 with bodies and boundary faces in space."""
+    """Return the text of a gmsh file (ASCII, 2.2) of solids with boundary faces."""
     groups, rows, tag = [], [], 0
     for dimension, kinds, named in ((3, _SOLIDS, bodies), (2, _FACES, faces)):
         for name, cells in named.items():

@@ -1,1 +1,1 @@
-"""Contact in space: node to face, and mortar contact between faces."""
+"""Three-dimensional contact: node to face, and mortar contact between faces."""

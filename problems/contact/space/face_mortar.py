@@ -1,4 +1,4 @@
-"""Face-to-face mortar contact in space, linearised at a displacement.
+"""Three-dimensional face-to-face mortar contact, linearised at a displacement.
 
 Sources: Puso and Laursen, "A mortar segment-to-segment contact method for large
 deformation solid mechanics", Comput. Methods Appl. Mech. Engrg. 193 (2004) 601-629, for

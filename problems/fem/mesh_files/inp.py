@@ -74,7 +74,7 @@ _FACES: Mapping[str, Sequence[Sequence[int]]] = {
     ),
 }  # fmt: skip
 _FLAT = "expected a file of *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE alone"
-#: keywords that are rejected, because they would change the mesh, with the remedy
+#: keywords that would change the mesh and are rejected, with the remedy in the message
 _REFUSED = {
     "INCLUDE": "other files are not opened; expected all data in this file",
     "PART": f"{_FLAT}: in Abaqus/CAE, Model, Edit Attributes, Do not use parts and "

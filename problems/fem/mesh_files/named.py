@@ -165,8 +165,8 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     )
     if dim == 2 and not is_flat:
         raise InputError(
-            f"{path}: not plane, and without cells in space; expected all nodes at the "
-            "same z, or volumes of tetrahedra, wedges or hexahedra"
+            f"{path}: the nodes are not all at the same z, and there are no volume "
+            "cells; expected a plane mesh, or tetrahedra, wedges or hexahedra"
         )
     parts = {name: file.cells(dim, rows) for name, rows in _bodies(file, bodies)}
     if not parts:

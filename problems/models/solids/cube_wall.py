@@ -1,4 +1,4 @@
-"""A cube of hexahedra next to a rigid wall: PERMON's example of contact in space.
+"""A cube of hexahedra next to a rigid wall: PERMON's example of contact in 3D.
 
 The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and loaded by a pressure
 of 465 Pa on its top. The cube bulges towards the wall, which enforces u_x ≤ 1 mm on

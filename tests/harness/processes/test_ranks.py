@@ -109,6 +109,7 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
     assert first.record.run_id != alone.record.run_id
 
 
+@pytest.mark.slow
 def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
     """On free components, some rows are smaller than the rounding errors of
     their sum.
@@ -217,7 +218,7 @@ def test_friction_on_metis_parts_has_the_same_displacement_on_ranks(tmp_path):
             assert answer.record.quantities[state] == alone.record.quantities[state]
 
 
-@pytest.mark.parametrize("parts", [6, 20])
+@pytest.mark.parametrize("parts", [6, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
     """Node-to-segment rows do not resist rolling, so the equality rows are
     dependent.

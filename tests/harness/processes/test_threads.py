@@ -226,7 +226,13 @@ def test_a_fork_does_not_wait_for_a_thread_of_its_parent():
     assert os.waitpid(child, 0)[1] == 0
 
 
-@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    "closed",
+    [
+        "<&- >&- 2>&-",
+        *(pytest.param(c, marks=pytest.mark.slow) for c in ("<&-", ">&-", "2>&-")),
+    ],
+)
 def test_closed_standard_streams_cost_no_answer(tmp_path, closed):
     solve = f"{sys.executable} -m mortarbench solve {CASE} --solver smalbe {closed}"
     library = (

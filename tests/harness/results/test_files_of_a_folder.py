@@ -120,10 +120,10 @@ def empty(path, _outside):
     path.write_bytes(b"")
 
 
+#: files as large as the limit, which every command reads for seconds
+LARGE = (sparse, with_zeros, below_the_limit)
 KINDS = (
-    sparse,
-    with_zeros,
-    below_the_limit,
+    *(pytest.param(kind, marks=pytest.mark.slow) for kind in LARGE),
     pipe,
     a_folder,
     dangling,

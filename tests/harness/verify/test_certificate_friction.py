@@ -50,7 +50,7 @@ CASES = {
         "contact-patch/ratio=0.1/contact=nts"
     ),
 }
-#: bodies in space: stiff and soft, floating, on a rigid plane, and decomposed
+#: three-dimensional bodies: stiff and soft, floating, on a rigid plane, and decomposed
 IN_SPACE = (
     "contact-patch/dim=3/lower=2/upper=1/ratio=0.1/friction=tresca/bound=1e5",
     "contact-patch/dim=3/lower=2/upper=1/ratio=1e-3/friction=tresca/bound=1e5",

@@ -118,14 +118,14 @@ class AttackOverSets(Attack):
         The terms of a ball include the shifts of its variables by other variables, as
         in `own_sizes`. Near the edge of a contact zone, the radius of a friction disc
         vanishes. Errors relative to that radius alone would refute every answer that a
-        conic solver computes in double precision.
+        conic solver computes in double precision. A radius of zero defines no length.
         """
         balls = self.qp.sets[1]
         own = np.maximum(own_sizes(self.qp, self.s.x) / TERMS_FACTOR, at)
         off = np.linalg.norm(x[balls.index], axis=1) - balls.radius
         size = balls.radius + np.linalg.norm(own[balls.index], axis=1)
-        has_size = size > 0
-        worst = (off[has_size] / size[has_size]).max(initial=0.0)
+        has_length = balls.radius > 0
+        worst = (off[has_length] / size[has_length]).max(initial=0.0)
         return max(worst, super().violation(x, at))
 
     def moved(self, s):

@@ -187,7 +187,7 @@ def searched(ranks, *arguments):
 @pytest.mark.parametrize(
     ("count", "ranks", "names"),
     [
-        (20, 4, ("membranes/S=3/n=2/dual", "disc under rollers")),
+        (8, 4, ("membranes/S=3/n=2/dual", "disc under rollers")),
         *(pytest.param(60, n, SEARCHED, marks=pytest.mark.slow) for n in (2, 3)),
     ],
 )

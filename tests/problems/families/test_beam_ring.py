@@ -350,15 +350,17 @@ def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
         assert space["multiplier_sum"] == pytest.approx(plane["multiplier_sum"])
 
 
-def test_the_difference_of_face_mortar_from_the_plane_falls_like_the_square_of_h():
+@pytest.mark.parametrize(
+    "cells", [(2, 4), pytest.param((4, 8), marks=pytest.mark.slow)]
+)
+def test_the_difference_of_face_mortar_from_the_plane_falls_like_the_square_of_h(cells):
     """Each face has a single normal, whereas normals in the plane are interpolated."""
     gaps = []
-    for n in (2, 4, 8):
+    for n in cells:
         keys = dict(Nr=n, Nh=n, steps=1, contact="mortar", tol=1e-10)
         plane, space = in_space(**keys), in_space(**keys, depth=1, sides="plane-strain")
         gaps.append(abs(space["energy"] / plane["energy"] - 1))
     assert gaps[0] / gaps[1] > 3
-    assert gaps[1] / gaps[2] > 3
 
 
 def test_free_ends_soften_the_bodies():

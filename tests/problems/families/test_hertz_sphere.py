@@ -47,7 +47,13 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
 
 
 @pytest.mark.parametrize(
-    "keys", ["", "n=3/", "against=sphere/", "n=2/against=sphere/Q=0.5/"]
+    "keys",
+    [
+        "",
+        "n=3/",
+        pytest.param("against=sphere/", marks=pytest.mark.slow),
+        "n=2/against=sphere/Q=0.5/",
+    ],
 )
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys, tol):

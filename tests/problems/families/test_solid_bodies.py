@@ -1,4 +1,4 @@
-"""Bodies in space from gmsh files, compared with exact solutions and divided bodies."""
+"""Solids from gmsh files, compared with exact solutions and decomposed bodies."""
 
 import meshio
 import numpy as np

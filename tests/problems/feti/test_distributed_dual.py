@@ -57,7 +57,7 @@ SOLVED = 1e-10  #: accepted difference of two reference solutions
 
 
 def emitted(ranks, cases):
-    """Return the parts that several ranks assemble, by case."""
+    """Compare QPs emitted on several ranks with QPs of one process, by case."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
@@ -88,6 +88,7 @@ def test_bodies_without_parts_are_emitted_by_one_process(described):
     assert case.family.emission(case.form, case.params) is None
 
 
+@pytest.mark.slow
 def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
     for case in emitted(2, [described["coulomb"]]).values():
         assert case["entries"][0] == case["entries"][1]
@@ -99,7 +100,7 @@ def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request, described):
-    """Parts that several ranks assemble for all cases."""
+    """Differences between the distributed QP and the QP of one process, by case."""
     bodies = described["first"], described["friction"]
     return emitted(request.param, [*CASES, *bodies])
 

@@ -1,4 +1,4 @@
-"""Pictures of bodies in space: orthographic projection, hidden faces, colours."""
+"""Pictures of solids: orthographic projection, hidden faces, colours."""
 
 import numpy as np
 import pytest

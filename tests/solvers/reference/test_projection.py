@@ -8,7 +8,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.box_stack import box_stack
 
 
-@pytest.mark.parametrize("mu", [0.5, 0.8])
+@pytest.mark.parametrize("mu", [0.5, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_problem_over_cones_with_p_of_half_rank_is_solved_to_rounding(mu):
     M, H, f, mu_of = box_stack(3, mu, seed=0)
     W, q = H.T @ (H / M[:, None]), H.T @ (f / M)
