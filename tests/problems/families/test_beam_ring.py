@@ -353,7 +353,7 @@ def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
 @pytest.mark.parametrize(
     "cells", [(2, 4), pytest.param((4, 8), marks=pytest.mark.slow)]
 )
-def test_the_difference_of_face_mortar_from_the_plane_falls_like_the_square_of_h(cells):
+def test_face_mortar_differs_from_the_plane_by_the_square_of_h(cells):
     """Each face has a single normal, whereas normals in the plane are interpolated."""
     gaps = []
     for n in cells:
