@@ -73,7 +73,7 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`; replace "auto" by "dense" or "sparse", as P is stored."""
+    """Return `backend`; replace "auto" by the storage of P: "dense" or "sparse"."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
