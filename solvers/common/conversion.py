@@ -233,7 +233,10 @@ class _ConicBlocks(NamedTuple):
         return flat
 
     def rows(self, n: int) -> tuple[csr_array, Vector]:
-        """Return R, r with r − Rx = (side + slope·x_head, x_tail) of non-flat blocks."""
+        """Return R and r with r − Rx = (side + slope·x_head, x_tail).
+
+        Flat blocks are omitted.
+        """
         tail, side, head, slope = (part[~self.is_flat] for part in self[:4])
         k, d = tail.shape
         first = np.arange(k) * (d + 1)
