@@ -197,7 +197,7 @@ cdef class FeasibleSet:
         return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """beta ← β, the part of g on the boundary whose descent is feasible."""
+        """beta ← β, the part of g on the boundary with a feasible direction −β."""
         cdef Py_ssize_t i
         for i in range(self.n):
             beta[i] = 0.0
@@ -322,7 +322,7 @@ cdef class FeasibleSet:
 
     cdef double within(self, const double *z, const double *x, const double *g,
                        bint release, double *s) except? -1:
-        """s ← z + s − x; within rounding of a bound, x + s is set to it; returns gᵀs.
+        """s ← z + s − x, with x + s set to a bound within rounding of it; return gᵀs.
 
         s is zero for components that the set fixes, unless `release` is true.
         """
