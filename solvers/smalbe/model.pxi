@@ -2,9 +2,9 @@
 
 
 cdef enum:
-    # Limits of Newton's method and of its line search. The search keeps a distance of 5
-    # % from the ends of its interval, so that 60 steps reduce the interval to at most 5
-    # %. If Newton's method does not end, the step is computed with the model norm·I,
+    # Limits of Newton's method and of its line search. The search keeps a distance of
+    # 5 % from the ends of its interval, so that 60 steps reduce the interval to at most
+    # 5 %. If Newton's method does not end, the step is computed with the model norm·I,
     # where norm is the largest eigenvalue. Without the line search,
     # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
     NEWTON_STEPS = 100
