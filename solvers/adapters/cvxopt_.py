@@ -26,7 +26,7 @@ from mortarbench.solvers.common.conversion import (
 
 @dataclass(frozen=True)
 class CVXOPT:
-    """https://cvxopt.org, with dense matrices if P is dense, otherwise sparse ones.
+    """https://cvxopt.org, with dense matrices if P is dense, otherwise sparse matrices.
 
     CVXOPT divides the 2-norm of the dual residual by max(1, ‖q‖), and the 2-norm of the
     primal residual by max(1, norm of the right-hand sides). The gap must be below

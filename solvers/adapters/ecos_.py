@@ -33,10 +33,10 @@ CLAIMS = {
 PRIMAL = 1  #: exit flag with a certificate of infeasibility
 #: eigenvalues of P below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-14
-#: Units of the corrections, relative to ‖x‖∞, four per decade. The adapter tries them
-#: in this order, because the best unit depends on the QP: ECOS breaks down near the
-#: optimum, at a residual that varies by two orders of magnitude between neighbouring
-#: units.
+#: Units of the corrections, relative to ‖x‖∞, four per decade. The adapter tries the
+#: units in this order, because the best unit depends on the QP: ECOS breaks down near
+#: the optimum, at a residual that varies by two orders of magnitude between
+#: neighbouring units.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
 #: largest KKT residual of a point that is reported as solved, relative to tol
 CLAIM_FACTOR = 10.0

@@ -157,7 +157,7 @@ class ProxQP:
 
 
 class _Dense:
-    """Dense backend, which accepts bounds; their n multipliers follow those of G."""
+    """Dense backend with bounds; the multipliers of bounds follow those of G rows."""
 
     def __init__(self, qp: QP) -> None:
         self.qp, self.has_box = qp, bool(has_bound(qp).any())

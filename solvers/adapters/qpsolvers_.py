@@ -77,7 +77,7 @@ CALLS: Mapping[str, Call] = {
 
 #: backends that accept dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
-#: backends that never receive unconstrained QPs, because qpsolvers solves such QPs
+#: backends that do not receive unconstrained QPs, because qpsolvers solves these QPs
 #: itself, with a wrong result
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
@@ -136,7 +136,7 @@ class QPSolvers:
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:
-            return "needs a row or a bound: qpsolvers solves unconstrained QPs itself"
+            return "needs a row or a bound; qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS

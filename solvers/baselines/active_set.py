@@ -43,7 +43,7 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Result of the inner iterations, with the final active set and its solver."""
+    """Result of the inner iterations, with the solution operator of the final face."""
 
     active: Active
     solve: Solve  #: solution operator of the face of `active`
@@ -165,7 +165,7 @@ def _newton(
 
 
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
-    """Activate violated constraints; release those with a multiplier of wrong sign.
+    """Predict the active set from violated constraints and multiplier signs.
 
     Violations of bounds are measured in √D·x, whose unit is √energy. Therefore the
     result does not depend on the units of the variables.

@@ -76,8 +76,8 @@ class Problem:
         """Take steps until all KKT residuals are at most 5·tol; return the solution.
 
         The residuals are evaluated when the norm of the natural map falls below
-        tol·‖q‖. If they are too large, the loop continues with a smaller bound. The
-        status is SOLVED only if all residuals are at most 5·tol.
+        tol·‖q‖. If the residuals are too large, the loop continues with a smaller
+        bound. The status is SOLVED only if all residuals are at most 5·tol.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x

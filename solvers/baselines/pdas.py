@@ -1,13 +1,13 @@
 """Primal-dual active set method: a semismooth Newton method for bounds and rows.
 
-This is the standard method of the mortar literature (Hintermüller, Ito and Kunisch
-2003, SIAM J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an
-active set of bounds and inequality rows, a linear system determines x and the
+The method is the standard method of the mortar literature (Hintermüller, Ito and
+Kunisch 2003, SIAM J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]).
+For an active set of bounds and inequality rows, a linear system determines x and the
 multipliers. The next active set consists of the active constraints whose multipliers
 have the right sign, and of the violated constraints. The iteration ends when the active
 set no longer changes. Three extensions handle QPs on which this iteration fails:
 
-1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
+1. Proximal method of multipliers (Rockafellar 1976). The linear systems belong to
 
        ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h),
 
@@ -175,7 +175,7 @@ class PDAS:
 
 
 def _start(qp: QP, carry: Carry | None) -> Carry:
-    """Return `carry` if it fits `qp`, otherwise the point of the box nearest to 0."""
+    """Return `carry` if its sizes match, else the point of the box nearest to zero."""
     if carry is not None and [v.size for v in carry.centre] == [
         qp.q.size,
         qp.b.size,

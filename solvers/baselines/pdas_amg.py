@@ -3,9 +3,9 @@
 The outer iteration is the one of `solvers.baselines.pdas`. On each face, the Newton
 system is solved by conjugate gradients, preconditioned by smoothed aggregation (Vaněk,
 Mandel and Brezina 1996, Computing 56; pyamg). In the primal QP of floating elastic
-bodies, the kernel of the stiffness matrix P contains the translations. Smoothed
-aggregation uses them as near-kernel vectors. Rotations are not used, because a QP
-contains no coordinates.
+bodies, the kernel of the stiffness matrix P contains the translations, which smoothed
+aggregation uses as near-kernel vectors. Rotations are not used, because a QP contains
+no coordinates.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
 
     Parameters
     ----------
-    library : name of a package; the result is empty if it is not installed
+    library : name of a package; the result is empty if the package is not installed
     pattern : glob of the adapter files, relative to the package
     suffix : part of the file name after the backend's name, e.g. "_.py" in "osqp_.py"
 
@@ -73,7 +73,7 @@ def reason_unavailable(
         return None
     installed = ", ".join(name for name in files if not _missing_packages(files[name]))
     if missing:
-        return f"not installed: {', '.join(missing)}; {library} finds {installed}"
+        return f"not installed: {', '.join(missing)}; installed backends: {installed}"
     return f"{library} has no backend {backend!r}; installed: {installed}"
 
 

@@ -60,7 +60,8 @@ def needs_independent_rows(qp: QP) -> str | None:
 def csc(M: Matrix) -> csc_matrix:
     """Return a writable csc_matrix copy with sorted indices and no duplicates.
 
-    A csc_array is unsuitable: OSQP warns about it, and qpsolvers treats it as dense.
+    A csc_array is unsuitable: OSQP warns about this type, and qpsolvers treats a
+    csc_array as dense.
     """
     copy = csc_matrix(M, dtype=np.float64, copy=True)
     copy.sum_duplicates()

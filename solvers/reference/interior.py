@@ -15,12 +15,13 @@ products are componentwise and μ = sᵀz/(number of rows of C). A step covers 0
 distance to the boundary of the set s, z ≥ 0. The step length is the same for x, y, z
 and s.
 
-A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  Its row of C
-is x_I/r at the current x, and its multiplier adds z/r to the diagonal of P.
+A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  The row of C
+for the disc is x_I/r at the current x, and the multiplier z of the disc adds z/r to the
+diagonal of P.
 
 δ is the parameter of a proximal method of multipliers centred at the iterate
-(Pougkakiotis and Gondzio 2021, Comput. Optim. Appl. 78). It permits a singular P and
-linearly dependent rows. The solution does not depend on δ.
+(Pougkakiotis and Gondzio 2021, Comput. Optim. Appl. 78). With δ > 0, P may be singular
+and rows may be linearly dependent. The solution does not depend on δ.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Refinement of a solution in extended precision, with active constraints as equations.
 
-For a fixed active set, the KKT conditions are linear. They are solved by iterative
-refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12), with
-residuals evaluated in `numpy.longdouble` and a factorisation of
+For a fixed active set, the KKT conditions are linear. These equations are solved by
+iterative refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch.
+12), with residuals evaluated in `numpy.longdouble` and a factorisation of
 
     [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
     [B_F       −δ  ]     B: A and the active rows of G.
@@ -126,7 +126,7 @@ def _solve_active_set(
 def _update_active_set(
     problem: _Problem, active: _Active, at: _Point, *, one: bool
 ) -> _Active:
-    """Activate violated constraints; release those with a multiplier of wrong sign.
+    """Update the active set according to violated constraints and multiplier signs.
 
     Nearly dependent active rows may require huge multipliers to be satisfied at the
     same time. Therefore, if no other constraint is wrong, active rows with a remaining

@@ -143,7 +143,7 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
     """Iterate t ← step(t) `count` times, with an acceleration every `MEMORY` steps.
 
     An accelerated point is used only if its residual ‖step(t) − t‖ is not larger than
-    the last one. The residual of plain steps never increases, because `step` is an
+    the last residual. The residual of plain steps never increases, because `step` is an
     averaged operator.
     """
     images, changes = list[Vector](), list[Vector]()

@@ -205,7 +205,7 @@ def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
 def _is_nonnegative(qp: QP) -> bool:
     """Return True if P is dense and the only constraints are x ≥ lb with finite lb.
 
-    A QP without variables is excluded, because scipy's nnls (1.17.1) crashes on it.
+    A QP without variables is excluded, because scipy's nnls (1.17.1) crashes for n = 0.
     """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
     lower = qp.q.size > 0 and np.isfinite(qp.lb).all()

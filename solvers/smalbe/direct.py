@@ -74,7 +74,7 @@ class Direct:
         if qp.h.size:
             return "accepts bounds and equality rows, but no inequality rows"
         if qp.q.size > MAX_UNKNOWNS:
-            return f"is for small problems; accepts at most {MAX_UNKNOWNS} unknowns"
+            return f"accepts at most {MAX_UNKNOWNS} unknowns"
         return needs_dense(qp, 3)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -125,7 +125,7 @@ class _Task:
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
-        """Return a point as a `Solution` with status SOLVED; the caller checks it."""
+        """Return a point as a `Solution` with status SOLVED, not yet checked."""
         return Solution(
             status=Status.SOLVED,
             x=x,

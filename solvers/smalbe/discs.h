@@ -13,7 +13,7 @@
 
 typedef struct {
     Py_ssize_t count, ranges;
-    int dim; /* number of variables of each disc; 0 if it differs */
+    int dim; /* number of variables of each disc; 0 if not constant */
     const int *start; /* (count + 1,) first entry of each disc in `index` */
     const int *index; /* variables of the discs */
     const double *radius;
@@ -200,8 +200,8 @@ INLINE void advance_each(const discs *D, int d, double alpha, double *x, double 
         result[k] += sums[k];
 }
 
-/* On discs, x = x − αp, moved to the boundary within rounding of it, g = g − αHp, and
-   the sums of `advance`.
+/* On discs, compute x = x − αp, g = g − αHp and the sums of `advance`; x is moved to
+   the boundary if it is within rounding of the boundary.
 
    phi, free : NULL if not needed */
 static void advance_discs(const discs *D, double alpha, double *x, double *g,

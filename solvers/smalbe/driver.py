@@ -227,8 +227,8 @@ def _estimated_spectrum(
 
     The previous spectrum is reused if the Rayleigh quotient of the Lanczos start
     vector, which is the same for all problems, has changed by less than a factor of
-    two. This is permitted only with model steps, because they detect and correct a
-    wrong model.
+    two. The reuse is permitted only with model steps, because model steps detect and
+    correct a wrong model.
     """
     if options.norm == "power":
         return by_power(F, C)
@@ -386,7 +386,7 @@ def _claimed(
     while True:
         at = task.loop.solve(tighter * tol, at)
         if at.status is Status.INFEASIBLE:
-            message = "no point within the bounds meets the equality rows"
+            message = "no point within the bounds satisfies the equality rows"
             nowhere = Solution.without_point(task.qp, at.status, message)
             return (nowhere, _nothing), np.inf, None, tighter
         if at.status is Status.FAILED:
@@ -528,7 +528,7 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
-    """Return an upper bound of the worst KKT residual, or its value if > `enough`."""
+    """Return an upper bound of the worst KKT residual; exact if above `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
         diagonal = task.scaled.diagonal

@@ -173,7 +173,7 @@ def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Ar
 
 
 def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Return a mask as a slice if its true components are consecutive, else as is."""
+    """Convert a mask to a slice if its true components are consecutive."""
     at = np.flatnonzero(chosen)
     whole = at.size and at[-1] - at[0] == at.size - 1
     return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen

@@ -354,8 +354,8 @@ cdef class Faces:
         """Add the components to be released to `wanted`; return True if there are any.
 
         A component at a bound is released if it has a feasible descent direction and if
-        its gradient, divided by √Pᵢᵢ, is at least `share` times the largest value of
-        this type. The gradient must also exceed its rounding error, for which Σ|Pᵢⱼxⱼ|
+        its gradient, divided by √Pᵢᵢ, is at least `share` times the largest of these
+        quotients. The gradient must also exceed its rounding error, for which Σ|Pᵢⱼxⱼ|
         is bounded by √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
         """
         cdef Py_ssize_t i, m

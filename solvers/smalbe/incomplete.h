@@ -1,6 +1,6 @@
 /* Incomplete Cholesky factors of principal submatrices of a sparse symmetric matrix.
 
-   M = (I + L) D (I + L)' in an order of elimination, where the pattern of L is that of P.
+   M = (I + L) D (I + L)' in an order of elimination, where L has the pattern of P.
    Fill-in outside this pattern is dropped, and `keep` times each dropped entry is added
    to the diagonal entries of its row and column. For keep = 1, this preserves row sums
    (modified incomplete Cholesky, Gustafsson 1978); keep = 0 is the method of Meijerink

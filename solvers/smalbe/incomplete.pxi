@@ -79,15 +79,15 @@ def scaled_by_diagonal(matrix, scale):
 cdef class IncompleteFactor:
     """Incomplete Cholesky factorisation M ≈ P_FF on the free set F.
 
-    The sparsity pattern of L is that of P. Dropped entries, multiplied by `keep`, which
-    is KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson,
-    BIT 18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002,
-    418-477). For a tridiagonal matrix, no entry is dropped, and M = P_FF. If a pivot is
-    below LEAST_PIVOT times the diagonal entry, `keep` is set to 0. If this is not
-    sufficient, the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math.
-    Comp. 34, 1980, 473-497). M is therefore finite and positive definite for every
-    symmetric P with a positive diagonal. The final values of `keep` and σ are used for
-    all later faces.
+    L has the sparsity pattern of P. Dropped entries, multiplied by `keep`, which is
+    KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson, BIT
+    18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002, 418-477).
+    For a tridiagonal matrix, no entry is dropped, and M = P_FF. If a pivot is below
+    LEAST_PIVOT times the diagonal entry, `keep` is set to 0. If this is not sufficient,
+    the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math. Comp. 34,
+    1980, 473-497). M is therefore finite and positive definite for every symmetric P
+    with a positive diagonal. The final values of `keep` and σ are used for all later
+    faces.
 
     The factorised matrix is WPW with a positive diagonal W. With `keep` = 1, its row
     sums would be preserved. Therefore P should map the vector of weights to zero in the
@@ -140,7 +140,7 @@ cdef class IncompleteFactor:
                     m += 1
                 if far and m == count:
                     if count == MAX_DIAGONALS:
-                        count = n + 1  # too many
+                        count = n + 1  # too many diagonals diagonals
                     else:
                         offset[count] = far
                         count += 1

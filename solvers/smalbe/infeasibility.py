@@ -19,7 +19,7 @@ def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
 
     With r = CᵀCν, every ν' with Cν' = 0 satisfies rᵀν' = 0. If the minimum of rᵀν' over
     the box is positive, the box therefore contains no ν' with Cν' = 0 (Farkas' lemma).
-    Infinite bounds are replaced by finite ones (`SEARCH_RADIUS`).
+    Infinite bounds are replaced by finite bounds (`SEARCH_RADIUS`).
     """
     lower, upper = bounds
     Cnu = rows.C @ nu

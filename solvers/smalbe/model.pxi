@@ -296,7 +296,7 @@ cdef class DenseBasis(Basis):
                 self.others[i * stride + j] = self.others[j * stride + i]
 
     cdef void change(self, Py_ssize_t count, double *gram) noexcept:
-        """Subtract the components in `where` that became active; add those now free."""
+        """Subtract the components in `where` that became active; add all others."""
         cdef Py_ssize_t c, q
         cdef double sign[4]
         for c in range(0, count, 4):

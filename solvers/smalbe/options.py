@@ -19,7 +19,7 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: mixed: projcg, or std if projcg would increase the cost (ESPRESO; 2 or 3)
 #: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
 #: to the boundary is the whole step; 1 more per CG step beyond the box, and 1 more if
-#: the decrease is below that of gradient projection)
+#: the decrease is below the decrease of gradient projection)
 #: spectral: a step to the boundary and, unless this step is most of the CG step, a
 #: projected Barzilai-Borwein step with a nonmonotone line search (1 or 2).
 #: Barzilai-Borwein steps also replace every proportioning step, and CG if the first CG
@@ -30,7 +30,7 @@ Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: cg: minimise along −β as far as feasible (textbook). With discs, −β is not a feasible
 #: direction, so the rule model is used instead
 #: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
-#: gradient step. After two such steps that did not halve ‖β‖², a step of the rule cg
+#: gradient step. After two model steps that did not halve ‖β‖², a step of the rule cg
 #: follows
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)

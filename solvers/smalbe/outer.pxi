@@ -113,10 +113,10 @@ cdef class SMALBE(MPRGP):
         The tail estimates the norm of 𝒫F𝒫 on the complement of the selected directions.
         It is the second to last Ritz value plus its residual, or the last value plus
         its residual if the process ended because β = 0. If the residual of an earlier
-        pair exceeds its value, the first pair of this type is used instead. If the tail
-        is too small, MPRGP increases τ to the curvature that its products show. The
-        models contain ρQ exactly. In a flat spectrum, a short Lanczos process does not
-        converge even to the first eigenvector, and Ritz vectors that are not
+        pair exceeds its value, the first pair with this property is used instead. If
+        the tail is too small, MPRGP increases τ to the curvature that its products
+        show. The models contain ρQ exactly. In a flat spectrum, a short Lanczos process
+        does not converge even to the first eigenvector, and Ritz vectors that are not
         eigenvectors would slow down CG. In this case, only the norm is used. With
         sparse rows, also only the norm is used, because these rows come from many
         subdomains, whose spectrum is flat.
@@ -229,7 +229,7 @@ cdef class SMALBE(MPRGP):
     # the start
 
     def begin(self, x, mu, double rho):
-        """Return ν (n,), the projection of x onto the set minus x̃, and its gradient.
+        """Return ν = Π(x) − x̃ (n,), where Π projects onto the set, and the gradient.
 
         The gradient includes Cᵀμ. The call takes one product, or no product for x = 0,
         where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.

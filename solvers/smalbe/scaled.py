@@ -77,7 +77,7 @@ class Scaled:
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
 
     def recovered(self, s: Solution) -> Solution:
-        """Return the point of the original QP; components at bounds remain there."""
+        """Return the point of the original QP; components at bounds stay at bounds."""
         if self.qp is self.given:
             return s
         x = np.clip(s.x / self.root, self.given.lb, self.given.ub)

@@ -68,7 +68,7 @@ class SMALBE(Options):
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
-            return "takes bounds and equality rows, no inequality rows"
+            return "accepts bounds and equality rows, but no inequality rows"
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:

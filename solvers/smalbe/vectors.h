@@ -696,8 +696,8 @@ INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upp
     }
 }
 
-/* x = x - αp and g = g - αHp, components within rounding of a bound set to it, and
-   `split`, in one pass over memory; result[3] = φᵀHp.
+/* x = x - αp and g = g - αHp, with components within rounding of a bound set to this
+   bound, then `split`, in one pass over memory; result[3] = φᵀHp.
 
    upper : NULL if no component has an upper bound
    phi, free : NULL if not needed */
