@@ -66,8 +66,8 @@ class Clarabel:
         package="clarabel",
         linear_solver="QDLDL or faer (sparse LDLᵀ), chosen by Clarabel; one "
         "factorisation per iteration",
-        phases="preparing: equilibration, symbolic analysis; solving: all "
-        "factorisations",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
         sequence="`update` replaces vectors and keeps the analysis; no warm starts",
     )
 

@@ -45,7 +45,7 @@ class CVXOPT:
         package="cvxopt",
         linear_solver="CHOLMOD (sparse) or LAPACK (dense), bundled, one factorisation "
         "per iteration",
-        phases="preparing: conversion only; solving: everything else",
+        phases="conversion only (preparing); everything else (solving)",
         limits=(
             "Linearly dependent equality rows are declined, because CVXOPT ends with "
             "an error or the status 'unknown' (conformance, shape 'redundant').",

@@ -96,8 +96,8 @@ class CVXPY:
         licence="Apache-2.0; backends have their own licences",
         package="cvxpy",
         linear_solver="linear solver of the backend",
-        phases="preparing: compilation of the model to the backend's data; "
-        "solving: setup and solve of the backend",
+        phases="compilation of the model to the backend's data (preparing); setup and "
+        "solve of the backend (solving)",
         limits=(
             "QPs are declined for CVXOPT and ECOS: as cone programs, they lose half "
             "of the digits (dual residuals of 1e-5 at tol 1e-6 in the conformance "

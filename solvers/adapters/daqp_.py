@@ -70,8 +70,8 @@ class DAQP:
         licence="MIT",
         package="daqp",
         linear_solver="its own dense LDLᵀ, updated when the active set changes",
-        phases="preparing: conversion to dense matrices, factorisation; solving: "
-        "iterations",
+        phases="conversion to dense matrices and factorisation (preparing); iterations "
+        "(solving)",
         sequence="`update` replaces vectors and keeps the factors and the active set",
         limits=(
             "DAQP takes more than 20 s on the 4420 unknowns of "

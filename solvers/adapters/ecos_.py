@@ -60,7 +60,7 @@ class ECOS:
         licence="GPL-3.0-only",
         package="ecos",
         linear_solver="sparse LDLᵀ, bundled, one factorisation per iteration",
-        phases="preparing: eigenvalues of P; solving: everything else",
+        phases="eigenvalues of P (preparing); everything else (solving)",
         limits=("ECOS fails at tolerances below 1e-8.",),
     )
 

@@ -63,7 +63,7 @@ class HiGHS:
         package="highspy",
         linear_solver="LU of the active rows and a dense reduced Hessian (qpasm); "
         "multifrontal LDLᵀ (hipo)",
-        phases="preparing: passing the model; solving: everything else",
+        phases="passing the model (preparing); everything else (solving)",
         limits=(
             "qpasm takes longer than 20 s on the 4420 unknowns of "
             "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",

@@ -60,7 +60,8 @@ class OSQP:
         licence="Apache-2.0",
         package="osqp",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per change of ρ",
-        phases="preparing: scaling, factorisation; solving: iterations, polishing",
+        phases="scaling and factorisation (preparing); iterations and polishing "
+        "(solving)",
         sequence="`update` replaces vectors and keeps the factors; starts from the "
         "last point",
         limits=(

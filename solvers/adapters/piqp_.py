@@ -53,8 +53,8 @@ class PIQP:
         licence="BSD-2-Clause",
         package="piqp",
         linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
-        phases="preparing: equilibration, symbolic analysis; solving: all "
-        "factorisations",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
         sequence="`update` replaces vectors and keeps the analysis; no warm starts",
     )
 

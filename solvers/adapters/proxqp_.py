@@ -67,8 +67,8 @@ class ProxQP:
         package="proxsuite",
         linear_solver="its own LDLᵀ, dense or sparse, updated when the active set "
         "changes",
-        phases="preparing: equilibration, and symbolic analysis if sparse; "
-        "solving: factorisation, iterations",
+        phases="equilibration, and symbolic analysis in the sparse backend "
+        "(preparing); factorisation and iterations (solving)",
         sequence="`update` replaces vectors and keeps the equilibration; starts from "
         "the last point",
         limits=(

@@ -51,8 +51,8 @@ class QOCO:
         licence="BSD-3-Clause",
         package="qoco",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
-        phases="preparing: equilibration, symbolic analysis; solving: all "
-        "factorisations",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
         sequence="`update_vector_data` keeps the analysis; no warm starts in Python "
         "(0.3.2)",
         limits=(

@@ -51,7 +51,7 @@ class QPALM:
         licence="LGPL-3.0-or-later",
         package="qpalm",
         linear_solver="LADEL (sparse LDLᵀ, updated when the active set changes)",
-        phases="preparing: scaling; solving: all factorisations",
+        phases="scaling (preparing); all factorisations (solving)",
         sequence="updates replace vectors; starts from the last point",
         limits=(
             "QPALM does not test the duality gap, so it may stop while the gap is "

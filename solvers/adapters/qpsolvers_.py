@@ -112,8 +112,8 @@ class QPSolvers:
         licence="LGPL-3.0-or-later; backends have their own licences",
         package="qpsolvers",
         linear_solver="linear solver of the backend",
-        phases="preparing: conversion only; solving: the backend's setup, "
-        "factorisation and iterations",
+        phases="conversion only (preparing); the backend's setup, factorisation and "
+        "iterations (solving)",
         limits=(
             "Unconstrained QPs are declined for clarabel, qtqp and scs. qpsolvers "
             "would solve these QPs with its own code, which claims that strictly "

@@ -54,7 +54,7 @@ class QTQP:
         licence="Apache-2.0",
         package="qtqp",
         linear_solver="MKL Pardiso (py-mkl-pardiso), one factorisation per iteration",
-        phases="preparing: conversion only; solving: everything else",
+        phases="conversion only (preparing); everything else (solving)",
         sequence="starts from the last point if QTQP accepts it",
         limits=(
             "QTQP needs an inequality row or a bound, because otherwise it divides by "

@@ -44,7 +44,7 @@ class Quadprog:
         licence="GPL-2.0-or-later",
         package="quadprog",
         linear_solver="dense Cholesky (LAPACK), and an updated QR of the active rows",
-        phases="preparing: factor of P and its inverse; solving: iterations",
+        phases="factor of P and its inverse (preparing); iterations (solving)",
         limits=(
             "quadprog solves strictly convex QPs only. The form `dual` is declined if "
             "F is singular.",

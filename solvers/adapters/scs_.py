@@ -54,7 +54,7 @@ class SCS:
         package="scs",
         linear_solver="bundled MKL Pardiso or QDLDL, one factorisation per change of "
         "scale",
-        phases="preparing: equilibration, factorisation; solving: iterations",
+        phases="equilibration and factorisation (preparing); iterations (solving)",
         sequence="`update` replaces vectors and keeps the factors; starts from the "
         "last point",
         limits=("SCS needs a row or a bound, because it rejects an empty cone.",),

@@ -41,8 +41,7 @@ class AcceleratedGradient:
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    #: factor by which L is multiplied after each step; with 1, L never decreases
-    shrink: float = 0.9
+    shrink: float = 0.9  #: multiplies L after each step; with 1, L never decreases
     #: factor by which an increase multiplies L; if the curvature along the step is
     #: larger than the product, L increases to the curvature
     growth: float = 2.0
@@ -53,7 +52,7 @@ class AcceleratedGradient:
         licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
-        phases="preparing: nothing; solving: everything",
+        phases="all work is timed as solving",
     )
 
     def __post_init__(self) -> None:

@@ -50,7 +50,7 @@ class BVLS:
         licence="BSD-3-Clause",
         method="active set (`nnls` or `lsq_linear`), applied to a Cholesky factor",
         linear_solver="LAPACK, called by scipy",
-        phases="preparing: factorisation of P; solving: iterations",
+        phases="factorisation of P (preparing); iterations (solving)",
         limits=("`nnls` does not report the number of iterations.",),
     )
 

@@ -84,8 +84,8 @@ class FETI:
         licence="BSD-3-Clause",
         method="projected preconditioned conjugate gradients",
         linear_solver="products with P, and a Cholesky factor of the coarse problem",
-        phases="preparing: factorisation of the coarse problem, setup of the "
-        "preconditioner; solving: iterations",
+        phases="factorisation of the coarse problem and setup of the preconditioner "
+        "(preparing); iterations (solving)",
         limits=(
             "The solver declines QPs with bounds or inequality rows, because it "
             "solves linear problems only.",

@@ -58,7 +58,7 @@ class GaussSeidel:
         licence="BSD-3-Clause",
         method="block Gauss–Seidel over discs, cones and single variables (NSGS)",
         linear_solver="none (columns of P)",
-        phases="preparing: nothing; solving: everything",
+        phases="all work is timed as solving",
         limits=(
             "The loop over blocks is written in Python, so compare numbers of sweeps "
             "rather than times.",

@@ -107,8 +107,8 @@ class PDAS:
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="preparing: assembly of the penalised matrix; solving: factorisations "
-        "of the matrices of the faces",
+        phases="assembly of the penalised matrix (preparing); factorisations of the "
+        "matrices of the faces (solving)",
         sequence="starts from the last active set and point",
         limits=(
             "On one-dimensional obstacle problems, the contact front moves by one "

@@ -60,8 +60,8 @@ class PDASAMG(PDAS):
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="conjugate gradients, preconditioned by smoothed aggregation "
         "(pyamg)",
-        phases="preparing: assembly of the penalised matrix; solving: multigrid setup "
-        "for each face, iterations",
+        phases="assembly of the penalised matrix (preparing); multigrid setup for "
+        "each face and iterations (solving)",
         sequence="starts from the last active set and point",
         package="pyamg",
         limits=(

@@ -70,7 +70,7 @@ class ProjectedGradient:
         licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
-        phases="preparing: nothing; solving: everything",
+        phases="all work is timed as solving",
         limits=(
             "The number of products varies strongly between the load steps of the "
             "benchmark, from 45 to 546.",

@@ -57,8 +57,8 @@ class Direct:
         licence="BSD-3-Clause",
         method="augmented Lagrangian with an exact inner active-set method",
         linear_solver="dense Cholesky factor, updated when the active set changes",
-        phases="preparing: orthonormalisation of the equality rows, factorisation of "
-        "the block of unbounded variables; solving: iterations",
+        phases="orthonormalisation of the equality rows and factorisation of the block "
+        "of unbounded variables (preparing); iterations (solving)",
         limits=(
             "QPs with inequality rows are declined; dual forms have no inequality "
             "rows.",

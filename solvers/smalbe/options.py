@@ -54,16 +54,12 @@ class Options:
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # with a sparse P, conjugation to all directions would cost more than a product
-    #: keep all CG directions on a face conjugate if P is not sparse
-    recycle: bool = True
-    #: compare ‖β‖² with φ̃ᵀφ instead of φᵀφ in the proportioning test
-    reduced: bool = True
-    #: ᾱ‖H‖ of gradient projection, and relaxation factor of model steps
-    alpha: float = 1.9
+    recycle: bool = True  #: keep CG directions on a face conjugate if P is not sparse
+    reduced: bool = True  #: compare ‖β‖² with φ̃ᵀφ, not φᵀφ, in proportioning tests
+    alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 is the limit without equality rows
-    #: limit of Lanczos steps; also limited to n/6 or n/10, but to no less than 5
-    lanczos_steps: int = 12
+    lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
     # only with the preconditioners model and none; others require the original P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables
     energy: float = 50.0  #: largest energy error estimate relative to tol; 0: no limit

@@ -50,8 +50,8 @@ class SMALBE(Options):
         method="augmented Lagrangian with an inner active-set method (MPRGP)",
         linear_solver="none (products with P, small dense systems of the model, "
         "incomplete factors of a sparse P)",
-        phases="preparing: orthonormalisation of rows, Lanczos process; solving: "
-        "iterations",
+        phases="orthonormalisation of rows and Lanczos process (preparing); iterations "
+        "(solving)",
         sequence="reuses the point, multipliers, Ritz pairs and the factor of the "
         "free block",
         limits=(
