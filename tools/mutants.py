@@ -434,8 +434,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     the input is invalid or tests of an unchanged module fail.
     """
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("modules", nargs="*", help="as in tests/mutants.toml; all")
-    parser.add_argument("--most", type=int, help="mutants per module")
+    parser.add_argument(
+        "modules", nargs="*", help="modules of tests/mutants.toml; default: all"
+    )
+    parser.add_argument("--most", type=int, help="largest number of mutants per module")
     args = parser.parse_args(argv)
     plan = read_plan()
     modules = args.modules or list(plan.tests)

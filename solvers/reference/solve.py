@@ -83,7 +83,7 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices; got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    ways: tuple[Iterator[Solution], ...] = (
+    attempts: tuple[Iterator[Solution], ...] = (
         _candidates(qp),
         _candidates_without_outliers(qp),
         _less_regularised_candidates(qp),
@@ -91,11 +91,11 @@ def reference_solution(qp: QP) -> Solution:
     if len(qp.sets) > 1:
         smooth = all(isinstance(one, Discs) for one in qp.sets[1:])
         shifts = (DELTA, SINGULAR_DELTA) if smooth else ()
-        ways = (
+        attempts = (
             *(_smooth_candidates(qp, delta) for delta in shifts),
             _projection_candidates(qp),
         )
-    for candidates in ways:
+    for candidates in attempts:
         residuals = list[float]()
         for point in candidates:
             residuals.append(worst := _residual(qp, point))

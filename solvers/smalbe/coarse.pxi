@@ -106,7 +106,7 @@ cdef class LocalCoarse(Coarse):
     cdef CompressedRows rows  # G
     cdef CompressedRows by_components  # Gᵀ
     cdef CompressedRows of_bounded  # G_bᵀ
-    cdef CompressedRows given  # transpose of the original, unnormalised rows
+    cdef CompressedRows original  # transpose of the original, unnormalised rows
     cdef CompressedRows matrix  # GGᵀ
     cdef BorderedFactor factor
     cdef bint has_border
@@ -118,9 +118,9 @@ cdef class LocalCoarse(Coarse):
         self.by_components = source.unit.transposed
         self.rows = self.by_components.transposed()
         self.of_bounded = source.of_bounded.transposed
-        self.given = transposed_rows(source.G)
+        self.original = transposed_rows(source.G)
         self.matrix, self.factor = symmetric_rows(gram.matrix), gram.factor
-        self.has_border, self.missed = gram.has_border, Room(self.given.k)
+        self.has_border, self.missed = gram.has_border, Room(self.original.k)
 
     cdef int times(self, const double *v, double *t) except -1:
         self.rows.times(v, t)
@@ -172,9 +172,9 @@ cdef class LocalCoarse(Coarse):
         return 0
 
     cdef double error(self, const double *nu) except? -1:
-        memset(self.missed.at, 0, self.given.k * sizeof(double))
-        self.given.add_transposed(nu, self.missed.at)
-        return sqrt(dot(self.missed.at, self.missed.at, self.given.k))
+        memset(self.missed.at, 0, self.original.k * sizeof(double))
+        self.original.add_transposed(nu, self.missed.at)
+        return sqrt(dot(self.missed.at, self.missed.at, self.original.k))
 
 
 cdef CompressedRows transposed_rows(G):

@@ -195,7 +195,7 @@ cdef extern from "incomplete.h" nogil:
                           const double *lower, const double *upper, double *s,
                           Py_ssize_t n)
     void scaled_matrix(const int *indptr, const int *indices, const double *data,
-                       const double *s, double *scaled, Py_ssize_t n, double *told)
+                       const double *s, double *scaled, Py_ssize_t n, double *row_sums)
 
 cdef extern from "discs.h" nogil:
     ctypedef struct discs:

@@ -204,7 +204,7 @@ def _projected(
     norm, diagonal = problem.spectrum.norm, problem.diagonal
     if scaled is not None:
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, scaled.diagonal, norm
+            scaled.original, qp, scaled.root, scaled.diagonal, norm
         )
     elif (
         options.expansion == "model"

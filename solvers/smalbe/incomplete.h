@@ -458,7 +458,7 @@ projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
    to the diagonal entry. */
 TWICE static void
 scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
-              Py_ssize_t n, out told)
+              Py_ssize_t n, out row_sums)
 {
     double norm = 0, least = INFINITY, least_scaled = INFINITY;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -475,9 +475,9 @@ scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
         least = least < sum ? least : sum;
         least_scaled = least_scaled < sum_scaled ? least_scaled : sum_scaled;
     }
-    told[0] = norm;
-    told[1] = least;
-    told[2] = least_scaled;
+    row_sums[0] = norm;
+    row_sums[1] = least;
+    row_sums[2] = least_scaled;
 }
 
 #endif

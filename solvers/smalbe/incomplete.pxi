@@ -39,10 +39,10 @@ def sparsity(matrix):
     """
     cdef Py_ssize_t i, k, n = matrix.shape[0], below, away = 0, others = 0
     cdef double pairs = 0.0, least = INFINITY, most = 0.0, diagonal
-    cdef list held = [_integers(matrix.indptr), _integers(matrix.indices)]
-    cdef const int *indptr = <const int *> cnp.PyArray_DATA(held[0])
-    cdef const int *indices = <const int *> cnp.PyArray_DATA(held[1])
-    cdef const double *data = read(matrix.data, held)
+    cdef list owners = [_integers(matrix.indptr), _integers(matrix.indices)]
+    cdef const int *indptr = <const int *> cnp.PyArray_DATA(owners[0])
+    cdef const int *indices = <const int *> cnp.PyArray_DATA(owners[1])
+    cdef const double *data = read(matrix.data, owners)
     for i in range(n):
         below, diagonal = 0, 0.0
         for k in range(indptr[i], indptr[i + 1]):
@@ -66,13 +66,13 @@ def scaled_by_diagonal(matrix, scale):
 
     matrix : P in SciPy's csr format; scale : S (n,)
     """
-    cdef list held = []
+    cdef list owners = []
     cdef int[::1] indptr = _integers(matrix.indptr), indices = _integers(matrix.indices)
-    cdef double told[3]
+    cdef double row_sums[3]
     entries = np.empty(len(matrix.data))
-    scaled_matrix(&indptr[0], &indices[0], read(matrix.data, held), read(scale, held),
-                  address(entries), len(scale), told)
-    return entries, told[0], told[1], told[2]
+    scaled_matrix(&indptr[0], &indices[0], read(matrix.data, owners), read(scale, owners),
+                  address(entries), len(scale), row_sums)
+    return entries, row_sums[0], row_sums[1], row_sums[2]
 
 
 @cython.final
@@ -103,7 +103,7 @@ cdef class IncompleteFactor:
     cdef Py_ssize_t n, most
     cdef const int *indptr
     cdef const int *indices
-    cdef list held
+    cdef list owners
     cdef Room room
     cdef Room values
     cdef int *integers
@@ -124,12 +124,12 @@ cdef class IncompleteFactor:
         cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
         cdef int first, last
         cdef bint by_bands
-        self.n, self.held, self.keep = n, [], KEEP if keep else 0.0
+        self.n, self.owners, self.keep = n, [], KEEP if keep else 0.0
         cdef int[::1] indptr = _integers(matrix.indptr)
         cdef int[::1] indices = _integers(matrix.indices)
         self.indptr, self.indices = &indptr[0], &indices[0]
-        cdef const double *data = read(matrix.data, self.held)
-        cdef const double *w = read(weights, self.held)
+        cdef const double *data = read(matrix.data, self.owners)
+        cdef const double *w = read(weights, self.owners)
         # 1. The order of elimination, and the distances of entries from the diagonal.
         for i in range(n):
             for k in range(indptr[i], indptr[i + 1]):
@@ -224,12 +224,12 @@ cdef class IncompleteFactor:
                     if first < last and row[first] == other:
                         target[pairs] = first
                     pairs += 1
-        self.held += [indptr, indices, at_offset]
+        self.owners += [indptr, indices, at_offset]
         self.F.n, self.F.half, self.F.reach, self.F.count = n, half, reach, count
         self.F.width, self.F.offset, self.F.between = n + reach, &at_offset[0], between
         self.F.start, self.F.row, self.F.target = start, row, target
         self.F.pair, self.F.below, self.F.diagonal = self.first_pairs, below, diagonal
-        self.F.scale = read(scale, self.held)
+        self.F.scale = read(scale, self.owners)
         self.F.L = self.F.bands = self.room.at
         self.F.pivot = self.F.L + stored
         self.F.inverse = self.F.pivot + n + reach

@@ -32,19 +32,19 @@ cdef class Judge:
     cdef double *size
     cdef double *z
     cdef Room room
-    cdef list held
+    cdef list owners
 
     def __init__(self, qp, scaled, root, diagonal, double norm):
         cdef Py_ssize_t n = len(diagonal)
-        self.n, self.norm, self.held = n, norm, []
+        self.n, self.norm, self.owners = n, norm, []
         box, scaled_box = qp.sets[0], scaled.sets[0]
-        self.q, self.lb = read(qp.q, self.held), read(box.lower, self.held)
-        self.ub = read(box.upper, self.held)
+        self.q, self.lb = read(qp.q, self.owners), read(box.lower, self.owners)
+        self.ub = read(box.upper, self.owners)
         if root is not None:
-            self.root = read(root, self.held)
-        self.low = read(scaled_box.lower, self.held)
-        self.high = read(scaled_box.upper, self.held)
-        self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
+            self.root = read(root, self.owners)
+        self.low = read(scaled_box.lower, self.owners)
+        self.high = read(scaled_box.upper, self.owners)
+        self.diagonal, self.room = read(diagonal, self.owners), Room(5 * n)
         self.x = self.room.at
         self.Px, self.forces = self.x + n, self.x + 2 * n
         self.size, self.z = self.x + 3 * n, self.x + 4 * n

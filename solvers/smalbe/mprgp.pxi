@@ -117,12 +117,12 @@ cdef double change_along(const Line *line, double alpha) noexcept:
     return -alpha * line.slope + 0.5 * alpha**2 * line.curvature
 
 
-cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
+cdef double *enlarged(double *array, Py_ssize_t size) except NULL:
     """Reallocate an array to `size` numbers, preserving its contents."""
-    held = <double *> realloc(held, max(size, 1) * sizeof(double))
-    if not held:
+    array = <double *> realloc(array, max(size, 1) * sizeof(double))
+    if not array:
         raise MemoryError
-    return held
+    return array
 
 
 @cython.final

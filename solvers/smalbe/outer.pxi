@@ -21,9 +21,9 @@ cdef double MIN_TAIL = 1e-4
 # journal bearings.
 cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
-# Number of pairs of projections in `onto_rows`. At the tolerance 1e-8, the relative
-# difference of the load and the contact force of a sphere on a plane is 3e-9 without
-# projections and 2e-10 with four pairs. Each pair takes two products with C.
+# Number of pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact
+# force of a sphere on a plane differs from the load by 3e-9 without projections and by
+# 2e-10 with four pairs. Each pair takes two products with C.
 cdef int ALTERNATIONS = 4
 
 
@@ -47,8 +47,9 @@ cdef class SMALBE(MPRGP):
     cdef bint plain, preconditioned
     cdef Py_ssize_t n_directions  # number of rows of C and Ritz vectors in the model
     cdef list owners  # references to the arrays that pointers refer to
-    cdef Basis basis  # these rows and vectors; None without any
-    cdef Room above  # (n_directions,) their eigenvalues minus the tail
+    cdef Basis basis  # rows of C and Ritz vectors; None without any
+    # (n_directions,) eigenvalues of the rows of `basis`, minus the tail
+    cdef Room above
     cdef const double *b
     cdef const double *q
     cdef const double *diagonal  # NULL for an operator without a diagonal
@@ -118,8 +119,8 @@ cdef class SMALBE(MPRGP):
         show. The models contain ρQ exactly. In a flat spectrum, a short Lanczos process
         does not converge even to the first eigenvector, and Ritz vectors that are not
         eigenvectors would slow down CG. In this case, only the norm is used. With
-        sparse rows, also only the norm is used, because these rows come from many
-        subdomains, whose spectrum is flat.
+        sparse rows, also only the norm is used, because sparse rows come from many
+        subdomains, for which the spectrum is flat.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef Py_ssize_t first = 0, last = n

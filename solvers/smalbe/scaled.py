@@ -27,10 +27,10 @@ ROUNDING = 1e-12
 class Scaled:
     """A QP in scaled variables, with data to compute a factor and to recover x."""
 
-    given: QP
-    P: Matrix  #: P of `given`, in CSR or CSC format with sorted indices
+    original: QP
+    P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
     diagonal: Vector  #: (n,) diagonal of P
-    qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
+    qp: QP  #: QP in y = D¹ᐟ²x; `original` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
     #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
     norm: float
@@ -78,11 +78,11 @@ class Scaled:
 
     def recovered(self, s: Solution) -> Solution:
         """Return the point of the original QP; components at bounds stay at bounds."""
-        if self.qp is self.given:
+        if self.qp is self.original:
             return s
-        x = np.clip(s.x / self.root, self.given.lb, self.given.ub)
-        x = np.where(s.x <= self.qp.lb, self.given.lb, x)
-        x = np.where(s.x >= self.qp.ub, self.given.ub, x)
+        x = np.clip(s.x / self.root, self.original.lb, self.original.ub)
+        x = np.where(s.x <= self.qp.lb, self.original.lb, x)
+        x = np.where(s.x >= self.qp.ub, self.original.ub, x)
         return replace(s, x=x, z_box=s.z_box * self.root)
 
 
