@@ -47,8 +47,8 @@ cdef enum:
     SPECTRAL = 5
     # Number of previous costs with which the nonmonotone line search compares. In a
     # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
-    # or 40, 2 % more with 5, and 35 % more with 1 (a monotone search). With 10 428
-    # discs, it takes 12 % more products with 10.
+    # and with 40, 2 % more with 5, and 35 % more with 1 (a monotone search). With
+    # 10 428 discs, it takes 12 % more products with 10.
     MEMORY = 20
     # Number of steps on an unchanged face before a Newton step. On contact patches with
     # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
