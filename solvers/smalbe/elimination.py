@@ -1,4 +1,4 @@
-"""Elimination of the variables without bounds from a QP, and recovery of these.
+"""Elimination of the variables without bounds from a QP, and recovery of their values.
 
 Let E be the variables without bounds and I the other variables. The stationarity
 conditions of E and the equality rows that involve E,

@@ -55,10 +55,11 @@ STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: runs on random AᵀA failed at tol 1e-12.
 MAX_PAIRS = 2.0
 #: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. The value was
-#: chosen on thirty string, obstacle, journal bearing and torsion problems of 20 to 20
-#: 000 unknowns. Below this value, a solve with a factor takes up to 2.8 times as long
-#: as with `model` and saves at most 0.2 ms. Above this value, a solve with a factor
-#: takes at most a quarter longer (a flat obstacle, n = 110) and saves up to 97 %.
+#: chosen on thirty string, obstacle, journal bearing and torsion problems of 20 to
+#: 20 000 unknowns. Below this value, a solve with a factor takes up to 2.8 times as
+#: long as with `model` and saves at most 0.2 ms. Above this value, a solve with a
+#: factor takes at most a quarter longer (a flat obstacle, n = 110) and saves up to
+#: 97 %.
 MIN_DIFFICULTY = 50.0
 #: smallest spread for which a factor is used for any number of levels; journal bearings
 #: with an eccentricity of 0.9 have spreads of 2000 to 7000
@@ -128,8 +129,8 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 def has_sparse_factor(qp: QP) -> bool:
     """Return True if an incomplete factor of the free block of P is cheap.
 
-    A factor requires a sparse P with a positive diagonal that this process stores. It
-    also requires bounds only, because a factor of P does not include the penalty of
+    A factor requires a sparse P with a positive diagonal that this process stores. The
+    QP must have bounds only, because a factor of P does not include the penalty of
     rows. The columns of P must have so few entries that a factor costs no more than
     several products.
     """

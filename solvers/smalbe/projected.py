@@ -105,7 +105,9 @@ class Iterate(NamedTuple):
 def projected_problem(
     qp: QP, find: Callable[[Product, compiled.Rows], Spectrum]
 ) -> Projected:
-    """Homogenise, project and normalise a QP; take one product, and those of `find`.
+    """Homogenise, project and normalise a QP.
+
+    This takes one product in addition to the products of `find`.
 
     find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
     """

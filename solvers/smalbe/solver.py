@@ -6,7 +6,7 @@ discs). With discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the pap
 reference [12]; Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with
 spectral steps (mprgp.pxi).
 
-1. Compute orthonormal rows C with the same span as the rows of G, and transform e.
+1. Compute orthonormal rows C with the span of the rows of G; transform e accordingly.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
