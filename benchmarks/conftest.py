@@ -1,8 +1,8 @@
-"""Fixtures for races: functions timed alternately in one process.
+"""Fixtures for races, in which functions are timed alternately in one process.
 
-Because the functions alternate, a drift of the machine's speed affects all of them
-equally. After the tests, medians, quartiles and ratios to the first function are
-printed.
+Because the functions alternate, a drift of the machine's speed affects all functions
+equally. After the tests, a summary shows medians, quartiles and ratios to the time of
+the first function.
 """
 
 from statistics import median, quantiles
@@ -29,7 +29,7 @@ def note(request):
 def race(request):
     """Return a function ``race(first=f, second=g, rounds=9)``.
 
-    The function returns the median times by name, in s.
+    The returned function runs the race and returns the median times in s, by name.
     """
 
     def run(*, rounds=9, **contestants):

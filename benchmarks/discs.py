@@ -1,8 +1,8 @@
-"""Products of in-house solvers on Mindlin's problem: tables of docs/smalbe-discs.md.
+"""Tables of docs/smalbe-discs.md: products of in-house solvers on Mindlin's problem.
 
     python -m benchmarks.discs products|ratios|time|conic
 
-* products: numbers of products with P (for nsgs, of sweeps) at tol 1e-8, for 88 to 1468
+* products: numbers of products with P (of sweeps for nsgs) at tol 1e-8, for 88 to 1468
   discs.
 * ratios: number of products of `smalbe` relative to that of the best other method. The
   numbers are sensitive to small changes of the data. Each problem is therefore solved
@@ -10,7 +10,7 @@
   deviate by up to 3 %.
 * conic: processor times of `smalbe` and of conic solvers until a point is verified.
 * time: errors, error bound, peak memory and processor time of `smalbe` for up to 512²
-  cells, and the ratio of this time to that of the products alone, where the two are
+  cells, and the ratio of this time to the time of the products alone. The two times are
   measured alternately. Set OMP_NUM_THREADS=1, because processor times of threads are
   added.
 """
@@ -144,7 +144,8 @@ def _ratio(logs: NDArray[np.float64]) -> str:
 def time() -> None:
     """Print errors, memory and times of `smalbe` for up to 512² cells.
 
-    The last column is the ratio of the time of a solve to that of its products alone.
+    The last column is the ratio of the time of a solve to the time of its products
+    alone.
     """
     header = "cells, discs", "ν", "Q/μP", "error of c/a", "of Q", "bound", "peak memory"
     print(*header, "products", "solve", "ratio", sep=" | ")
@@ -175,10 +176,10 @@ def time() -> None:
 
 
 def conic() -> None:
-    """Print processor times for a point that is verified at 1e-8, ν = 0.3, Q/μP = 0.5.
+    """Print processor times to a point that is verified at 1e-8, ν = 0.3, Q/μP = 0.5.
 
-    Each solver runs at tolerances 1e-6, 1e-8, … until its point is verified. The time
-    is that of the last run.
+    Each solver runs at tolerances 1e-6, 1e-8, … until its point is verified. The
+    printed time is the time of the last run.
     """
     for n, name in product(CELLS, ("smalbe", *CONIC)):
         qp, result = with_dense(mindlin(n, 0.3, 0.5).qp), "not verified"
@@ -195,7 +196,7 @@ def conic() -> None:
 
 
 if __name__ == "__main__":
-    parser = ArgumentParser(description="Solvers on discs of friction.")
+    parser = ArgumentParser(description="Compare solvers on friction discs.")
     parser.add_argument("table", choices=["products", "ratios", "time", "conic"])
     tables = {"products": products, "ratios": ratios, "time": time, "conic": conic}
     tables[parser.parse_args().table]()

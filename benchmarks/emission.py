@@ -4,9 +4,10 @@
     .venv/bin/python benchmarks/emission.py whole [CASE]
 
 Each rank assembles its share of the QP. After each stage, the script prints the peak of
-resident memory in excess of that of imports (largest and mean over the ranks) and the
+resident memory beyond the memory of imports (largest and mean over the ranks) and the
 time of the slowest rank. With `whole`, the case is built in one process, including the
-data for certificates and pictures. No results are asserted, since machines differ.
+data for certificates and pictures. The script asserts no results, because machines
+differ.
 """
 
 import sys
@@ -25,7 +26,7 @@ def whole(name: str = CASE) -> None:
     import mortarbench as mb
     from mortarbench.problems.models import beam_ring
 
-    del beam_ring  # imported only so that the import is not part of the measured memory
+    del beam_ring  # imported so that the import is not part of the measured memory
     before, start = memory_mib("VmHWM"), time.perf_counter()
     qp = mb.build(name).qp
     seconds, peak = time.perf_counter() - start, memory_mib("VmHWM") - before
@@ -61,7 +62,7 @@ def distributed(name: str = CASE) -> None:
     start = time.perf_counter()
     emit = case.family.emission(case.form, case.params)
     if emit is None:
-        raise SystemExit(f"{name}: ranks cannot emit it")
+        raise SystemExit(f"{name}: ranks cannot assemble this case")
     share_source = emit(ranks, reference_over_ranks)
     if ranks.rank == 0:
         print(f"{name}: {share_source.variables} multipliers, {ranks.size} ranks")

@@ -1,24 +1,24 @@
-"""Total FETI against size: time, memory, steps and condition numbers at fixed H/h.
+"""Scaling of Total FETI: time, memory, steps and condition numbers at fixed H/h.
 
     python benchmarks/feti_scaling.py [--cells H/h] [--ways feti,whole] [Nr ...]
     python benchmarks/feti_scaling.py --family cube-wall [--cells H/h] [n ...]
 
 The problem is the beam on its half ring in one load step, Nh = Nr/2, or the cube of n³
 hexahedra beside a wall. With `feti`, the bodies are decomposed into subdomains; `whole`
-is the dual QP of undivided bodies. Both are timed from the mesh to an answer with a
-certified error below 1e-6, which requires different tolerances. Each measurement runs
-in a separate process, so that the peak memory of this measurement is known. `cpu` is
+is the dual QP of undivided bodies. Both variants are timed from the mesh to an answer
+with a certified error below 1e-6; the necessary tolerances of the two variants differ.
+Each measurement runs in a separate process, so that its peak memory is known. `cpu` is
 processor time, for comparisons on a busy machine.
 
-For `feti`, the following quantities of the theory are measured in addition. They do not
-depend on the search for the active set.
+For `feti`, the script also measures the following quantities of the theory, which do
+not depend on the search for the active set.
 
     kappa            condition number of PFP without contact, by Lanczos; P projects
                      onto the kernel of the equality rows, and F is the dual operator
                      of supports and gluing
     kappa_dirichlet  condition number with the Dirichlet preconditioner
-    face             CG steps, with this preconditioner, to reduce the residual by 1e-6
-                     if the active contact rows are equations
+    face             CG steps with this preconditioner to reduce the residual by 1e-6,
+                     where the active contact rows are equations
     face none        CG steps for the same problem without a preconditioner
 
 The script prints a table, and for each quantity the exponent p of a fit c·n^p with its
@@ -132,7 +132,7 @@ def one(way, family, size, cells):
 
 
 def final_face(pieces, unbounded, qp, s):
-    """Return the quantities of the theory, see the docstring of the module.
+    """Return the quantities of the theory described in the docstring of the module.
 
     pieces : decomposed bodies
     unbounded : local QP without contact
@@ -171,7 +171,11 @@ def main():
     parser.add_argument("--family", choices=FAMILIES, default="beam-ring")
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--ways", default="feti,whole")
-    parser.add_argument("--one", action="store_true", help="in this process, as JSON")
+    parser.add_argument(
+        "--one",
+        action="store_true",
+        help="measure one size in this process, and print JSON",
+    )
     args = parser.parse_args()
     if args.one:
         print(json.dumps(one(args.ways, args.family, args.sizes[0], args.cells)))

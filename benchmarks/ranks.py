@@ -2,15 +2,15 @@
 
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/ranks.py [CASE] [REPEATS]
 
-The speed of products is limited by memory bandwidth, which the CPUs of a machine share.
-Therefore two copies of a job on two CPUs do not achieve twice the throughput of one
-copy either. The speed-up of a solve on all ranks is shown beside the joint throughput
-of copies, one on each rank. The same QP is solved in three ways: `alone` on one rank,
-as `copies`, and by all `ranks` together. Their rounds are interleaved. The script
-prints medians with minimum and maximum, and the times of each rank for the phases of a
-solve. Measurements during which other processes used the CPUs are dropped; the number
-of remaining ones is printed. The script requires Linux. No results are asserted, since
-machines differ.
+Memory bandwidth, which the CPUs of a machine share, limits the speed of products.
+Therefore even two independent copies of a job on two CPUs do not achieve twice the
+throughput of one copy. The script compares the speed-up of a solve on all ranks with
+the joint throughput of copies, one on each rank. The same QP is solved in three ways:
+`alone` on one rank, as independent `copies`, and by all `ranks` together. The rounds of
+these measurements alternate. The script prints medians with minimum and maximum, and
+the times of each rank for the phases of a solve. Measurements during which other
+processes used the CPUs are dropped, and the number of remaining measurements is
+printed. The script requires Linux. It asserts no results, because machines differ.
 """
 
 import os
@@ -31,7 +31,7 @@ MAX_DISTURBANCE = 0.04
 
 
 def together(comm: MPI.Comm) -> None:
-    """Wait for all ranks, without keeping a CPU busy."""
+    """Wait until all ranks arrive, without keeping a CPU busy."""
     request = comm.Ibarrier()
     while not request.Test():
         time.sleep(1e-3)
@@ -46,7 +46,7 @@ def busy():
 
 
 def undisturbed(world, act):
-    """Call `act` on every rank and return its result.
+    """Call `act` on every rank, and return the local result.
 
     Return None if other processes used more CPU time than `MAX_DISTURBANCE` allows.
     """
@@ -64,8 +64,8 @@ def undisturbed(world, act):
 def timed(qp, comm):
     """Prepare and solve on the ranks of `comm`.
 
-    Return the times in s of preparing, of solving and of the phases of the solve, and
-    counts of operations.
+    Return the times in s of preparing, solving and the phases of the solve, and counts
+    of operations.
     """
     ranks = Ranks(comm)
     share = qp.P.build().share(qp, ranks)
@@ -88,7 +88,7 @@ def main(name: str = CASE, repeats: str = "5") -> None:
     """Measure, and print the table."""
     world, alone = MPI.COMM_WORLD, MPI.COMM_SELF
     cpus = sorted(os.sched_getaffinity(0))
-    # each rank has its own CPU, as in a run
+    # as in a run, each rank uses a separate CPU
     os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})
     qp = mb.build(name).qp
     ways = {

@@ -5,8 +5,8 @@
     .venv/bin/python benchmarks/runner.py null [TRIALS]  intervals of a true ratio of 1
     .venv/bin/python benchmarks/runner.py neighbours [N] times beside careless solvers
 
-The overhead is the time from one record to the next, minus the times of the solver and
-of fsync. In an A/A comparison (``null``), a solver is compared with itself.
+The overhead is the time from one record to the next record, minus the times of the
+solver and of fsync. In an A/A comparison (``null``), a solver is compared with itself.
 """
 
 import os
@@ -65,7 +65,7 @@ class Watch:
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
 
     def overheads(self):
-        """Return the times between records, minus those of solver and fsync, in s."""
+        """Return the times between records in s, without those of solver and fsync."""
         seconds = []
         for i in range(1, len(self.at)):
             gap = self.at[i] - self.at[i - 1]
@@ -75,7 +75,7 @@ class Watch:
 
 
 def measure(out, *solvers, repeats, plugin=PLUGIN):
-    """Run solvers of a plug-in on the tiny QP of this plug-in; return the `Watch`."""
+    """Run solvers of a plug-in on the plug-in's tiny QP; return the `Watch`."""
     start = [sys.executable, "-P", str(plugin)]
     plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
@@ -110,7 +110,7 @@ def overhead(n=500):
 
 
 def growth(n=10_000):
-    """Print memory and number of open files after a tenth, half and all of a run."""
+    """Print memory and number of open files after a tenth, half and the whole run."""
     with tempfile.TemporaryDirectory() as out:
         watch = measure(Path(out), "honest", repeats=n // 2)
         lines = len(read_journal(Path(out)))

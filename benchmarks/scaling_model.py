@@ -2,9 +2,10 @@
 
 `python -m benchmarks.scaling_model` prints the tables of docs/scaling-model.md that
 depend on the machine, in Markdown. The case is `cube-wall/n=32/feti=4`, with 512
-congruent subdomains and 107 811 dofs in total. Each time is the smallest of many calls,
-because other programs can only lengthen a call. If there are more ranks than CPUs,
-messages wait for their receivers, and only the times of local products are printed.
+congruent subdomains and 107 811 dofs in total. Each time is the smallest time of many
+calls, because other programs can only lengthen a call. If there are more ranks than
+CPUs, messages wait for their receivers, and only the times of local products are
+printed.
 """
 
 import json
@@ -50,7 +51,7 @@ class Row:
     ranks: int
     cluster: int  #: subdomains per side of a cluster
     measured: dict[str, float]  #: measurements by name of the quantity
-    machine: dict[str, float]  #: measured speeds, the fields of `Machine`
+    machine: dict[str, float]  #: measured speeds by field of `Machine`
 
     @property
     def run(self) -> Distribution:
@@ -62,7 +63,7 @@ class Row:
 
     @property
     def model(self) -> Prediction:
-        """Prediction with the machine speeds measured on the same ranks just before."""
+        """Prediction with machine speeds measured on the same ranks shortly before."""
         return predict(self.run, Machine(**self.machine))
 
 
@@ -81,8 +82,8 @@ def speeds() -> Machine:
     """Measure the speeds of a core and of messages between ranks.
 
     Memory bandwidth is measured by the product of a packed triangular matrix of 64 MiB
-    with a vector, and the floating-point rate by the product of the matrix of a
-    subdomain with 64 vectors, as many as congruent subdomains.
+    with a vector. The floating-point rate is measured by the product of the matrix of a
+    subdomain with 64 vectors, as for 64 congruent subdomains.
     """
     n, m = 4096, Distribution(cores=1, cells=CELLS).block
     packed, x = np.ones(n * (n + 1) // 2), np.ones(n)
@@ -98,7 +99,7 @@ def speeds() -> Machine:
 
 
 def distinct() -> float:
-    """Return the time of local products in s if no two subdomains share a block."""
+    """Return the time in s of local products in which no subdomains share a block."""
     n = Distribution(cores=1, cells=CELLS).block
     count = SIDE**3 // MPI.COMM_WORLD.size
     triangles = [np.ones(n * (n + 1) // 2) for _ in range(count)]
@@ -134,7 +135,7 @@ def measured(cluster: int) -> dict[str, float]:
         MESSAGES: world.allreduce(product["messages"], MPI.MAX),
         APPLICATIONS: counts["P_products"] + counts["preconditioner_applies"],
         # An application sends as many messages as a product, so the number of messages
-        # yields that of applications. A single rank sends no messages.
+        # determines the number of applications. A single rank sends no messages.
         REDUCED: ranks.counts["reductions"] * product["messages"]
         / max(ranks.counts["messages"], 1),
     }  # fmt: skip
@@ -144,7 +145,7 @@ def on_ranks() -> None:
     """Print the measurements on these ranks as JSON, one line per cluster size."""
     world = MPI.COMM_WORLD
     cpus = sorted(os.sched_getaffinity(0))
-    # each rank has its own CPU, as in a run
+    # as in a run, each rank uses a separate CPU
     os.sched_setaffinity(0, {cpus[world.rank % len(cpus)]})
     machine, different = speeds(), distinct()
     for cluster in CLUSTERS:
@@ -164,7 +165,7 @@ def digits(x: float) -> str:
 
 
 def number(head: str, name: str, unit: float = 1.0) -> Column:
-    """Return a column of measurements, divided by `unit`; "–" if not meaningful."""
+    """Return a column of measurements divided by `unit`, with "–" if not meaningful."""
     return head, lambda r: digits(r.measured[name] / unit) if shows(r, name) else "–"
 
 
@@ -172,7 +173,7 @@ def model(name: str, of: Callable[[Row], float], unit: float = 1.0) -> Column:
     """Return a column of predictions with their deviations from measurements.
 
     name : measured quantity
-    of : returns the prediction
+    of : function that returns the prediction
     unit : divisor of the predictions
     """
 

@@ -1,11 +1,11 @@
-"""Time and peak memory of one load step, from mesh to recovery, against size.
+"""Scaling of time and peak memory of one load step, from mesh to recovery.
 
     make size        or   .venv/bin/python benchmarks/size.py [FORM] [Nr ...]
 
-The case is beam-ring with Nh = Nr/2. Each size runs in a separate process, so that the
-peak memory of this size is known. The script prints a table and, for each quantity, the
-exponent p of a fit c·n^p with its 95 % interval. Logarithms are fitted by least
-squares, and n is the number of displacements.
+The case is beam-ring with Nh = Nr/2. Each size runs in a separate process, so that its
+peak memory is known. The script prints a table and, for each quantity, the exponent p
+of a fit c·n^p with its 95 % interval, where n is the number of displacements.
+Logarithms are fitted by least squares.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Costs of SMALBE relative to its products: tables of docs/performance-smalbe.md.
+"""Tables of docs/performance-smalbe.md: costs of SMALBE relative to its products.
 
     python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
@@ -16,10 +16,10 @@
 * kept: solves with and without recycling of CG directions.
 * race: times to prepare and solve a case with several solvers; answers are verified.
 
-Runs that are compared alternate in one process. Times are processor times of that
-process; set OMP_NUM_THREADS=1, because the times of threads are added. The script
-prints the median of the runs and the median of their fastest tenth, on which other
-programs have less influence.
+Runs that are compared with each other alternate in one process. Times are processor
+times of this process; set OMP_NUM_THREADS=1, because the times of threads are added.
+The script prints the median of the runs and the median of the fastest tenth, on which
+other programs have less influence.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ SUBDOMAINS = (
     "beam-ring/Nr=56/Nh=28/feti=16/dual",
 )  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
-REPEATS = 20  #: number of products timed together, since a single one is too short
+#: number of products that are timed together, because a single product is too short
+REPEATS = 20
 
 #: median time by name, and median of the fastest tenth, in s
 Times = dict[str, tuple[float, float]]
@@ -215,8 +216,8 @@ def incomplete(tol: float = 1e-6) -> None:
 def sparse_qp(name: str, params: dict[str, object]) -> QP:
     """Return a primal QP.
 
-    params : keys of the family; with a further key "half", the second half of the
-        variables have no lower bounds
+    params : keys of the family; with the additional key "half", the second half of the
+        variables has no lower bounds
     """
     given = {key: value for key, value in params.items() if key != "half"}
     family = PROBLEMS[name]
@@ -347,7 +348,8 @@ def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
     Raises
     ------
     InputError
-        If there is no such solver or case, or `rounds` or a tolerance is not positive.
+        If a solver or the case does not exist, or if `rounds` or a tolerance is not
+        positive.
 
     """
     names = solvers.split(",")
@@ -378,7 +380,7 @@ def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
 
 def main() -> None:
     """Parse the command line and print the table."""
-    parser = ArgumentParser(description="Costs of a solve of SMALBE.")
+    parser = ArgumentParser(description="Measure costs of a solve with SMALBE.")
     tables = parser.add_subparsers(dest="table", required=True)
     for name in ("dense", "sparse", "incomplete", "subdomains", "kept"):
         tables.add_parser(name)

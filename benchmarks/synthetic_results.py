@@ -1,11 +1,11 @@
-"""Time and peak memory of reading a journal and writing the report, against size.
+"""Scaling of time and peak memory of reading a journal and writing the report.
 
     make synthetic   or   .venv/bin/python benchmarks/synthetic_results.py [CASES ...]
 
 The synthetic journal has 20 solvers and 5 repeats; the report is written in all
-formats. Each measurement runs in a separate process, so that the peak memory of this
-measurement is known. If chromium and playwright are installed (make browser), the times
-until the first paint of the page and until all plots are drawn are measured as well.
+formats. Each measurement runs in a separate process, so that its peak memory is known.
+If chromium and playwright are installed (make browser), the script also measures the
+times until the first paint of the page and until all plots are drawn.
 """
 
 import os
@@ -27,7 +27,7 @@ TIMES = """() => new Promise((done) =>
 
 
 def read(folder):
-    """Read the journal in a folder, and print records, CPU time and peak memory."""
+    """Read the journal in a folder; print number of records, CPU time and memory."""
     from mortarbench.harness.results.journal import read_journal
 
     start = process_time()
@@ -37,7 +37,7 @@ def read(folder):
 
 
 def measure(folder):
-    """Write the report on a folder, and print CPU time, peak memory and page size."""
+    """Write the report on a folder; print CPU time, peak memory and page size."""
     from mortarbench.reports import write_report
 
     start = process_time()

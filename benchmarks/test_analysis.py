@@ -1,11 +1,11 @@
-"""Entire analysis of the paper's Table 1: ten load steps, from mesh to displacements.
+"""Complete analysis of the paper's Table 1: ten load steps, mesh to displacements.
 
 The paper reports 29.99 s (assembly 0.087, Cholesky 0.078, mortar 2.064, dualisation
 26.686, QPs 1.074) for MATLAB on a Ryzen 5 3600. Here, SMALBE solves the QP of each step
 to 1e-8, both in the paper's form, in which all Dirichlet conditions are dualised, and
-in the form with bounds alone. Times are relative to that of one sparse Cholesky
-factorisation of the stiffness matrix K without fixed components, by the simplicial
-method of CHOLMOD with AMD ordering.
+in the form with bounds only. Times are relative to the time of one sparse Cholesky
+factorisation of the stiffness matrix K without fixed components, computed by the
+simplicial method of CHOLMOD with AMD ordering.
 """
 
 from time import perf_counter
@@ -69,7 +69,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
 
 
 def plain(bodies):
-    """Return a function that orders and factorises K_ff, K without fixed components."""
+    """Return a function that orders and factorises K without fixed components."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
     K_ff = csc_matrix(bodies.K[free][:, free])
     return lambda: cholesky(K_ff, mode="simplicial", ordering_method="amd")

@@ -1,6 +1,6 @@
 """Time of stiffness assembly, compared with scikit-fem and assembly by triplets.
 
-The comparison with triplets is made in the plane. Meshes of quadrilaterals and
+The comparison with triplets is made in two dimensions. Meshes of quadrilaterals and
 hexahedra are distorted smoothly, so that no two cells are congruent.
 """
 

@@ -1,4 +1,4 @@
-"""Times of contact linearisation, in the plane and in space, and of contact search."""
+"""Times of contact linearisation in two and three dimensions, and of contact search."""
 
 from functools import partial
 

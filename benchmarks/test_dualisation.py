@@ -1,4 +1,4 @@
-"""Times of dualising ten load steps, by condensation and by solves for each step.
+"""Times to dualise ten load steps, by condensation and by solves for each step.
 
 Dualisation computes the matrix F and the vector d of the dual QP.
 """

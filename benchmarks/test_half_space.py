@@ -1,4 +1,4 @@
-"""Half-spaces: time of a product, and time of a solve relative to its products."""
+"""Times of a product with a half-space operator, and of a solve per product."""
 
 from time import process_time
 
@@ -31,7 +31,8 @@ def test_product(benchmark, law, n):
 def test_the_time_of_a_solve_is_that_of_its_products(note, n, nu):
     """Report the ratio of the times; for ν = 0, check the stick radius.
 
-    Its error is below 0.3 % for n = 256 and below 0.1 % for n = 512.
+    The error of the stick radius is below 0.3 % for n = 256 and below 0.1 % for n =
+    512.
     """
     case = built(n=n, law="mindlin", nu=nu)
     x = np.random.default_rng(1).standard_normal(case.qp.q.size)

@@ -1,4 +1,4 @@
-"""Times of the stages of an analysis, on the mesh of Table 1 and on a coarser one."""
+"""Times of the stages of an analysis on the mesh of Table 1 and a coarser mesh."""
 
 import numpy as np
 import pytest

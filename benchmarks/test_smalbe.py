@@ -1,4 +1,4 @@
-"""SMALBE compared with PERMON by products with F, and with all solvers by time."""
+"""Compare SMALBE with PERMON by products with F, and with all solvers by time."""
 
 from dataclasses import replace
 from functools import partial
@@ -75,7 +75,7 @@ def test_products_with_F(note, name):
 
 @pytest.mark.parametrize("tol", TOLERANCES)
 def test_products_on_generated_bodies(note, tol):
-    """Report products for 300 bodies, relative to the better of two preset rules.
+    """Report products for 300 bodies, relative to the better of two presets.
 
     The presets follow the rules of PERMON and of ESPRESO.
     """
@@ -98,7 +98,7 @@ def test_products_on_generated_bodies(note, tol):
 
 @pytest.mark.parametrize("preconditioner", ["diagonal", "lumped", "dirichlet"])
 def test_products_with_other_preconditioners(note, preconditioner):
-    """Report products and applications for other preconditioners than the default."""
+    """Report products and applications of preconditioners other than the default."""
     solver = replace(SOLVERS["smalbe"], preconditioner=preconditioner)
     for Nr, Nh, step in PERMON:
         cells = []
@@ -163,7 +163,7 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
 def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
     race, note, form, Nr, Nh
 ):
-    """Compare the time of a solve with 1.5 times that of its products plus 100 µs."""
+    """Compare the time of a solve with 1.5·T + 100 µs, T being that of its products."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
     ready = []
@@ -299,7 +299,7 @@ def test_sparse_problems_with_bounds(note, name, params):
 
 @pytest.mark.parametrize(("Nr", "Nh"), [(6, 3), (12, 6), (12, 7), (24, 12)])
 def test_the_smallest_duals_with_bounds_alone(note, Nr, Nh):
-    """Report processor times at 1e-6, and the ratio of preparing to solving."""
+    """Report processor times at 1e-6, and the ratio of preparing to solving time."""
     qp, tol, solver = dual(Nr, Nh, 5, "dual-bounds"), 1e-6, SOLVERS["smalbe"]
     ready = []
     spent = products(solver.prepare(qp, tol)())

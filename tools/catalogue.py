@@ -1,4 +1,4 @@
-"""Write mortarbench/catalogue.json and the documentation pages on our solvers."""
+"""Write mortarbench/catalogue.json and the documentation pages on the solvers."""
 
 import json
 from pathlib import Path

@@ -1,8 +1,8 @@
-"""Build hook that compiles the .pyx modules and adds the libraries to the package.
+"""Build hook that compiles the .pyx modules and adds shared libraries to the package.
 
 The libraries are placed beside their sources. Hatchling runs the hook whenever the
-package is built or installed, including by `pip install -e`. If a .pyx file has
-changed, `make setup` repeats this installation.
+package is built or installed, also by `pip install -e`. If a .pyx file has changed,
+`make setup` repeats the installation.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-#: folder of scales.h and scales.pxd, which modules of solvers include
+#: folder of scales.h and scales.pxd, which compiled modules of solvers include
 SCALES = ROOT / "harness" / "verify"
-#: folder of sparse.pxd, which modules of problems and solvers include
+#: folder of sparse.pxd, which compiled modules of problems and solvers include
 MAPS = ROOT / "harness" / "distributed"
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: for all modules
 #: Further flags by module. Without contraction to fused multiply-adds, results have the
@@ -30,7 +30,7 @@ MODULES = {
     # residuals must have the same digits on every machine
     "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
-    # the same holds for stiffness matrices and the order in which they are eliminated
+    # stiffness matrices and elimination orders must also be equal on every machine
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],

@@ -1,11 +1,11 @@
 """Mutation testing: change single expressions of modules and run the tests.
 
-A mutant is a copy of the project in which one expression or statement of a module is
-changed: for example, a sign, a comparison or a constant is changed, or a guard is
-removed. The tests of the module are run on the mutant. If a test fails, the mutant is
-killed; if all tests pass, it survives, which shows that no test detects this change.
-`tests/mutants.toml` lists the modules, their tests, the number of mutants per module,
-and accepted survivors with reasons. The exit code is 1 if any other mutant survives.
+A mutant is a copy of the project with one change in an expression or statement of a
+module, such as another sign, comparison or constant, or a removed guard. The tests of
+the module are run on the mutant. If a test fails, the mutant is killed; if all tests
+pass, it survives, which shows that no test detects this change. `tests/mutants.toml`
+lists the modules, their tests, the number of mutants per module, and accepted survivors
+with reasons. The exit code is 1 if a mutant survives that is not accepted.
 
 The selection of mutants depends only on their text, so that a change in one function
 does not affect the selection in other functions. The working tree is not modified.
@@ -44,11 +44,11 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAN = ROOT / "tests" / "mutants.toml"
-#: A mutant counts as hanging if its tests take longer than SLOWER times their usual
-#: time plus GRACE seconds.
+#: A mutant counts as hanging if its tests take longer than SLOWER times the usual time
+#: of these tests plus GRACE seconds.
 SLOWER, GRACE = 5.0, 20.0
 MAX_LENGTH = 100  #: largest number of characters of code in a description
-#: libraries that each laboratory imports only once, not again for each mutant
+#: libraries that each laboratory imports once for all mutants
 LIBRARIES = ("hypothesis", "pandas", "scipy.sparse.linalg", "scipy.stats")
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
@@ -73,8 +73,8 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-#: Tried only if one side is a count, since equality of floats is too rare for tests to
-#: detect the change.
+#: Changes that are made only if one side is a count, because floats are so rarely equal
+#: that tests would not detect the change.
 BOUNDARIES: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -155,7 +155,7 @@ def _shown(code: str) -> str:
 def _changes(
     tree: ast.AST, where: str = ""
 ) -> Iterator[tuple[str, ast.expr | ast.stmt, str]]:
-    """Yield changes of code that affects results, but not of types or messages.
+    """Yield changes of code that affect results rather than types or messages.
 
     Each change consists of the dotted name of its function or class, the node to
     replace and the new source of this node.
@@ -194,7 +194,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _expressions(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield the changes of one expression, without changes of its subexpressions."""
+    """Yield the changes of one expression, but not of its subexpressions."""
     match node:
         case ast.Compare(ops=[op]):
             yield _with(node, ops=[OPERATORS[type(op)]()])
@@ -265,7 +265,7 @@ def _is_text(node: ast.AST) -> bool:
 
 
 def _is_removable(node: ast.stmt, parent: ast.AST) -> bool:
-    """Return True if a statement is a guard, or does more than bind a name."""
+    """Return True if a statement is a guard or does more than bind a name."""
     match node:
         case ast.Expr(value=ast.Constant()):
             return False  # a docstring
@@ -285,7 +285,7 @@ def _is_removable(node: ast.stmt, parent: ast.AST) -> bool:
 class Laboratory:
     """Copy of the project with a process on one CPU that forks for each mutant.
 
-    The process has imported the libraries, which takes longer than most tests, but no
+    The process has imported `LIBRARIES`, which takes longer than most tests, but no
     module of the project.
     """
 
@@ -303,7 +303,7 @@ class Laboratory:
         self._process.join()
 
     def failure(self, tests: Sequence[str], limit: float = inf) -> str | None:
-        """Run tests; return None if all pass, else a description of the first failure.
+        """Run tests; return a description of the first failure, or None without one.
 
         limit : time limit in s
         """
@@ -313,7 +313,7 @@ class Laboratory:
     def failure_on(
         self, mutant: Mutant, tests: Sequence[str], limit: float
     ) -> str | None:
-        """Run tests on a mutant, see `failure`, and restore the module afterwards."""
+        """Run tests on a mutant, as in `failure`, and restore the module afterwards."""
         path = self.folder / mutant.module
         original = path.read_bytes()
         try:
@@ -324,8 +324,8 @@ class Laboratory:
 
     def _write(self, path: Path, source: bytes) -> None:
         """Write a module and delete its bytecode."""
-        # Python compares only the size and the time in seconds of a source with those
-        # in the bytecode, and both may be equal for two mutants.
+        # Python checks only whether the size and the time (in s) of a source equal the
+        # values in the bytecode, and both may be equal for two mutants.
         path.write_bytes(source)
         for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
             compiled.unlink()
@@ -383,7 +383,7 @@ def _run_tests(tests: Sequence[str], output: Path) -> None:
 def _wait(child: int, limit: float) -> int | None:
     """Wait for a fork; return its exit code, or None if it exceeded the limit.
 
-    In the latter case, all processes of its session are killed.
+    If the limit is exceeded, all processes of the session of the fork are killed.
 
     limit : s
     """
@@ -434,8 +434,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     the input is invalid or tests of an unchanged module fail.
     """
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("modules", nargs="*", help="as in tests/mutants.toml; all")
-    parser.add_argument("--most", type=int, help="mutants per module")
+    parser.add_argument(
+        "modules", nargs="*", help="modules of tests/mutants.toml; default: all"
+    )
+    parser.add_argument("--most", type=int, help="largest number of mutants per module")
     args = parser.parse_args(argv)
     plan = read_plan()
     modules = args.modules or list(plan.tests)
@@ -474,7 +476,7 @@ def report(
     """
     start = monotonic()
     tests = plan.tests[module]
-    # Run the tests on each unchanged copy, to measure the usual time and fill caches.
+    # run the tests on each unchanged copy to measure the usual time and to fill caches
     for failure in pool.map(lambda one: one.failure(tests), laboratories):
         if failure is not None:
             print(f"{module}: the tests of the unchanged module fail: {failure}")

@@ -2,12 +2,12 @@
 
     python tools/products.py [PATTERN]...     only cases that match a shell pattern
 
-A table is measured if the heading of its first column is ``case``. A cell of that
+A table is measured if the heading of its first column is ``case``. A cell of this
 column begins with a case name in backquotes, in which ``key=1..24`` denotes a sequence
-of cases. If there are several such keys, the last one varies fastest. The heading of a
-measured column consists of a solver in backquotes (possibly with options ``key=value``)
-or ``best preset``, of the tolerance and, for sequences in which the solver reuses
-earlier results, of ``warm`` or ``tightened``. Other columns are left unchanged.
+of cases. With several keys of this type, the last key varies fastest. The heading of a
+measured column begins with a solver in backquotes (possibly with options ``key=value``)
+or with ``best preset``, followed by the tolerance. If the solver reuses earlier results
+in a sequence, ``warm`` or ``tightened`` follows. Other columns are left unchanged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mortarbench.solvers import SOLVERS
 
 PAGE = Path(__file__).parents[1] / "docs" / "smalbe-products.md"
 PRESETS = ("smalbe-permon", "smalbe-espreso")
-#: tolerance of a tightened step, relative to the distance from the fixed point, as in
+#: tolerance of a tightened step relative to the distance from the fixed point, as in
 #: suites/fixed-point.toml
 THETA = 0.1
 LOOSEST = 1e-2  #: largest tolerance of a tightened step

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set up .venv: install system packages, the virtual environment and pinned Python packages.
+# Set up .venv: system packages, the virtual environment and pinned Python packages.
 # Usage: tools/setup.sh PYTHON [browser|docs]   (called by make; installs only what is missing)
 # browser: also install chromium and its driver, for the tests of the report's HTML page
 # docs: also install the packages that build the documentation site

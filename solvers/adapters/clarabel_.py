@@ -30,27 +30,27 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PrimalInfeasible"  #: status for which Clarabel returns a certificate
+PRIMAL = "PrimalInfeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
     "Solved": Status.SOLVED,
     "MaxIterations": Status.ITERATION_LIMIT,
     "MaxTime": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "DualInfeasible": Status.INFEASIBLE,
-}  #: all others (AlmostSolved, InsufficientProgress, …) count as FAILED
+}  #: all other statuses (AlmostSolved, InsufficientProgress, …) count as FAILED
 
 
 @dataclass(frozen=True)
 class Clarabel:
     """https://clarabel.org, with one thread.
 
-    Clarabel divides its residuals by max(1, size of their terms), and accepts a gap
-    below tol, absolute *or* relative to max(1, |objective|). For a small objective
-    these tests are absolute, and tol = 1e-6 loses five digits at an energy of 1e-5.
-    With the objective scaled to ‖q‖∞ = 1e4, each test is relative if x is of order one,
-    as in every QP of this project, and tol is passed unchanged. (The scaling hardly
-    changes the steps, since Clarabel equilibrates the objective.) In units in which x
-    is tiny, Clarabel may stop early.
+    Clarabel divides each residual by max(1, size of its terms). The gap must be below
+    tol, either in absolute terms or relative to max(1, |objective|). For a small
+    objective, these tests are absolute: at an energy of 1e-5, tol = 1e-6 would lose
+    five digits. The adapter scales the objective to ‖q‖∞ = 1e4 and passes tol
+    unchanged. Each test is then relative if x is of order one, as in every QP of this
+    project. If the units make x tiny, Clarabel may stop early. The scaling hardly
+    changes the steps, because Clarabel equilibrates the objective.
 
     Equalities are assigned to the zero cone; inequalities and finite bounds, one row
     each, to the nonnegative cone.
@@ -66,8 +66,9 @@ class Clarabel:
         package="clarabel",
         linear_solver="QDLDL or faer (sparse LDLᵀ), chosen by Clarabel; one "
         "factorisation per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; no warm starts",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
+        sequence="`update` replaces vectors and keeps the analysis; no warm starts",
     )
 
     def __post_init__(self) -> None:

@@ -26,12 +26,13 @@ from mortarbench.solvers.common.conversion import (
 
 @dataclass(frozen=True)
 class CVXOPT:
-    """https://cvxopt.org, with dense matrices if P is dense, else with sparse matrices.
+    """https://cvxopt.org, with dense matrices if P is dense, otherwise sparse matrices.
 
-    CVXOPT divides the 2-norms of residuals by max(1, ‖q‖) and max(1, norm of the
-    right-hand sides), and tests the gap in absolute terms (abstol) or relative to the
-    objective (reltol). Therefore feastol = reltol = tol, abstol is negligible, and the
-    objective is scaled to ‖q‖∞ = 1e4, so that the maximum with 1 has no effect.
+    CVXOPT divides the 2-norm of the dual residual by max(1, ‖q‖), and the 2-norm of the
+    primal residual by max(1, norm of the right-hand sides). The gap must be below
+    abstol, or below reltol relative to the objective. Therefore feastol = reltol = tol
+    and abstol is negligible. The objective is scaled to ‖q‖∞ = 1e4, so that the 1 in
+    max(1, ‖q‖) has no effect.
     """
 
     max_iter: int = 200
@@ -44,13 +45,13 @@ class CVXOPT:
         package="cvxopt",
         linear_solver="CHOLMOD (sparse) or LAPACK (dense), bundled, one factorisation "
         "per iteration",
-        phases="preparing converts only; solving does everything else",
+        phases="conversion only (preparing); everything else (solving)",
         limits=(
-            "Linearly dependent equality rows are declined, because solves end with an "
-            "error or as 'unknown' (conformance, shape 'redundant').",
-            "For bodies supported by equality rows only (an exactly singular P), "
-            "solves end as 'unknown' after 2 iterations with the default KKT solver, "
-            "'chol2'; with 'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
+            "Linearly dependent equality rows are declined, because CVXOPT ends with "
+            "an error or the status 'unknown' (conformance, shape 'redundant').",
+            "If only equality rows support the bodies, P is exactly singular. The "
+            "default KKT solver, 'chol2', then ends with 'unknown' after 2 "
+            "iterations; 'chol' and 'ldl' solve the same QP (docs/weaknesses.md).",
         ),
     )
 

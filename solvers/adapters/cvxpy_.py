@@ -27,7 +27,7 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: arguments for backends; backends that are not listed run with cvxpy's defaults
+#: arguments for each backend; a backend that is not listed runs with cvxpy's defaults
 CALLS: Mapping[str, Call] = {
     "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
@@ -53,8 +53,8 @@ CALLS: Mapping[str, Call] = {
 }
 
 SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends that accept discs and cones
-CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
-LINEAR = "takes linear programs only"
+CONIC = "cvxpy passes QPs to it as cone programs, which costs half of the digits"
+LINEAR = "solves linear programs only"
 DECLINED_BACKENDS: Mapping[str, str] = {
     "CVXOPT": CONIC,
     "ECOS": CONIC,
@@ -62,7 +62,7 @@ DECLINED_BACKENDS: Mapping[str, str] = {
     "GLPK": LINEAR,
     "GLPK_MI": LINEAR,
     "SCIPY": LINEAR,
-    "PROXQP": "cvxpy cannot enable its test of the duality gap; use proxqp",
+    "PROXQP": "cvxpy cannot enable its test of the duality gap; use the solver proxqp",
 }
 
 CLAIMS = {
@@ -71,20 +71,21 @@ CLAIMS = {
     "infeasible": Status.INFEASIBLE,
     "unbounded": Status.INFEASIBLE,
     "infeasible_or_unbounded": Status.INFEASIBLE,
-}  #: all others (optimal_inaccurate, …) count as FAILED
+}  #: all other statuses (optimal_inaccurate, …) count as FAILED
 
 
 @dataclass(frozen=True)
 class CVXPY:
-    """One backend of cvxpy; compilation is timed as preparing, its setup as solving.
+    """One backend of cvxpy.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`). If a stopping test
-    adds an absolute and a relative tolerance, `tol` is passed as the relative
-    tolerance. A backend without an entry in `CALLS` runs with cvxpy's defaults. As in
-    the native adapters, the objective is scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the
-    backend's test is absolute (HIGHS, DAQP). QPs are declined for backends to which
-    cvxpy passes a cone program, and for ProxQP, because cvxpy cannot enable the test of
-    its duality gap.
+    The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
+    a stopping test is the sum of an absolute and a relative term, `tol` is the relative
+    tolerance and the absolute tolerance is negligible. A backend without an entry in
+    `CALLS` runs with cvxpy's defaults. As in the native adapters, the objective is
+    scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (HIGHS,
+    DAQP). The adapter declines QPs for backends that would receive them as cone
+    programs. It also declines QPs for ProxQP, because cvxpy cannot enable ProxQP's test
+    of the duality gap.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME
@@ -95,14 +96,15 @@ class CVXPY:
         licence="Apache-2.0; backends have their own licences",
         package="cvxpy",
         linear_solver="linear solver of the backend",
-        phases="preparing compiles the model to the backend's data; solving is the "
-        "backend's setup and solve",
+        phases="compilation of the model to the backend's data (preparing); setup and "
+        "solve of the backend (solving)",
         limits=(
-            "QPs are declined for CVXOPT and ECOS, which would receive a cone program "
-            "and lose half of the digits (dual residuals of 1e-5 at tol 1e-6 in the "
-            "conformance suite).",
-            "QPs are declined for PROXQP: without its gap test, a claimed solution has "
-            "a complementarity of 2e-6 at tol 1e-9 (conformance, shape 'bounds').",
+            "QPs are declined for CVXOPT and ECOS: as cone programs, they lose half "
+            "of the digits (dual residuals of 1e-5 at tol 1e-6 in the conformance "
+            "suite).",
+            "QPs are declined for PROXQP: without the test of the duality gap, the "
+            "complementarity of a claimed solution is 2e-6 at tol 1e-9 (conformance, "
+            "shape 'bounds').",
         ),
     )
 
@@ -166,7 +168,7 @@ def _model(
 ) -> tuple[Any, Any, list[tuple[NDArray[np.int64], Any]]]:
     """Return the problem, its variable, and the constraints with their row indices."""
     x, rows = cvxpy.Variable(qp.q.size), form.rows.tocsr()
-    # assume_PSD: otherwise cvxpy computes eigenvalues of P to prove convexity
+    # without assume_PSD, cvxpy computes eigenvalues of P to check convexity
     energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
     objective = cvxpy.Minimize(0.5 * energy + (qp.q * scale) @ x)
     equal, less = np.split(np.arange(form.linear), [form.equalities])
@@ -175,7 +177,7 @@ def _model(
         constraints.append((equal, rows[equal] @ x == form.rhs[equal]))
     if less.size:
         constraints.append((less, rows[less] @ x <= form.rhs[less]))
-    for size in np.unique(form.cones):  # one cvxpy constraint for all cones of a size
+    for size in np.unique(form.cones):  # one constraint for all cones of a size
         heads = form.heads[form.cones == size]
         tails = (heads[:, None] + np.arange(1, size)).ravel()
         t, w = (form.rhs[place] - rows[place] @ x for place in (heads, tails))

@@ -28,7 +28,7 @@ CLAIMS = {
     -1: Status.INFEASIBLE,
     -3: Status.INFEASIBLE,  # unbounded
     -4: Status.ITERATION_LIMIT,
-}  #: all others count as FAILED
+}  #: all other exit flags count as FAILED
 MESSAGES = {
     1: "optimal",
     2: "soft optimal",
@@ -43,8 +43,8 @@ MESSAGES = {
 INFINITE = 1e30  #: DAQP's value for an absent bound
 EQUALITY = 5  #: DAQP's flag for an equality
 TOL_FACTOR = 1e-3  #: tolerances passed to DAQP, relative to tol
-#: smallest tolerance passed to DAQP: with 1e-12 its proximal iterations stop early or
-#: cycle
+#: smallest tolerance passed to DAQP; with 1e-12, DAQP's proximal iterations stop early
+#: or cycle
 MIN_TOLERANCE = 1e-11
 
 
@@ -52,13 +52,14 @@ MIN_TOLERANCE = 1e-11
 class DAQP:
     """https://darnstrom.github.io/daqp, with dense matrices.
 
-    DAQP ends with an active set for which the KKT conditions hold up to rounding;
-    primal_tol and dual_tol only decide which violations and multiplier signs count.
-    Both tolerances are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are
-    set to tol/1000, but at least 1e-11. Larger values would not save steps.
+    At the final active set of DAQP, the KKT conditions hold up to rounding. The options
+    primal_tol and dual_tol only set the size of violations and negative multipliers
+    that DAQP ignores. Both tolerances are absolute. Therefore the objective is scaled
+    to ‖q‖∞ = 1, and both are set to tol/1000, but at least 1e-11. Larger values would
+    not save steps.
 
-    If the Cholesky factorisation of P breaks down, DAQP runs its own proximal-point
-    iterations (eps_prox < 0: automatic).
+    If the Cholesky factorisation of P breaks down, DAQP runs proximal-point iterations
+    (eps_prox < 0 selects them automatically).
     """
 
     max_iter: int = 100_000
@@ -68,14 +69,15 @@ class DAQP:
         method="dual active set",
         licence="MIT",
         package="daqp",
-        linear_solver="its own dense LDLᵀ, updated as rows become active",
-        phases="preparing converts to dense matrices and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factors and the active set",
+        linear_solver="its own dense LDLᵀ, updated when the active set changes",
+        phases="conversion to dense matrices and factorisation (preparing); iterations "
+        "(solving)",
+        sequence="`update` replaces vectors and keeps the factors and the active set",
         limits=(
             "DAQP takes more than 20 s on the 4420 unknowns of "
             "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
             "With tolerances of 1e-12, the proximal iterations of DAQP end with "
-            "residuals of 7e-7 on singular QPs, so the adapter sets at least 1e-11.",
+            "residuals of 7e-7 on singular QPs.",
         ),
     )
 
@@ -138,7 +140,7 @@ class DAQP:
 
 
 def _sides(qp: QP) -> tuple[Vector, Vector]:
-    """Return lower and upper limits, stacked: bounds, equalities, inequalities."""
+    """Return lower and upper limits of the variables, equality and inequality rows."""
     no_low = np.full(qp.h.size, -INFINITE)
     low = np.concatenate([np.maximum(qp.lb, -INFINITE), qp.b, no_low])
     return low, np.concatenate([np.minimum(qp.ub, INFINITE), qp.b, qp.h])

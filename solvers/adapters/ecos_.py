@@ -29,15 +29,16 @@ CLAIMS = {
     1: Status.INFEASIBLE,
     2: Status.INFEASIBLE,  # unbounded
     -1: Status.ITERATION_LIMIT,
-}  #: claims by exit flag; all others count as FAILED
-PRIMAL = 1  #: exit flag for which ECOS returns a certificate
+}  #: claim for each exit flag; all other exit flags count as FAILED
+PRIMAL = 1  #: exit flag with a certificate of infeasibility
 #: eigenvalues of P below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-14
-#: Units of the corrections, relative to ‖x‖∞, tried in turn, four per decade. Which of
-#: them helps depends on the QP: ECOS breaks down near the optimum, at a residual that
-#: varies by two orders of magnitude between neighbouring units.
+#: Units of the corrections, relative to ‖x‖∞, four per decade. The adapter tries the
+#: units in this order, because the best unit depends on the QP: ECOS breaks down near
+#: the optimum, at a residual that varies by two orders of magnitude between
+#: neighbouring units.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
-#: a point is reported as solved if its KKT residuals are at most this times tol
+#: largest KKT residual of a point that is reported as solved, relative to tol
 CLAIM_FACTOR = 10.0
 
 
@@ -45,9 +46,9 @@ CLAIM_FACTOR = 10.0
 class ECOS:
     """https://github.com/embotech/ecos.
 
-    The term ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues
-    and eigenvectors of P. A gap of tol permits errors of √tol in x, so ECOS is called
-    again to compute corrections of x.
+    The adapter replaces ½xᵀPx = ½‖Lᵀx‖² by a second-order cone, and computes L from the
+    eigenvalues and eigenvectors of P. A gap of tol permits errors of √tol in x. The
+    adapter therefore calls ECOS again for corrections of x.
     """
 
     max_iter: int = 200
@@ -59,7 +60,7 @@ class ECOS:
         licence="GPL-3.0-only",
         package="ecos",
         linear_solver="sparse LDLᵀ, bundled, one factorisation per iteration",
-        phases="preparing computes eigenvalues",
+        phases="eigenvalues of P (preparing); everything else (solving)",
         limits=("ECOS fails at tolerances below 1e-8.",),
     )
 
@@ -85,7 +86,7 @@ class ECOS:
         root = (vectors * roots).T / np.sqrt(energy)
 
         def correct(x: Vector, sigma: float) -> tuple[dict[str, Any], Vector, Vector]:
-            """Solve for e; return ECOS's result, x + σe and multipliers of rows."""
+            """Compute a correction e; return the result, x + σe and row multipliers."""
             factor = energy * (sigma / size) ** 2
             cost = (P @ x + qp.q) * sigma / factor
             answer = _solve(
@@ -143,7 +144,7 @@ def _solve(
 ) -> dict[str, Any]:
     """Minimise ½‖root·e‖² + costᵀe with ECOS, subject to rhs − Re in the cones.
 
-    ½‖root·e‖² ≤ t is the second-order cone  ‖(√2·root·e, t − 1)‖ ≤ t + 1.
+    The constraint ½‖root·e‖² ≤ t is written as ‖(√2·root·e, t − 1)‖ ≤ t + 1.
     """
     m, n = form.equalities, cost.size
     t = csc_matrix(([-1.0, -1.0], ([0, 1], [0, 0])), shape=(2, 1))

@@ -23,7 +23,7 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-PRIMAL = "kInfeasible"  #: status for which HiGHS may return a certificate
+PRIMAL = "kInfeasible"  #: status that may have a certificate of infeasibility
 CLAIMS = {
     "kOptimal": Status.SOLVED,
     "kIterationLimit": Status.ITERATION_LIMIT,
@@ -31,26 +31,26 @@ CLAIMS = {
     PRIMAL: Status.INFEASIBLE,
     "kUnbounded": Status.INFEASIBLE,
     "kUnboundedOrInfeasible": Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 MIN_TOLERANCE = 1e-10  #: smallest tolerance that HiGHS accepts
 MIN_ENTRY = 1e-12  #: smallest value of small_matrix_value that HiGHS accepts
 
 
 @dataclass(frozen=True)
 class HiGHS:
-    """https://highs.dev, one thread: active set (qpasm) or interior point (hipo).
+    """https://highs.dev, with one thread and the method qpasm or hipo.
 
     HiGHS tests violations and multiplier signs in absolute terms. Therefore the
-    objective is scaled to ‖q‖∞ = 1, and all tolerances are set to tol/100, but at least
+    objective is scaled to ‖q‖∞ = 1. All tolerances are set to tol/100, but at least to
     1e-10, the smallest value that HiGHS accepts. An active-set method needs few
     additional steps for this accuracy.
 
-    The adapter works around three properties of HiGHS. On QPs with bounds only, qpasm
-    claims an optimum after 0 iterations, so the adapter adds a free row. HiGHS adds
-    qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which causes
-    residuals of 1e-6 on a singular QP of order one; the adapter sets it to 0.
-    HiGHS drops entries below small_matrix_value (default 1e-9); the adapter lowers this
-    value to 1e-12.
+    The adapter works around three properties of HiGHS. If a QP has bounds but no rows,
+    qpasm claims an optimum after 0 iterations, so the adapter adds a free row. HiGHS
+    adds qp_regularization_value (default 1e-7) to the diagonal of the Hessian, which
+    causes residuals of 1e-6 on a singular QP of order one; the adapter sets this option
+    to 0. HiGHS drops entries below small_matrix_value (default 1e-9); the adapter sets
+    1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -61,25 +61,26 @@ class HiGHS:
         method="active set (qpasm) or interior point (hipo)",
         licence="MIT; highspy-extras (hipo) Apache-2.0",
         package="highspy",
-        linear_solver="qpasm: LU of the active rows and a dense reduced Hessian; hipo: "
-        "its own multifrontal LDLᵀ",
-        phases="preparing passes the model; solving does everything else",
+        linear_solver="LU of the active rows and a dense reduced Hessian (qpasm); "
+        "multifrontal LDLᵀ (hipo)",
+        phases="passing the model (preparing); everything else (solving)",
         limits=(
             "qpasm takes longer than 20 s on the 4420 unknowns of "
             "beam-ring/Nr=12/Nh=6/primal (suites/fleet.toml).",
-            "hipo at tol 1e-9 ends as kUnknown on beam-ring/Nr=30/Nh=15/primal, with "
-            "residuals of 5e-12.",
-            "qpasm ends with kSolveError if lengths of 1e-3 increase the entries of "
-            "the Hessian by a factor of 1e6 (tests/solvers/test_solvers.py), and on "
-            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, where F has the "
-            "condition number 260 (suites/friction.toml).",
+            "At tol 1e-9, hipo ends with kUnknown on beam-ring/Nr=30/Nh=15/primal, "
+            "with residuals of 5e-12.",
+            "qpasm ends with kSolveError if lengths are scaled by 1e-3, which "
+            "increases the entries of the Hessian by 1e6 "
+            "(tests/solvers/test_solvers.py), and on "
+            "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, where the condition "
+            "number of F is 260 (suites/friction.toml).",
             "Without the free row, the result for a membrane of 225 nodes has a "
             "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
             "400 nodes touches').",
             "Without highspy-extras, HiGHS silently runs qpasm instead of hipo; the "
             "adapter then reports a failure.",
-            "qpasm stores a dense Hessian on the null space of active rows; a QP is "
-            "declined if this Hessian would not fit into memory.",
+            "qpasm stores a dense Hessian on the null space of the active rows. A QP "
+            "is declined if this Hessian would not fit into memory.",
         ),
     )
 

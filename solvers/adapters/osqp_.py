@@ -24,16 +24,16 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status for which OSQP returns a certificate
+PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
     "OSQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
-    # iteration limit, but within 10·tol
+    # at the iteration limit, residuals below 10·tol
     "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,
     "OSQP_TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "OSQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,10 @@ class OSQP:
     """https://osqp.org, with its built-in linear algebra (QDLDL) and one thread.
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
-    are below eps_abs + eps_rel·(their largest term). With a negligible eps_abs, this is
-    the relative test of the harness, so eps_rel = tol. OSQP evaluates the test every 25
-    iterations. Bounds become rows of the identity, one per bounded variable.
+    are each below eps_abs + eps_rel·(their largest term). With eps_rel = tol and a
+    negligible eps_abs, this test equals the relative test of the harness. OSQP
+    evaluates the test every 25 iterations. Each bounded variable becomes a row of the
+    identity.
 
     If the dual residual is below 1e-10 (absolute) before polishing, OSQP accepts any
     dual residual after polishing. With polishing, the objective is therefore scaled to
@@ -51,7 +52,7 @@ class OSQP:
     """
 
     max_iter: int = 1_000_000
-    polishing: bool = False  #: solve again with the active rows as equalities
+    polishing: bool = False  #: finally solve with the active rows as equalities
 
     about: ClassVar[About] = About(
         title="OSQP",
@@ -59,13 +60,15 @@ class OSQP:
         licence="Apache-2.0",
         package="osqp",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per change of ρ",
-        phases="preparing scales and factorises; solving iterates and polishes",
-        sequence="`update` of vectors keeps the factors; starts from the last point",
+        phases="scaling and factorisation (preparing); iterations and polishing "
+        "(solving)",
+        sequence="`update` replaces vectors and keeps the factors; starts from the "
+        "last point",
         limits=(
-            "On QPs with a small objective, polishing increases residuals. Without the "
-            "scaling, the dual residual was 3e-3 at a tolerance of 1e-6 "
-            "(tests/solvers/test_solvers.py, energies of 1e-6), and the gap was 3e-7 "
-            "at a tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
+            "Polishing increases residuals if the objective is small. Without the "
+            "scaling, the dual residual was 3e-3 at tol 1e-6 for energies of 1e-6 "
+            "(tests/solvers/test_solvers.py), and the gap was 3e-7 at tol 1e-9 on "
+            "beam-ring/Nr=4/Nh=3/primal.",
         ),
     )
 

@@ -31,20 +31,20 @@ CLAIMS = {
     "PIQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "PIQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 
 
 @dataclass(frozen=True)
 class PIQP:
     """https://predict-epfl.github.io/piqp.
 
-    PIQP stops when the max norms of the residuals and the duality gap are below eps_abs
-    *or* below eps_rel·max(1, their largest term). Therefore eps_abs is negligible,
-    eps_rel = tol, and the objective is scaled to ‖q‖∞ = 1e4, so that the maximum with 1
-    has no effect.
+    PIQP stops when the max norms of the residuals and the duality gap are each below
+    eps_abs *or* below eps_rel·max(1, their largest term). Therefore eps_rel = tol and
+    eps_abs is negligible. The objective is scaled to ‖q‖∞ = 1e4, so that the 1 in the
+    maximum has no effect.
     """
 
-    backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
+    backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: dense if P is dense
     max_iter: int = 250
 
     about: ClassVar[About] = About(
@@ -53,8 +53,9 @@ class PIQP:
         licence="BSD-2-Clause",
         package="piqp",
         linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update` of vectors keeps the analysis; no warm starts",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
+        sequence="`update` replaces vectors and keeps the analysis; no warm starts",
     )
 
     def __post_init__(self) -> None:
@@ -93,7 +94,7 @@ class PIQP:
                 y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
             )
             if status is Status.INFEASIBLE:
-                # the multipliers diverge along a certificate of infeasibility
+                # the diverging multipliers approach a certificate of infeasibility
                 ray = multipliers if info.status.name == PRIMAL else {}
                 return Solution.without_point(qp, status, info.status.name, **ray)
             return Solution(

@@ -28,14 +28,14 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status for which ProxQP returns a certificate
+PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "PROXQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
 
 
@@ -43,21 +43,21 @@ CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
 class ProxQP:
     """https://simple-robotics.github.io/proxsuite.
 
-    ProxQP stops when the max norms of the primal and dual residuals are below
-    eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The adapter enables the test of the duality gap, which is off by default.
-    ProxQP does not test the signs of multipliers. Its default starting point, which
-    treats every row as an equality, often passes all tests with negative multipliers
-    (primal forms, tol ≥ 1e-4). The adapter starts from zero: negative multipliers
-    become rare, and fewer iterations are needed.
+    ProxQP stops when the max norms of the primal and dual residuals are each below
+    eps_abs + eps_rel·(their largest term). Therefore eps_rel = tol and eps_abs is
+    negligible. The adapter enables the test of the duality gap, which is off by
+    default. The default starting point of ProxQP solves the QP with every row as an
+    equality. This point often passes all tests with negative multipliers (primal forms,
+    tol ≥ 1e-4). The adapter starts from zero; negative multipliers then become rare,
+    and ProxQP needs fewer iterations.
 
-    Certificates of infeasibility are tested in absolute terms. With the default
-    tolerance of 1e-4, feasible QPs with multipliers of this size are claimed
+    ProxQP tests certificates of infeasibility in absolute terms. With the default
+    tolerance of 1e-4, it claims that feasible QPs with multipliers of this size are
     infeasible. The adapter sets 1e-8, which avoids these claims, but some infeasible
     QPs then end at the iteration limit.
     """
 
-    backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
+    backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: dense if P is dense
     max_iter: int = 10_000
 
     about: ClassVar[About] = About(
@@ -65,18 +65,19 @@ class ProxQP:
         method="proximal augmented Lagrangian",
         licence="BSD-2-Clause",
         package="proxsuite",
-        linear_solver="its own LDLᵀ, dense or sparse, updated as rows become active",
-        phases="preparing equilibrates and, in the sparse backend, analyses; solving "
-        "factorises and iterates",
-        sequence="`update` of vectors keeps the equilibration; starts from the last "
-        "point",
+        linear_solver="its own LDLᵀ, dense or sparse, updated when the active set "
+        "changes",
+        phases="equilibration, and symbolic analysis in the sparse backend "
+        "(preparing); factorisation and iterations (solving)",
+        sequence="`update` replaces vectors and keeps the equilibration; starts from "
+        "the last point",
         limits=(
-            "The sign of multipliers is not tested.",
+            "ProxQP does not test the signs of multipliers.",
             "At tol 1e-3, claimed points have residuals of 1e-2 to 2e-2 on duals with "
             "friction (greco/dual-bounds, beam-ring/steps=1/friction=tresca/bound=1e8/"
-            "dual); at 1e-6 and 1e-9 all answers are verified.",
-            "ProxQP has no time limit and does not release Python's GIL, so only "
-            "killing the process ends a solve.",
+            "dual). At tol 1e-6 and 1e-9, all answers are verified.",
+            "ProxQP has no time limit and does not release Python's GIL, so a solve "
+            "can only be stopped by killing its process.",
         ),
     )
 
@@ -156,7 +157,7 @@ class ProxQP:
 
 
 class _Dense:
-    """Dense backend: accepts bounds; their n multipliers follow those of G."""
+    """Dense backend with bounds; the multipliers of bounds follow those of G rows."""
 
     def __init__(self, qp: QP) -> None:
         self.qp, self.has_box = qp, bool(has_bound(qp).any())
@@ -182,7 +183,7 @@ class _Dense:
 
 
 class _Sparse:
-    """Sparse backend: bounds become rows of the identity."""
+    """Sparse backend, in which bounds become rows of the identity."""
 
     def __init__(self, qp: QP) -> None:
         self.qp = qp

@@ -27,19 +27,19 @@ from mortarbench.solvers.common.sequence import Session, chain
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
     "QOCO_MAX_ITER": Status.ITERATION_LIMIT,
-}  #: all others (QOCO_SOLVED_INACCURATE, …) count as FAILED
+}  #: all other statuses (QOCO_SOLVED_INACCURATE, …) count as FAILED
 
 
 @dataclass(frozen=True)
 class QOCO:
     """https://qoco-org.github.io/qoco.
 
-    QOCO stops when the max norms of the residuals are below abstol + reltol·(their
+    QOCO stops when the max norms of the residuals are each below abstol + reltol·(their
     largest term) and the gap is below abstol + reltol·max(1, |objective|). Therefore
-    abstol is negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, so
-    that the maximum with 1 has no effect. QOCO computes no certificates: on an
-    unbounded QP its iterates grow until every relative residual is small, and QOCO
-    reports success. A claim with ‖x‖∞ > 1e12 therefore counts as failed.
+    reltol = tol and abstol is negligible. The objective is scaled to ‖q‖∞ = 1e4, so
+    that the 1 in the maximum has no effect. On an unbounded QP, the iterates grow until
+    every relative residual is small, and QOCO claims success. A claimed solution with
+    ‖x‖∞ > 1e12 therefore counts as failed.
     """
 
     max_iter: int = 200
@@ -51,12 +51,13 @@ class QOCO:
         licence="BSD-3-Clause",
         package="qoco",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
-        phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
-        "accepts no starting point",
+        phases="equilibration and symbolic analysis (preparing); all factorisations "
+        "(solving)",
+        sequence="`update_vector_data` keeps the analysis; no warm starts in Python "
+        "(0.3.2)",
         limits=(
-            "QOCO computes no certificates of infeasibility (in the conformance check "
-            "'unbounded' it claims success with ‖x‖∞ = 1e16).",
+            "QOCO computes no certificates of infeasibility. In the conformance check "
+            "'unbounded', it claims success with ‖x‖∞ = 1e16.",
         ),
     )
 

@@ -23,14 +23,14 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PRIMAL_INFEASIBLE"  #: status for which QPALM returns a certificate
+PRIMAL = "PRIMAL_INFEASIBLE"  #: status with a certificate of infeasibility
 CLAIMS = {
     "SOLVED": Status.SOLVED,
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "DUAL_INFEASIBLE": Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 INFINITE = 1e20  #: QPALM's value for an absent bound
 
 
@@ -38,9 +38,9 @@ INFINITE = 1e20  #: QPALM's value for an absent bound
 class QPALM:
     """https://kul-optec.github.io/QPALM.
 
-    QPALM stops when the max norms of the primal and dual residuals are below eps_abs +
-    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. QPALM
-    does not test the duality gap. Bounds become rows of the identity.
+    QPALM stops when the max norms of the primal and dual residuals are each below
+    eps_abs + eps_rel·(their largest term). Therefore eps_rel = tol and eps_abs is
+    negligible. Bounds become rows of the identity.
     """
 
     max_iter: int = 10_000
@@ -50,12 +50,12 @@ class QPALM:
         method="proximal augmented Lagrangian with semismooth Newton steps",
         licence="LGPL-3.0-or-later",
         package="qpalm",
-        linear_solver="LADEL (sparse LDLᵀ, updated as rows become active)",
-        phases="preparing scales; solving does all factorisations",
-        sequence="`update` of vectors; starts from the last point",
+        linear_solver="LADEL (sparse LDLᵀ, updated when the active set changes)",
+        phases="scaling (preparing); all factorisations (solving)",
+        sequence="updates replace vectors; starts from the last point",
         limits=(
-            "QPALM does not test the duality gap, so it may stop early if the primal "
-            "and dual residuals are small but the gap is large.",
+            "QPALM does not test the duality gap, so it may stop while the gap is "
+            "large.",
         ),
     )
 

@@ -35,7 +35,7 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-#: arguments for backends; backends that are not listed run with their defaults
+#: arguments for each backend; a backend that is not listed runs with its defaults
 CALLS: Mapping[str, Call] = {
     "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "cvxopt": Call(("feastol", "abstol", "reltol")),
@@ -47,7 +47,7 @@ CALLS: Mapping[str, Call] = {
             "qp_regularization_value": 0.0,
             "small_matrix_value": 1e-12,
             "threads": 1,
-            "qp_iteration_limit": 1_000_000,  # without a limit it may cycle forever
+            "qp_iteration_limit": 1_000_000,  # without a limit, HiGHS may cycle
         },
         size=1.0,
         tighter=1e-2,
@@ -77,11 +77,12 @@ CALLS: Mapping[str, Call] = {
 
 #: backends that accept dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
-#: backends for which qpsolvers solves unconstrained QPs itself, with a wrong result
+#: backends that do not receive unconstrained QPs, because qpsolvers solves these QPs
+#: itself, with a wrong result
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
-#: claims for the status message if there is no solution; the first match counts
+#: claim for a status message without a solution; the first pattern that matches counts
 STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
     (r"time", Status.TIME_LIMIT),
@@ -92,15 +93,15 @@ STATUS_PATTERNS = (
 
 @dataclass(frozen=True)
 class QPSolvers:
-    """One backend of qpsolvers; all work except the conversion is timed as solving.
+    """One backend of qpsolvers.
 
-    The tolerance is passed in the backend's own keywords (`CALLS`). If a stopping test
-    adds an absolute and a relative tolerance, `tol` is passed as the relative
-    tolerance. A backend without an entry in `CALLS` runs with its defaults. As in the
-    native adapters, the objective is scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the
-    backend's test is absolute (highs, daqp). Backends that accept both dense and sparse
-    matrices receive dense matrices if P is dense. qpsolvers reports iterations only for
-    some backends.
+    The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
+    a stopping test is the sum of an absolute and a relative term, `tol` is the relative
+    tolerance and the absolute tolerance is negligible. A backend without an entry in
+    `CALLS` runs with its defaults. As in the native adapters, the objective is scaled
+    to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp).
+    Backends that accept both dense and sparse matrices receive dense matrices if P is
+    dense.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME
@@ -111,16 +112,17 @@ class QPSolvers:
         licence="LGPL-3.0-or-later; backends have their own licences",
         package="qpsolvers",
         linear_solver="linear solver of the backend",
-        phases="preparing converts only; the backend's setup and factorisation count "
-        "as solving",
+        phases="conversion only (preparing); the backend's setup, factorisation and "
+        "iterations (solving)",
         limits=(
-            "Unconstrained QPs are declined for clarabel, qtqp and scs, because "
-            "qpsolvers solves them with its own code, which claims that strictly "
+            "Unconstrained QPs are declined for clarabel, qtqp and scs. qpsolvers "
+            "would solve these QPs with its own code, which claims that strictly "
             "convex QPs are unbounded (conformance, shape 'unconstrained').",
-            "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
-            "ecos attains only half of the requested digits; use our adapter `ecos` "
-            "instead. pyqpmad, which `make setup` does not install, returns wrong "
-            "multipliers for fixed variables.",
+            "qpsolvers reports no iterations for clarabel, cvxopt, daqp, highs, "
+            "quadprog and sip.",
+            "The backend ecos attains only half of the requested digits; use our "
+            "solver `ecos` instead. pyqpmad, which `make setup` does not install, "
+            "returns wrong multipliers for fixed variables.",
         ),
     )
 
@@ -134,7 +136,7 @@ class QPSolvers:
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:
-            return "needs a row or a bound: qpsolvers solves unconstrained QPs itself"
+            return "needs a row or a bound; qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
@@ -152,10 +154,10 @@ class QPSolvers:
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)
         convert = dense if as_dense or self.backend in DENSE_BACKENDS else csc
         problem = qpsolvers.Problem(**_arguments(qp, convert, scale))
-        if self.backend == "sip":  # sip rejects a P that is asymmetric by rounding
+        if self.backend == "sip":  # sip rejects P if rounding makes it asymmetric
             problem.P = csc((problem.P + problem.P.T) / 2)
         if self.backend == "highs" and not qp.b.size + qp.h.size:
-            # with bounds only, HiGHS claims an optimum after 0 iterations
+            # without rows, HiGHS claims an optimum after 0 iterations
             problem.G, problem.h = convert(np.eye(1, qp.q.size)), np.array([np.inf])
 
         def solve() -> Solution:
@@ -226,7 +228,7 @@ def _claim(message: str) -> Status:
 
 
 def _vector(v: Any, size: int, *, absent: bool = False) -> Vector:
-    """Return `v` as a vector; zeros if `absent`, NaN if it has another size."""
+    """Return `v` as a vector; zeros if `absent`, NaN if the size of `v` is wrong."""
     if absent:
         return np.zeros(size)
     if v is None or np.size(v) != size:

@@ -21,13 +21,13 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "infeasible"  #: status for which QTQP returns a certificate
+PRIMAL = "infeasible"  #: status with a certificate of infeasibility
 CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
     "unbounded": Status.INFEASIBLE,
-}  #: all others (almost_solved, …) count as FAILED
+}  #: all other statuses (almost_solved, …) count as FAILED
 LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 
 
@@ -35,14 +35,14 @@ LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 class QTQP:
     """https://github.com/google-deepmind/qtqp.
 
-    QTQP compares its residuals with max(1, size of their terms), and accepts a gap
-    below tol, absolute or relative to max(1, |objective|). Therefore the objective is
-    scaled to ‖q‖∞ = 1e4, so that the maximum with 1 has no effect, and tol is passed
-    unchanged.
+    QTQP divides each residual by max(1, size of its terms). The gap must be below tol,
+    either in absolute terms or relative to max(1, |objective|). Therefore the objective
+    is scaled to ‖q‖∞ = 1e4, so that the 1 in the maximum has no effect, and tol is
+    passed unchanged.
 
-    In sequences QTQP starts from the last point, shifted into the interior, if the
-    residuals at this point are small enough; otherwise QTQP uses its default starting
-    point. The count `accepted_starts` is 1 if the last point was used, otherwise 0.
+    In sequences, QTQP shifts the last point into the interior and starts there if the
+    residuals are small enough; otherwise it uses its default starting point. The count
+    `accepted_starts` is 1 if QTQP used the last point, otherwise 0.
     """
 
     linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"
@@ -54,17 +54,19 @@ class QTQP:
         licence="Apache-2.0",
         package="qtqp",
         linear_solver="MKL Pardiso (py-mkl-pardiso), one factorisation per iteration",
-        phases="preparing converts only; solving equilibrates and factorises",
+        phases="conversion only (preparing); everything else (solving)",
         sequence="starts from the last point if QTQP accepts it",
         limits=(
-            "QTQP needs an inequality row or a bound; otherwise it divides by zero.",
-            "At tol 1e-9 QTQP stagnates with a relative gap of 1.1e-9 on beam-ring/"
-            "Nr=30/Nh=15/primal and ends at its iteration limit, near the solution; "
-            "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
-            "of the claimed point is 2.0e-8, twice the limit for a verified point.",
-            "When its own test is met, the complementarity may exceed 10·tol: on "
-            "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
-            "and 1.7e-7 at 1e-8 (step 5, cold start).",
+            "QTQP needs an inequality row or a bound, because otherwise it divides by "
+            "zero.",
+            "At tol 1e-9, QTQP stagnates with a relative gap of 1.1e-9, near the "
+            "solution of beam-ring/Nr=30/Nh=15/primal, and ends at its iteration "
+            "limit. On hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, the "
+            "complementarity of the claimed point is 2.0e-8, twice the limit for a "
+            "verified point.",
+            "The complementarity of a claimed point may exceed 10·tol: on "
+            "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a "
+            "sequence) and 1.7e-7 at tol 1e-8 (step 5, cold start).",
         ),
     )
 
@@ -126,7 +128,7 @@ class QTQP:
         def start_at(s: Solution) -> None:
             nonlocal start
             # start from the slack s = r − Rx with the rows R, r of this QP, because the
-            # slack of the previous QP satisfies other rows
+            # previous slack belongs to the rows of the previous QP
             x, y, slack = form.point(s)
             start = x, y * scale, slack
 

@@ -22,21 +22,20 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: a Hessian counts as singular if its smallest pivot is below this times the largest
+#: smallest ratio of Cholesky pivots (smallest to largest) of a nonsingular Hessian
 MIN_PIVOT = 1e-12
 
 
 @dataclass(frozen=True)
 class Quadprog:
-    """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
+    """https://github.com/quadprog/quadprog, with dense matrices.
 
-    quadprog has no tolerance, so `tol` is not used: after finitely many changes of the
-    active set, the KKT conditions hold up to rounding.
+    quadprog has no tolerance, so the adapter does not use `tol`. After finitely many
+    changes of the active set, the KKT conditions hold up to rounding.
 
     The adapter factorises the Hessian of a QP. It declines the QP if the Hessian is not
-    positive definite, or if the smallest Cholesky pivot is below 1e-12 of the largest
-    pivot. QPs with linearly dependent equality rows are also declined, because quadprog
-    reports that such rows are inconsistent.
+    positive definite, or if the smallest Cholesky pivot is below 1e-12 times the
+    largest pivot.
     """
 
     about: ClassVar[About] = About(
@@ -44,11 +43,11 @@ class Quadprog:
         method="dual active set (Goldfarb-Idnani)",
         licence="GPL-2.0-or-later",
         package="quadprog",
-        linear_solver="dense Cholesky (LAPACK), QR of the active rows updated",
-        phases="preparing factorises P and inverts the factor; solving iterates",
+        linear_solver="dense Cholesky (LAPACK), and an updated QR of the active rows",
+        phases="factor of P and its inverse (preparing); iterations (solving)",
         limits=(
-            "quadprog solves strictly convex QPs only: the dual with Dirichlet rows, "
-            "whose F is singular, is declined.",
+            "quadprog solves strictly convex QPs only. The form `dual` is declined if "
+            "F is singular.",
             "Linearly dependent equality rows are declined, because quadprog claims "
             "infeasibility even if they are consistent (conformance, shape "
             "'redundant').",

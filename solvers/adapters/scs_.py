@@ -23,13 +23,13 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = -2  #: status for which SCS returns a certificate
+PRIMAL = -2  #: status with a certificate of infeasibility
 CLAIMS = {
     1: Status.SOLVED,
-    2: Status.ITERATION_LIMIT,  # inaccurate, at the iteration limit
+    2: Status.ITERATION_LIMIT,  # inaccurate solution at the iteration limit
     -1: Status.INFEASIBLE,  # unbounded
     PRIMAL: Status.INFEASIBLE,
-}  #: all others count as FAILED
+}  #: all other statuses count as FAILED
 CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
 
 
@@ -38,10 +38,9 @@ class SCS:
     """https://www.cvxgrp.org/scs.
 
     SCS stops when the max norms of the primal and dual residuals and the duality gap
-    are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
-    negligible eps_abs. The test is evaluated every 25 iterations. Equalities are
-    assigned to the zero cone; inequalities and finite bounds, one row each, to the
-    nonnegative cone; discs and cones to second-order cones.
+    are each below eps_abs + eps_rel·(their largest term). Therefore eps_rel = tol and
+    eps_abs is negligible. SCS evaluates the test every 25 iterations. Discs and
+    cones become second-order cones.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
@@ -53,11 +52,12 @@ class SCS:
         method="operator splitting (homogeneous embedding, Anderson acceleration)",
         licence="MIT; bundles Intel MKL",
         package="scs",
-        linear_solver="MKL Pardiso, bundled (or QDLDL), one factorisation per change "
-        "of scale",
-        phases="preparing equilibrates and factorises; solving iterates",
-        sequence="`update` of vectors keeps the factors; starts from the last point",
-        limits=("SCS needs a row or a bound, because its cone must not be empty.",),
+        linear_solver="bundled MKL Pardiso or QDLDL, one factorisation per change of "
+        "scale",
+        phases="equilibration and factorisation (preparing); iterations (solving)",
+        sequence="`update` replaces vectors and keeps the factors; starts from the "
+        "last point",
+        limits=("SCS needs a row or a bound, because it rejects an empty cone.",),
     )
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class SCS:
     def declines(self, qp: QP) -> str | None:
         rows = ("equalities", "inequalities", "bounds")
         if len(qp.sets) == 1 and not any(qp.sizes[k] for k in rows):
-            return "needs a row or a bound: its cone must not be empty"
+            return "needs a row or a bound, because SCS rejects an empty cone"
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:

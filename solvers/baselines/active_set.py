@@ -22,7 +22,8 @@ KAPPA = 1e4
 #: Largest number of consecutive changes of the active set that do not reduce the number
 #: of wrong constraints. Afterwards, constraints are exchanged one at a time.
 PATIENCE = 10
-#: smaller relative errors of multiplier signs and of bounds count as rounding errors
+#: relative errors of multiplier signs and of bounds below this value count as rounding
+#: errors
 SIGN_ROUNDING = 1e-13
 
 
@@ -42,7 +43,7 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Result of the inner iterations, with the final active set and its solver."""
+    """Result of the inner iterations, with the solution operator of the final face."""
 
     active: Active
     solve: Solve  #: solution operator of the face of `active`
@@ -53,7 +54,7 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """QP with the weights of the proximal terms and the Newton systems of its faces."""
+    """QP, with proximal weights and a function that factorises its Newton systems."""
 
     qp: QP
     A: Matrix
@@ -77,13 +78,13 @@ def penalise(
 ) -> Problem:
     """Return the problem with row weights κ/(a D⁻¹aᵀ); factorise the common block.
 
-    The common block is the block of components that are free on every face.
+    The common block consists of the components that are free on every face.
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If this factorisation breaks down because P is not positive semidefinite. For
-        such a P, a later factorisation of a face may raise the same errors.
+        If this factorisation breaks down because P is not positive semidefinite. A
+        later factorisation of a face may raise the same errors for such a P.
 
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc
@@ -114,11 +115,11 @@ def solve_subproblem(
     slack: float,
     max_iter: int,
 ) -> Run:
-    """Update the active set until it no longer changes (extensions 1, 2 of `pdas`).
+    """Update the active set until it no longer changes (extensions 1 and 2 of `pdas`).
 
     start : active set, and the solution operator of its face, or None if this face has
         not been factorised
-    slack : largest relative errors of signs and bounds that are accepted
+    slack : largest accepted relative errors of multiplier signs and of bounds
     """
     active, solve = start
     fewest, patience = np.inf, PATIENCE
@@ -164,13 +165,13 @@ def _newton(
 
 
 def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
-    """Activate violated constraints; release those with multipliers of wrong sign.
+    """Predict the active set from violated constraints and multiplier signs.
 
-    Violations of bounds are measured in terms of √D·x, whose unit is √energy, so that
-    the result does not depend on the units of the variables.
+    Violations of bounds are measured in √D·x, whose unit is √energy. Therefore the
+    result does not depend on the units of the variables.
 
-    at : x (n,); in its field `y`, the gradient without the multipliers of bounds; in
-        its field `z`, the trial multipliers of all inequality rows
+    at : x (n,); the field `y` contains the gradient without the multipliers of bounds,
+        and the field `z` contains the trial multipliers of all inequality rows
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)
@@ -190,7 +191,7 @@ def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Activ
 def _exchange(active: Active, new: Active, index: int) -> Active:
     """Return `active` with the state of a single constraint taken from `new`.
 
-    index : i for the bounds of variable i < n; n + i for row i of G
+    index : i for the bounds of variable i < n, or n + i for row i of G
     """
     side, rows = active.side.copy(), active.rows.copy()
     if index < side.size:

@@ -9,7 +9,7 @@ increases until it bounds the curvature along the step; after the step, L is red
 (Mazhar, Heyn, Negrut and Tasora, Using Nesterov's method to accelerate multibody
 dynamics with friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a
 linear combination of the last two products Px. A step therefore takes one product with
-P, and one more for each increase of L.
+P and one additional product for each increase of L.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class AcceleratedGradient:
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
-    shrink: float = 0.9  #: factor by which L changes after each step; 1: constant L
-    #: factor by which an increase multiplies L, unless the curvature along the step is
-    #: larger than this product; L then increases to the curvature
+    shrink: float = 0.9  #: multiplies L after each step; with 1, L never decreases
+    #: factor by which an increase multiplies L; if the curvature along the step is
+    #: larger than the product, L increases to the curvature
     growth: float = 2.0
     max_iter: int = 50_000
 
@@ -52,7 +52,7 @@ class AcceleratedGradient:
         licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
-        phases="the preparation does nothing; the solve includes all work",
+        phases="all work is timed as solving",
     )
 
     def __post_init__(self) -> None:
@@ -89,7 +89,7 @@ class _State(NamedTuple):
 
 
 def _start(problem: Problem) -> _State:
-    """Return the initial state with L = ‖Pd‖/‖d‖; d is q, or all ones if q = 0."""
+    """Return the initial state; L = ‖Pd‖/‖d‖ for d = q, or for all ones if q = 0."""
     q = problem.qp.q
     x = problem.project(np.zeros(q.size))
     d = q if q.any() else np.ones(q.size)

@@ -1,10 +1,10 @@
 """Bounded-variable least squares (scipy), applied to a Cholesky factor of P.
 
 With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖².  A strictly convex QP with
-bounds is therefore a least-squares problem. If only lower bounds are present, it is
+bounds is therefore a least-squares problem. With lower bounds only, this problem is
 solved by the active-set method of Lawson and Hanson (Solving Least Squares Problems,
-1974, Chapter 23), otherwise by the extension due to Stark and Parker (Comput. Stat. 10,
-1995).
+1974, Chapter 23). With other bounds, it is solved by the extension of this method by
+Stark and Parker (Comput. Stat. 10, 1995).
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from mortarbench.harness import (
 from mortarbench.solvers.common.conversion import check_positive, dense
 
 MAX_COMPONENTS = 5_000  #: largest accepted n, because P is converted to a dense matrix
-#: a point is claimed as a solution if its KKT residuals are at most this factor times
-#: tol
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
 
 
@@ -51,7 +50,7 @@ class BVLS:
         licence="BSD-3-Clause",
         method="active set (`nnls` or `lsq_linear`), applied to a Cholesky factor",
         linear_solver="LAPACK, called by scipy",
-        phases="the preparation factorises P; the solve iterates",
+        phases="factorisation of P (preparing); iterations (solving)",
         limits=("`nnls` does not report the number of iterations.",),
     )
 
@@ -100,7 +99,11 @@ class BVLS:
 def _least_squares(
     C: Vector, rhs: Vector, box: tuple[Vector, Vector], tol: float, limit: int
 ) -> tuple[Vector, Vector, int | None]:
-    """Minimise ‖Cx − rhs‖ in the box; return x, sides (−1, 0, 1) and iterations."""
+    """Minimise ‖Cx − rhs‖ in the box; return x, active bounds and iterations.
+
+    The second array contains −1 at the lower bound, 1 at the upper bound, otherwise 0.
+    The number of iterations is None if scipy does not report it.
+    """
     from scipy.optimize import lsq_linear, nnls
 
     if not rhs.size:

@@ -1,15 +1,12 @@
-"""Newton systems of the primal-dual active set method, one per face.
+"""Factorised Newton systems of the primal-dual active set method for each face.
 
 Let F be the free components of a face and R its active inequality rows. The Newton step
-dx for the right-hand side r is the solution of
-
-    (M + G_RᵀρG_R)_FF dx_F = r_F
-
-and is computed with a Cholesky factor. M is positive definite, and ρ is the diagonal
-matrix of the penalties of the rows. If M is dense and the QP has no inequality rows,
-the components E without bounds are eliminated in advance, which costs about as much as
-one factorisation. A face then needs only a factor of the free block of the Schur
-complement S on the bounded components E̅:
+dx for the right-hand side r is the solution of (M + G_RᵀρG_R)_FF dx_F = r_F and is
+computed with a Cholesky factor. M is positive definite, and ρ is the diagonal matrix of
+the row penalties. If M is dense and the QP has no inequality rows, the components E
+without bounds are eliminated in advance, which costs about as much as one
+factorisation. A face then needs only a factor of the free block of the Schur complement
+S on the bounded components E̅:
 
     S = M_E̅E̅ − W ᵀW,   W = L⁻¹M_EE̅,   M_EE = LLᵀ.
 """
@@ -38,7 +35,7 @@ Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
 
 
 class InnerSolveError(ArithmeticError):
-    """Failure of an iterative solve on a face to converge."""
+    """Error for an iterative solve on a face that does not converge."""
 
 
 def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:

@@ -1,8 +1,8 @@
-"""FETI: projected preconditioned conjugate gradients for equality rows only.
+"""FETI: projected preconditioned conjugate gradients for QPs with equality rows only.
 
-The method minimises ½xᵀFx − dᵀx subject to Gx = e. The dual of a linear problem without
-contact, on bodies decomposed into subdomains, has this form (Farhat and Roux 1991). The
-algorithm was published by Farhat, Mandel and Roux (1994). With the projector P_Q =
+The method minimises ½xᵀFx − dᵀx subject to Gx = e. If bodies are decomposed into
+subdomains, the dual of a linear problem without contact has this form (Farhat and Roux
+1991). Farhat, Mandel and Roux (1994) published the algorithm. With the projector P_Q =
 I − QGᵀ(GQGᵀ)⁻¹G and a preconditioner M, its steps are:
 
 1. x = QGᵀ(GQGᵀ)⁻¹e, r = d − Fx
@@ -48,8 +48,7 @@ from mortarbench.solvers.common.conversion import (
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
-#: a point is claimed as a solution if its KKT residuals are at most this factor times
-#: tol
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
 #: the solve fails if its stopping bound falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
@@ -76,7 +75,7 @@ class FETI:
 
     #: preconditioner M; "auto" selects "dirichlet" if P provides it, otherwise "none"
     preconditioner: Kind = "auto"
-    scaling: Scaling = "stiffness"  #: weights in M of the copies of an interface node
+    scaling: Scaling = "stiffness"  #: weights of the copies of an interface node in M
     Q: Weight = "identity"  #: matrix Q in the projector P_Q
     max_iter: int = 2000
 
@@ -85,11 +84,11 @@ class FETI:
         licence="BSD-3-Clause",
         method="projected preconditioned conjugate gradients",
         linear_solver="products with P, and a Cholesky factor of the coarse problem",
-        phases="the preparation factorises the coarse problem and sets up the "
-        "preconditioner; the solve iterates",
+        phases="factorisation of the coarse problem and setup of the preconditioner "
+        "(preparing); iterations (solving)",
         limits=(
-            "Only linear problems are solved; QPs with bounds or inequality rows are "
-            "declined.",
+            "The solver declines QPs with bounds or inequality rows, because it "
+            "solves linear problems only.",
             "The solver stores two vectors per iteration.",
         ),
     )
@@ -150,7 +149,7 @@ class _Coarse:
     solve: Callable[[Vector], Vector]  #: t ↦ (GQGᵀ)⁻¹t
 
     def feasible(self, e: Vector) -> Vector:
-        """Return the x in the range of QGᵀ with Gx = e."""
+        """Return the solution x of Gx = e in the range of QGᵀ."""
         return np.asarray(self.QGT @ self.solve(e))
 
     def project(self, v: Vector) -> Vector:
@@ -207,7 +206,7 @@ class _State(NamedTuple):
 
 @dataclass(eq=False)
 class _Directions:
-    """F-orthonormal directions p of all steps and the products Fp, stored as rows."""
+    """F-orthonormal directions p of all steps, and the products Fp, stored as rows."""
 
     P: NDArray[np.float64]
     FP: NDArray[np.float64]
@@ -278,8 +277,8 @@ def _iterate(
 
 def _state(task: _Task, x: Vector) -> _State:
     """Return the state at x, with w recomputed from F and d."""
-    # project twice: the second projection removes the rounding errors that a large y
-    # causes in the first one
+    # project twice: a large y causes rounding errors in the first projection, and the
+    # second projection removes these errors
     once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
     return _project(task, *once)
 
@@ -291,7 +290,7 @@ def _project(task: _Task, x: Vector, y: Vector, r: Vector) -> _State:
 
 
 def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
-    """Return the next state, or None if the curvature along its direction is ≤ 0."""
+    """Return the next state, or None if the new direction has a curvature ≤ 0."""
     p = directions.conjugate(task.preconditioned(at.w))
     Fp = task.product(p)
     curvature = float(p @ Fp)

@@ -1,12 +1,12 @@
 """Projected Gauss–Seidel over discs and cones, as used in granular dynamics.
 
 A sweep minimises the objective over one block of variables at a time, with all other
-variables fixed. The variables of a block belong to one disc or cone, or a block is a
-single variable with bounds. The method is known as NSGS (nonsmooth Gauss–Seidel:
-Jourdan, Alart and Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998, 31–47; Acary and
-Brogliato 2008, Chapter 13). The problem on a block is solved by projected gradient
-steps of length 1/λ, where λ is the largest eigenvalue of the diagonal block of P. The
-steps end when they become short.
+variables fixed. A block consists of the variables of one disc or cone, or of a single
+variable with bounds. The method is known as NSGS (nonsmooth Gauss–Seidel: Jourdan,
+Alart and Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato
+2008, Chapter 13). The problem on a block is solved by projected gradient steps of
+length 1/λ, where λ is the largest eigenvalue of the diagonal block of P. The steps end
+when they become short.
 
 After each change of a block, the gradient is updated with the columns of P of this
 block. A sweep over all blocks therefore costs as much as a product with P.
@@ -31,7 +31,7 @@ from mortarbench.solvers.common.conversion import check_positive
 
 #: The steps on a block end when the ratio of the last to the first step length is at
 #: most this value. With the value 1, which permits a single step, 30 QPs with cones
-#: take 70 sweeps on average. With 1e-3 or 1e-6, they take 34.
+#: take 70 sweeps on average. With 1e-3 or 1e-6, they take 34 sweeps.
 SETTLED = 1e-3
 MAX_LOCAL = 100  #: largest number of steps on a block in one sweep
 
@@ -58,7 +58,7 @@ class GaussSeidel:
         licence="BSD-3-Clause",
         method="block Gauss–Seidel over discs, cones and single variables (NSGS)",
         linear_solver="none (columns of P)",
-        phases="the preparation does nothing; the solve includes all work",
+        phases="all work is timed as solving",
         limits=(
             "The loop over blocks is written in Python, so compare numbers of sweeps "
             "rather than times.",
@@ -94,7 +94,8 @@ class GaussSeidel:
 class _State(NamedTuple):
     x: Vector
     g: Vector  #: Px + q
-    most: float  #: largest curvature dᵀPd/dᵀd of a sweep so far; d is its change of x
+    #: largest curvature dᵀPd/dᵀd so far, where d is the change of x in a sweep
+    most: float
 
 
 class _Block(NamedTuple):

@@ -1,9 +1,8 @@
-"""Tests whether a vector certifies that a QP has no solution.
+"""Tests of certificates which prove that a QP has no solution.
 
-If a certificate exists, the differences of successive proximal iterates converge to a
-certificate. Banjac et al. prove this for ADMM, a related method (Infeasibility
-detection in the alternating direction method of multipliers for convex optimization,
-JOTA 183, 2019).
+If a certificate exists, the differences of successive proximal iterates converge to
+one. Banjac et al. prove this for ADMM, a related method (Infeasibility detection in the
+alternating direction method of multipliers for convex optimization, JOTA 183, 2019).
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from mortarbench.harness import QP, Matrix, Vector
 ROUNDING = 1e-10
 
 
-# iterates of QPs without a solution diverge
+# overflow is possible, because iterates of QPs without a solution diverge
 @np.errstate(over="ignore", invalid="ignore")
 def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
     """Return True if y and z ≥ 0 are a Farkas certificate of infeasibility.
@@ -43,7 +42,8 @@ def proves_unbounded(qp: QP, v: Vector) -> bool:
     """Return True if the objective is unbounded below along the feasible direction v.
 
     The conditions are Pv = 0, qᵀv < 0, Av = 0 and Gv ≤ 0, with vᵢ ≥ 0 if lbᵢ is finite
-    and vᵢ ≤ 0 if ubᵢ is finite. They do not imply that a feasible point exists.
+    and vᵢ ≤ 0 if ubᵢ is finite. These conditions do not imply that a feasible point
+    exists.
     """
     if not v.any() or not np.isfinite(v).all():
         return False

@@ -1,4 +1,4 @@
-"""Natural map of a QP on convex sets, and the iteration loop of methods that use it.
+"""Natural map of a QP on convex sets, and an iteration loop that uses this map.
 
 Let Π be the projection onto the product of the sets, L a curvature, and g = Px + q. The
 natural map L(x − Π(x − g/L)) is zero if and only if x is a solution. With v = x − g/L,
@@ -17,8 +17,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 
-#: a point is claimed as a solution if its KKT residuals are at most this factor times
-#: tol
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
 #: the solve fails if its stopping bound falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
@@ -77,8 +76,8 @@ class Problem:
         """Take steps until all KKT residuals are at most 5·tol; return the solution.
 
         The residuals are evaluated when the norm of the natural map falls below
-        tol·‖q‖. If they are too large, the loop continues with a smaller bound. The
-        status is SOLVED only if all residuals are at most 5·tol.
+        tol·‖q‖. If the residuals are too large, the loop continues with a smaller
+        bound. The status is SOLVED only if all residuals are at most 5·tol.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x
@@ -97,7 +96,7 @@ class Problem:
                 self.counts["steps"] += 1
             v = at.x - at.g / at.most
             x = self.project(v)
-            # recompute g, because the steps only update it
+            # recompute g to remove the rounding errors of its updates
             at = restarted(at, x, self.product(x) + qp.q)
             point = self._point(x, v, at.most)
             worst = kkt_residuals(qp, point).worst

@@ -1,13 +1,13 @@
-"""Primal-dual active set method: semismooth Newton for bounds and rows.
+"""Primal-dual active set method: a semismooth Newton method for bounds and rows.
 
-This is the standard method of the mortar literature (Hintermüller, Ito and Kunisch
-2003, SIAM J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an
-active set of bounds and inequality rows, a linear system determines x and the
+The method is the standard method of the mortar literature (Hintermüller, Ito and
+Kunisch 2003, SIAM J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]).
+For an active set of bounds and inequality rows, a linear system determines x and the
 multipliers. The next active set consists of the active constraints whose multipliers
 have the right sign, and of the violated constraints. The iteration ends when the active
 set no longer changes. Three extensions handle QPs on which this iteration fails:
 
-1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
+1. Proximal method of multipliers (Rockafellar 1976). The linear systems belong to
 
        ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h),
 
@@ -15,10 +15,10 @@ set no longer changes. Three extensions handle QPs on which this iteration fails
    solution even if P is singular, rows are repeated, or there are more active rows than
    free components. When the active set no longer changes, the centre (x_k, y_k, z_k)
    moves to the solution, and the factor of the last face is reused. The weights δᵢ =
-   1e-9·Pᵢᵢ are small. The penalty ρ = 1e4/(a D⁻¹aᵀ) of a row a, with D = diag P, is
-   large. Therefore the active set for the first centre is usually the final one. If the
-   residuals decrease too slowly, ρ is increased. This is necessary for a row whose free
-   variables are all stiff.
+   1e-9·Pᵢᵢ are small, and the penalty ρ = 1e4/(a D⁻¹aᵀ) of a row a, with D = diag P, is
+   large. Therefore the active set for the first centre is usually the final active set.
+   If the residuals decrease too slowly, ρ is increased. The increase is necessary for a
+   row in which all free variables are stiff.
 2. Block principal pivoting (Júdice and Pires 1994, Comput. Oper. Res. 21). After ten
    changes of the active set that did not reduce the number of wrong constraints, only
    the last wrong constraint is changed (Murty's rule), until the number of wrong
@@ -65,16 +65,15 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 from mortarbench.solvers.common.conversion import check_positive
 
 #: Factor by which ρ increases after two changes of the centre that have not halved the
-#: residuals. With these increases, all of 600 random QPs were solved; without them,
-#: 522.
+#: residuals. With these increases, all of 600 random QPs were solved; without them, 522
+#: were solved.
 RHO_GROWTH = 100.0
-MAX_KAPPA = 1e10  #: value of ρ·aD⁻¹aᵀ beyond which ρ is not increased
+MAX_KAPPA = 1e10  #: largest value of ρ·aD⁻¹aᵀ for which ρ is still increased
 #: the solve fails after this number of changes of the centre that have not halved the
 #: residuals
 PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
-#: a point is claimed as a solution if its KKT residuals are at most this factor times
-#: tol
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
 
 
@@ -91,14 +90,14 @@ class PDAS:
 
     The iteration stops when the KKT residuals of the QP are at most tol. If rounding
     prevents further progress, the solver also claims a point with residuals of at most
-    5·tol. It reports the number of linear solves as iterations. Its counts are:
+    5·tol. The solver reports the number of linear solves as iterations. It counts
     factorisations (one per face, and one more if unbounded variables are condensed),
     constraints that entered or left the active set, steps that exchanged a single
     constraint, proximal centres, and products with P.
 
     The solver starts from the point of the box nearest to zero, which is a state
-    without contact in both the primal and the dual. On the duals of contact problems, a
-    start with all variables free took between one solve less and seven solves more.
+    without contact in both primal and dual forms. On the duals of contact problems, a
+    start with all variables free took between one solve fewer and seven solves more.
     """
 
     max_iter: int = 5_000
@@ -108,12 +107,12 @@ class PDAS:
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="the preparation assembles the penalised matrix; the solve factorises "
-        "the matrices of the faces",
-        sequence="the iteration starts from the last active set and point",
+        phases="assembly of the penalised matrix (preparing); factorisations of the "
+        "matrices of the faces (solving)",
+        sequence="starts from the last active set and point",
         limits=(
-            "On one-dimensional obstacle problems, the contact front moves by one node "
-            "per step, which takes 323 solves for 1000 nodes.",
+            "On one-dimensional obstacle problems, the contact front moves by one "
+            "node per step; 1000 nodes take 323 solves.",
             "The symbolic analysis is repeated for every sparse face. At Nr = 30, Nh = "
             "15, a factorisation takes 97 ms instead of 60 ms.",
         ),
@@ -176,7 +175,7 @@ class PDAS:
 
 
 def _start(qp: QP, carry: Carry | None) -> Carry:
-    """Return `carry` if it fits `qp`, otherwise the point of the box nearest to 0."""
+    """Return `carry` if its sizes match, else the point of the box nearest to zero."""
     if carry is not None and [v.size for v in carry.centre] == [
         qp.q.size,
         qp.b.size,
@@ -227,9 +226,9 @@ def _proximal(
 
 
 def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Return the reason why no solution exists, if (x, y, z) certifies it, or None.
+    """Return the reason why no solution exists, or None without a certificate.
 
-    (x, y, z) : difference of the last two proximal centres
+    (x, y, z) : difference of the last two proximal centres, tested as a certificate
     """
     if proves_infeasible(qp, y, z):
         return "no point satisfies all constraints"

@@ -3,9 +3,9 @@
 The outer iteration is the one of `solvers.baselines.pdas`. On each face, the Newton
 system is solved by conjugate gradients, preconditioned by smoothed aggregation (Vaněk,
 Mandel and Brezina 1996, Computing 56; pyamg). In the primal QP of floating elastic
-bodies, the kernel of the stiffness matrix P contains the translations. Smoothed
-aggregation uses them as near-kernel vectors. Rotations are not used, because a QP
-contains no coordinates.
+bodies, the kernel of the stiffness matrix P contains the translations, which smoothed
+aggregation uses as near-kernel vectors. Rotations are not used, because a QP contains
+no coordinates.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mortarbench.solvers.baselines.face import (
 )
 from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
-#: a translation t counts as a vector of the kernel if ‖Pt‖∞ is at most this factor
+#: a translation t counts as an element of the kernel if ‖Pt‖∞ is at most this factor
 #: times ‖P‖∞
 KERNEL_ROUNDING = 1e-8
 #: Relative residual of conjugate gradients, divided by the tolerance of the QP. With
@@ -38,7 +38,7 @@ KERNEL_ROUNDING = 1e-8
 #: cube-wall/n=16), but 17 to 34 % more CG steps were necessary.
 CG_SHARE = 0.1
 #: largest number of CG steps per solve; small beam-ring and cube-wall cases need 9 to
-#: 80
+#: 80 steps
 MAX_CG = 1000
 #: largest number of unknowns on the coarsest level
 COARSEST = 100
@@ -48,10 +48,10 @@ COARSEST = 100
 class PDASAMG(PDAS):
     """`pdas` with conjugate gradients and algebraic multigrid on the faces.
 
-    P must be sparse. The near-kernel consists of the translations if they are in the
-    kernel of P, otherwise of a constant vector. The counts are the same as for `pdas`,
-    but a multigrid set-up counts as a factorisation. The number of conjugate-gradient
-    steps is counted in addition.
+    P must be sparse. If the translations are in the kernel of P, the near-kernel
+    consists of the translations, otherwise of a constant vector. The solver reports the
+    same counts as `pdas`, where a multigrid setup counts as a factorisation, and the
+    number of conjugate-gradient steps.
     """
 
     about: ClassVar[About] = About(
@@ -60,15 +60,15 @@ class PDASAMG(PDAS):
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="conjugate gradients, preconditioned by smoothed aggregation "
         "(pyamg)",
-        phases="the preparation assembles the penalised matrix; the solve sets up "
-        "multigrid for each face",
-        sequence="the iteration starts from the last active set and point",
+        phases="assembly of the penalised matrix (preparing); multigrid setup for "
+        "each face and iterations (solving)",
+        sequence="starts from the last active set and point",
         package="pyamg",
         limits=(
             "The near-kernel does not contain rotations, because a QP contains no "
             "coordinates.",
-            "More CG steps are needed if rows couple several nodes: 30 to 80 per solve "
-            "on beam-ring, but 9 to 22 on cube-wall.",
+            "More CG steps are needed if rows couple several nodes: 30 to 80 steps "
+            "per solve on beam-ring, but 9 to 22 on cube-wall.",
         ),
     )
 
@@ -130,8 +130,7 @@ def _multigrid(
 
     def face(free: Mask, active: Mask) -> Solve:
         F = M + G[active].T @ (diags_array(rho[active]) @ G[active])
-        # keep components that are not free as uncoupled rows, so that every node keeps
-        # d rows
+        # keep fixed components as uncoupled rows, so that every node keeps d rows
         inside = diags_array(1.0 * free)
         F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
         levels = pyamg.smoothed_aggregation_solver(
@@ -139,7 +138,7 @@ def _multigrid(
             B=kernel,
             symmetry="symmetric",
             max_coarse=COARSEST,
-            coarse_solver="splu",  # the default, a pseudo-inverse, took seconds
+            coarse_solver="splu",  # the default pseudo-inverse took seconds
         )
         precondition = levels.aspreconditioner()
 

@@ -11,9 +11,9 @@ Martínez and Raydan, Nonmonotone spectral projected gradient methods on convex 
 SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective is quadratic along d, so one
 product Pd per iteration suffices for both the line search and the next α.
 
-An alternation of α with the step length sᵀPs/‖Ps‖² (ABBmin) halves the number of steps
-for a string on an obstacle. On the duals of contact problems, however, it multiplies
-the number of steps by five to twenty.
+Alternating α with the step length sᵀPs/‖Ps‖² (ABBmin) halves the number of steps for a
+string on an obstacle. On the duals of contact problems, however, this alternation
+multiplies the number of steps by five to twenty.
 
 The stopping test uses the natural map (`solvers.baselines.natural_map`).
 """
@@ -70,10 +70,10 @@ class ProjectedGradient:
         licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
-        phases="the preparation does nothing; the solve includes all work",
+        phases="all work is timed as solving",
         limits=(
-            "The number of products varies strongly, from 45 to 546 for the load steps "
-            "of the benchmark.",
+            "The number of products varies strongly between the load steps of the "
+            "benchmark, from 45 to 546.",
         ),
     )
 
@@ -121,7 +121,7 @@ def _step(problem: Problem, memory: int, s: _State) -> _State | Solution:
     slope, curvature, square = float(s.g @ d), float(d @ w), float(d @ d)
     rise, t = max(s.costs) - s.costs[-1], 1.0
     if slope + curvature / 2 > rise + SUFFICIENT_DECREASE * slope:
-        # the minimiser along d always satisfies the decrease condition
+        # the minimiser along d always satisfies the condition of sufficient decrease
         t = -slope / curvature
     cost = s.costs[-1] + t * slope + t * t / 2 * curvature
     curved = curvature > 1e-15 * np.sqrt(square * float(w @ w))

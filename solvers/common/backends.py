@@ -1,8 +1,9 @@
 """Lists of the backends of qpsolvers and cvxpy, without importing these libraries.
 
-Importing either library imports every installed backend, which takes a second. The
-backends are therefore listed from the adapter files inside the library, and the
-packages that a backend needs are read from the import statements in its adapter file.
+Importing either library imports every installed backend, which takes a second.
+Therefore the names of the adapter files inside the library provide the list of
+backends, and the import statements of these files show the packages that each backend
+needs.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 class Call:
     """Keyword arguments and scaling for one backend of a solver library."""
 
-    #: keywords to which max(tighter·tol, floor) is passed
+    #: keywords whose value is max(tighter·tol, floor)
     tolerances: tuple[str, ...] = ()
-    fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords
+    fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keyword arguments
     size: float = OBJECTIVE_SIZE  #: ‖q‖∞ after the scaling of the objective
     tighter: float = 1.0
     floor: float = 0.0
 
     def options(self, tol: float) -> dict[str, Any]:
-        """Return all keyword arguments for a tolerance."""
+        """Return all keyword arguments of the backend for the tolerance `tol`."""
         value = max(self.tighter * tol, self.floor)
         return {**dict.fromkeys(self.tolerances, value), **self.fixed}
 
@@ -40,7 +41,7 @@ def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
 
     Parameters
     ----------
-    library : name of a package; the result is empty if it is not installed
+    library : name of a package; the result is empty if the package is not installed
     pattern : glob of the adapter files, relative to the package
     suffix : part of the file name after the backend's name, e.g. "_.py" in "osqp_.py"
 
@@ -72,18 +73,18 @@ def reason_unavailable(
         return None
     installed = ", ".join(name for name in files if not _missing_packages(files[name]))
     if missing:
-        return f"not installed: {', '.join(missing)}; {library} finds {installed}"
+        return f"not installed: {', '.join(missing)}; installed backends: {installed}"
     return f"{library} has no backend {backend!r}; installed: {installed}"
 
 
 def _missing_packages(adapter: Path) -> list[str]:
-    """Return the packages that an adapter file imports and that are not installed."""
+    """Return the imports of an adapter file that are not installed."""
     return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 
 @cache
 def _imported_packages(adapter: Path) -> tuple[str, ...]:
-    """Return the top-level packages that an adapter file imports."""
+    """Return the names of the top-level packages that an adapter file imports."""
     roots: dict[str, None] = {}
     for node in ast.walk(ast.parse(adapter.read_text(encoding="utf-8"))):
         match node:

@@ -23,22 +23,22 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
-#: absolute tolerance for solvers that require residual ≤ absolute + relative·size; it
-#: is so small that only the relative tolerance matters
+#: absolute tolerance for solvers that require residual ≤ absolute + relative·size; the
+#: value is so small that only the relative tolerance matters
 NEGLIGIBLE = 1e-14
 #: types of sets that have a conic form
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
-#: A claimed solution with a larger ‖x‖∞ counts as diverged, because the terms of its
-#: residuals are so large that every relative residual is small.
+#: A claimed solution counts as diverged if ‖x‖∞ exceeds this value: the terms of its
+#: residuals are then so large that every relative residual is small.
 DIVERGED = 1e12
-#: ‖q‖∞ after scaling, for solvers that compare residuals with max(1, size). At sizes of
-#: about 1e4 the 1 has no effect, so the tests of these solvers are relative, like the
-#: tests of the harness.
+#: ‖q‖∞ after scaling, for solvers that divide residuals by max(1, size). If the size is
+#: about 1e4, the 1 has no effect. The tests of these solvers are then relative, like
+#: the tests of the harness.
 OBJECTIVE_SIZE = 1e4
 
 
 def needs_dense(qp: QP, copies: float) -> str | None:
-    """Return the reason to decline `qp` if its dense matrices are too large, or None.
+    """Return a reason to decline `qp` if its dense matrices are too large, or None.
 
     copies : largest number of dense matrices, each as large as P, that the solver
         stores at the same time
@@ -47,10 +47,10 @@ def needs_dense(qp: QP, copies: float) -> str | None:
 
 
 def needs_independent_rows(qp: QP) -> str | None:
-    """Return the reason to decline `qp` if its equality rows are dependent, or None."""
-    # AAᵀ has the squared singular values of A, so rows count as dependent if the
-    # smallest singular value of A, relative to the largest, is below about √(machine
-    # precision)
+    """Return a reason to decline `qp` if its equality rows are dependent, or None."""
+    # The eigenvalues of AAᵀ are the squared singular values of A. Therefore rows count
+    # as dependent if the ratio of the smallest to the largest singular value of A is
+    # below about √(machine precision).
     gram = dense(csc(qp.A) @ csc(qp.A).T)
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
@@ -60,7 +60,8 @@ def needs_independent_rows(qp: QP) -> str | None:
 def csc(M: Matrix) -> csc_matrix:
     """Return a writable csc_matrix copy with sorted indices and no duplicates.
 
-    A csc_array is unsuitable: OSQP warns about it, and qpsolvers treats it as dense.
+    A csc_array is unsuitable: OSQP warns about this type, and qpsolvers treats a
+    csc_array as dense.
     """
     copy = csc_matrix(M, dtype=np.float64, copy=True)
     copy.sum_duplicates()
@@ -73,7 +74,7 @@ def dense(M: Matrix) -> Vector:
 
 
 def resolve_backend(backend: str, qp: QP) -> str:
-    """Return `backend`; replace "auto" by "dense" or "sparse", as P is stored."""
+    """Return `backend`, or the storage of P ("dense" or "sparse") instead of "auto"."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
@@ -85,7 +86,7 @@ def has_bound(qp: QP) -> NDArray[np.bool_]:
 
 
 def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
-    """Return R, low, high with low ≤ Rx ≤ high, for rows of A, G and bounded x_j."""
+    """Return R, low and high with low ≤ Rx ≤ high, for rows of A and G and bounds."""
     box = has_bound(qp)
     rows = vstack([csc(qp.A), csc(qp.G), eye_array(qp.q.size, format="csr")[box]])
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf), qp.lb[box]])
@@ -105,7 +106,7 @@ def from_two_sided(qp: QP, v: Vector) -> dict[str, Any]:
 
 
 def to_two_sided(qp: QP, s: Solution) -> Vector:
-    """Return the multipliers of `two_sided` rows; the inverse of `from_two_sided`."""
+    """Return the multipliers of `two_sided` rows; this inverts `from_two_sided`."""
     return np.concatenate([s.y, s.z, s.z_box[has_bound(qp)]])
 
 
@@ -115,7 +116,7 @@ class ConicForm:
 
     The components of s are, in this order:
 
-    - zeros (rows of A, and variables that a set fixes at 0),
+    - zeros (rows of A, and variables that a disc or cone fixes at 0),
     - nonnegative numbers (rows of G, x ≤ ub, −x ≤ −lb),
     - blocks (t, w) with ‖w‖ ≤ t: (radius, x_I) for a disc of variables I, and
       (slope·x_N, x_T) for a cone with normal component x_N and tangential part x_T.
@@ -133,18 +134,18 @@ class ConicForm:
 
     @property
     def linear(self) -> int:
-        """Number of rows outside second-order cones."""
+        """Number of rows that do not belong to second-order cones."""
         return self.equalities + self.inequalities
 
     @property
     def heads(self) -> NDArray[np.int64]:
-        """Index of the first row, t, of each second-order cone."""
+        """Index of the first row (the component t) of each second-order cone."""
         heads: NDArray[np.int64] = self.linear + np.cumsum(self.cones) - self.cones
         return heads
 
     @property
     def tails(self) -> NDArray[np.int64]:
-        """Indices of the rows of second-order cones other than `heads`, ascending."""
+        """Ascending indices of the other rows (the components w) of these cones."""
         return np.setdiff1d(np.arange(self.linear, self.rhs.size), self.heads)
 
     def multipliers(self, v: Vector) -> dict[str, Any]:
@@ -162,12 +163,13 @@ class ConicForm:
     def point(self, s: Solution) -> tuple[Vector, Vector, Vector]:
         """Return x, multipliers v in the dual cone, and a slack in the cones.
 
-        s : point of the QP, whose multipliers are converted to v
+        s : point of the QP with multipliers y, z and z_box
         """
         qp, first, last = self.qp, self.equalities, self.linear
-        # A row of a set has a single entry, ±1 or −slope. Its product with the
-        # multiplier is a component of z_box, so R z_box is the multiplier times the
-        # square of the entry. The head row of a disc has no entries.
+        # A row of a bound, disc or cone has at most one entry, ±1 or −slope. The
+        # product of the entry and the multiplier is a component of z_box, so R z_box is
+        # the multiplier times the square of the entry. The head row of a disc has no
+        # entries.
         v = self.rows @ s.z_box
         squares = np.ravel(self.rows.multiply(self.rows).sum(axis=1))[self.heads]
         apex = np.divide(v[self.heads], squares, where=squares > 0, out=0 * squares)
@@ -181,7 +183,7 @@ class ConicForm:
         return s.x.copy(), v, slack
 
     def _lengths(self, v: Vector) -> Vector:
-        """Return ‖w‖ for the tail w of v in each second-order cone."""
+        """Return ‖w‖ of the components (t, w) of v in each second-order cone."""
         owner = np.repeat(np.arange(self.cones.size), self.cones - 1)
         lengths: Vector = np.sqrt(
             np.bincount(owner, v[self.tails] ** 2, self.cones.size)
@@ -192,8 +194,8 @@ class ConicForm:
 def to_cone(qp: QP) -> ConicForm:
     """Return the constraints of a QP in conic form.
 
-    A disc of radius 0 becomes equality rows. As a second-order cone, it would have no
-    interior, and interior-point methods would fail. A cone of slope 0 becomes rows
+    A disc of radius 0 becomes equality rows: as a second-order cone, it would have no
+    interior, and interior-point methods would fail. A cone of slope 0 becomes the rows
     x_T = 0 and x_N ≥ 0.
     """
     up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
@@ -216,9 +218,9 @@ def to_cone(qp: QP) -> ConicForm:
 
 
 class _ConicBlocks(NamedTuple):
-    """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]  for i < k."""
+    """k constraints ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]."""
 
-    #: (k, d) indices of the variables whose norm is bounded, for each block
+    #: (k, d) indices of the variables on the left-hand side of each constraint
     tail: NDArray[np.int64]
     side: Vector  #: (k,) radii of discs; zero for cones
     head: NDArray[np.int64]  #: (k,) index of the normal component of each cone
@@ -227,12 +229,15 @@ class _ConicBlocks(NamedTuple):
 
     @property
     def is_flat(self) -> NDArray[np.bool_]:
-        """Mask (k,) of the blocks whose right-hand side is zero for every x."""
+        """Mask (k,) of the constraints whose right-hand side is zero for every x."""
         flat: NDArray[np.bool_] = (self.side == 0) & (self.slope == 0)
         return flat
 
     def rows(self, n: int) -> tuple[csr_array, Vector]:
-        """Return R, r with r − Rx = (side + slope·x_head, x_tail); omit flat blocks."""
+        """Return R and r with r − Rx = (side + slope·x_head, x_tail).
+
+        Flat blocks are omitted.
+        """
         tail, side, head, slope = (part[~self.is_flat] for part in self[:4])
         k, d = tail.shape
         first = np.arange(k) * (d + 1)
@@ -262,7 +267,7 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
 
 
 def same_cones(one: QP, other: QP) -> bool:
-    """Return True if both QPs have bounds only or conic forms with equal rows."""
+    """Return True if the QPs have no discs and cones, or the same conic rows."""
     if len(one.sets) == len(other.sets) == 1:
         return True
     R, S = to_cone(one), to_cone(other)
@@ -281,8 +286,8 @@ def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
 def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
     """Return z_box (n,) with the multipliers of absent bounds set to zero.
 
-    Solvers may return rounding errors for these multipliers. If a larger value is set
-    to zero, the harness measures it as a residual of stationarity.
+    Solvers may return rounding errors for these multipliers. If this function sets a
+    larger value to zero, the harness measures this value as a residual of stationarity.
     """
     return admissible(qp.sets, z_box)
 

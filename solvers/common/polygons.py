@@ -21,21 +21,21 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 class PolygonalQP:
     """Approximation of a QP in which polygons replace discs and sections of cones."""
 
-    qp: QP  #: QP without discs and cones; its G has a row for each side of a polygon
-    #: 1 − cos(π/k) for k sides; each polygon contains the disc of (1 − error)·radius
+    qp: QP  #: QP without discs and cones; G contains one row for each side of a polygon
+    #: 1 − cos(π/k) for k sides; each polygon contains the disc with (1 − error)·radius
     error: float
-    #: Maps a point of `qp` to a point of the original QP. The `z_box` of the result is
-    #: normal to the polygons rather than to the circles, so its residuals for the
-    #: original QP show the error of the approximation.
+    #: Maps a point of `qp` to a point of the original QP. The resulting `z_box` is
+    #: normal to the polygons rather than to the circles, so the residuals of the point
+    #: in the original QP show the error of the approximation.
     recover: Callable[[Solution], Solution]
 
 
 def polygonal(qp: QP, sides: int) -> PolygonalQP:
     """Replace discs and friction cones by inscribed regular polygons and pyramids.
 
-    Every feasible point of the new QP is feasible for the original one. With the
-    normals n_j of the k sides, a disc is replaced by  n_jᵀx ≤ radius·cos(π/k),  and a
-    cone by  n_jᵀx_T ≤ slope·cos(π/k)·x_N  with x_N ≥ 0.
+    Every feasible point of the new QP is feasible for the original QP. With the normals
+    n_j of the k sides, a disc is replaced by  n_jᵀx ≤ radius·cos(π/k),  and a cone
+    by  n_jᵀx_T ≤ slope·cos(π/k)·x_N  with x_N ≥ 0.
 
     sides : k, the number of sides of each polygon
 
@@ -80,7 +80,7 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
 
 
 def _sides(one: ConvexSet, sides: int, n: int) -> tuple[csr_array, Vector]:
-    """Return R, r such that Rx ≤ r describes all polygons of a set."""
+    """Return R and r such that Rx ≤ r describes all polygons of a set."""
     if isinstance(one, Discs):
         tangents, radius, slope = one.index, one.radius, 0 * one.radius
     elif isinstance(one, Cones):

@@ -1,4 +1,4 @@
-"""Sequences of QPs: solver objects that are updated, or that start from a point."""
+"""Sequences of QPs with updates of solver objects and with warm starts."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mortarbench.solvers.common.conversion import same_cones
 
 
 class Session(NamedTuple):
-    """Operations on a library's solver object that has been set up for one QP."""
+    """Operations on a library's solver object that was set up for one QP."""
 
     solve: Callable[[], Solution]
-    #: replaces the vectors of the QP by those of a QP with the same matrices and the
+    #: replaces the vectors of the QP; the new QP must have the same matrices and the
     #: same set of bounded variables; None if every QP needs a new session
     update: Callable[[QP], None] | None = None
     #: sets the starting point of the next solve; None if the library does not accept a
@@ -28,7 +28,7 @@ class Session(NamedTuple):
 def chain(
     begin: Callable[[QP, float], Session], tol: float
 ) -> Callable[[QP], Callable[[], Solution]]:
-    """Return the `prepare` function for a sequence of QPs, all solved to `tol`."""
+    """Return the `prepare` function for a sequence of QPs with the tolerance `tol`."""
     prepare = tightening(begin)
     return lambda qp: prepare(qp, tol)
 
@@ -102,8 +102,8 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
     """Return True if the point `s` of `earlier` can be a starting point for `qp`."""
-    # if the QPs bound different variables, the rows of their conic forms do not
-    # correspond, and neither do the multipliers
+    # if different variables are bounded in the two QPs, the rows and multipliers of the
+    # two conic forms do not correspond
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))

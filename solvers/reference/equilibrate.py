@@ -2,8 +2,8 @@
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
 largest entries until every largest entry is about one (Ruiz 2001, RAL-TR-2001-034).
-This leaves one common factor free, the scale of x relative to y and z. It is chosen
-such that the largest entry of P is about one, independently of the unit of the
+One common factor remains free: the scale of x relative to y and z. This factor is
+chosen such that the largest entry of P is about one, independently of the unit of the
 objective. All factors are powers of two, so the scaling and its inverse cause no
 rounding errors.
 """
@@ -19,15 +19,15 @@ from scipy.sparse import csc_array, diags_array
 from mortarbench.harness import QP, Box, Matrix, Solution, Vector
 from mortarbench.harness.sets.blocks import Blocks
 
-#: largest number of scaling rounds; fewer rounds suffice if the units of the entries
-#: differ by factors from 1e-12 to 1e12
+#: largest number of scaling rounds; fewer rounds suffice if units of entries differ by
+#: factors between 1e-12 and 1e12
 ROUNDS = 20
 Exponents = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class ScaledQP:
-    """Scaled QP, with the factors of x, y and z: x = D x̂, y = E ŷ, z = H ẑ."""
+    """Scaled QP with the factors D, E, H of x, y, z: x = D x̂, y = E ŷ, z = H ẑ."""
 
     qp: QP
     D: Vector  #: (n,)
@@ -116,6 +116,6 @@ def _largest(M: Matrix, axis: int) -> Vector:
 
 
 def _root(largest: Vector) -> Exponents:
-    """Return log₂(1/√largest), rounded to an integer; 0 for zero, inf and NaN."""
+    """Return log₂(1/√largest) rounded to an integer, and 0 for zero, inf and NaN."""
     filled = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
     return np.rint(-0.5 * np.log2(filled)).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Primal-dual interior-point method, which computes the start for refinement.
+"""Primal-dual interior-point method that computes a starting point for refinement.
 
 The method is Mehrotra's predictor-corrector method for the problem  min ½xᵀPx + qᵀx,
 Ax = b,  Cx + s = d,  s ≥ 0,  where C contains the rows of G and of the finite bounds
@@ -12,14 +12,16 @@ centring parameter σ, a step solves
 
 first for r_sz = sz (predictor), then for r_sz = sz + ds dz − σμ (corrector), where
 products are componentwise and μ = sᵀz/(number of rows of C). A step covers 0.995 of the
-distance to the boundary of s, z ≥ 0. The step length is the same for x, y, z and s.
+distance to the boundary of the set s, z ≥ 0. The step length is the same for x, y, z
+and s.
 
-A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  Its row of C
-is x_I/r at the current x, and its multiplier adds z/r to the diagonal of P.
+A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  The row of C
+for the disc is x_I/r at the current x, and the multiplier z of the disc adds z/r to the
+diagonal of P.
 
 δ is the parameter of a proximal method of multipliers centred at the iterate
-(Pougkakiotis and Gondzio 2021, Comput. Optim. Appl. 78). It permits a singular P and
-linearly dependent rows. The solution does not depend on δ.
+(Pougkakiotis and Gondzio 2021, Comput. Optim. Appl. 78). With δ > 0, P may be singular
+and rows may be linearly dependent. The solution does not depend on δ.
 """
 
 from __future__ import annotations
@@ -46,8 +48,8 @@ from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
-#: KKT residual at which the iteration ends; it is small enough to identify the active
-#: constraints, which `polish` then treats as equations
+#: KKT residual at which the iteration ends; at this residual the active constraints can
+#: be identified, which `polish` then treats as equations
 STOP_RESIDUAL = 1e-11
 MAX_ITERATIONS = 100
 #: the iteration ends after this number of consecutive iterations that have not halved
@@ -116,7 +118,7 @@ class _Problem:
         return csr_array(vstack([*rows, self.G])), curvature
 
     def box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
-        """Add the multipliers z of upper and lower bounds to the vector `start` (n,).
+        """Add the multipliers z of upper and lower bounds to `start` (n,).
 
         lower : factor of the multipliers of lower bounds
         """
@@ -164,7 +166,8 @@ class _Problem:
         )
 
 
-@np.errstate(all="ignore")  # a residual that overflows is not finite and ends the loop
+# an overflow makes the residual infinite or NaN, which ends the loop
+@np.errstate(all="ignore")
 def interior_point(qp: QP, delta: float = DELTA) -> Solution:
     """Run the interior-point method; return the iterate with the smallest KKT residual.
 
@@ -186,7 +189,7 @@ def interior_point(qp: QP, delta: float = DELTA) -> Solution:
             if least <= STOP_RESIDUAL or stalled == PATIENCE or not np.isfinite(worst):
                 break
             at = _step(problem, at)
-    except ArithmeticError:  # a system is singular: return the best iterate
+    except ArithmeticError:  # a system is singular; return the best iterate
         pass
     return best
 
@@ -237,7 +240,7 @@ def _stacked(A: Matrix, rows: Matrix) -> Matrix:
 
 
 def _start(problem: _Problem) -> Iterate:
-    """Return the first iterate: a penalised minimiser with s and z shifted to s, z > 0.
+    """Return the first iterate: a penalised minimiser, with s and z made positive.
 
     The term ½‖Cx − d‖² replaces the constraint Cx ≤ d (Vandenberghe 2010, The CVXOPT
     linear and quadratic cone program solvers, section 5.3).
@@ -250,8 +253,8 @@ def _start(problem: _Problem) -> Iterate:
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
-    # if x started far outside a disc, the slack of this disc would become small before
-    # x reached the disc
+    # without this projection, x may start far outside a disc, and the slack of the disc
+    # then becomes small before x reaches the disc
     for one in problem.discs:
         x = one.project(x)
     return Iterate(x, y, z, s)

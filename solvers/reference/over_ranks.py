@@ -6,13 +6,13 @@ equality rows must be linearly independent on the components without bounds, whi
 the case if all bodies are supported.
 
 1. On a face, some components are fixed at bounds, and the free components x_𝓕 solve a
-   linear system. The system is solved by projected preconditioned conjugate gradients
-   with the projector 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕, restarted from the true residual
-   until only rounding errors remain (iterative refinement). If x is on the boundary of
-   a disc, with the multipliers z_I = ηx_I, the disc is linearised as in Newton's
-   method: the normal component of x_I is fixed by nᵀx_I = r with the outward normal n,
-   and x_I varies along the tangents. The curvature of the boundary adds η to F along
-   the tangents.
+   linear system. The system is solved by conjugate gradients with a preconditioner and
+   the projector 𝒫 = I − G_𝓕ᵀ(G_𝓕G_𝓕ᵀ)⁻¹G_𝓕. The iteration is restarted from the true
+   residual until only rounding errors remain (iterative refinement). If x is on the
+   boundary of a disc, with the multipliers z_I = ηx_I, the disc is linearised as in
+   Newton's method: the normal component of x_I is fixed by nᵀx_I = r with the outward
+   normal n, and x_I varies along the tangents. The curvature of the boundary adds η to
+   F along the tangents.
 2. The active sets are updated by the primal-dual method (Hintermüller, Ito and Kunisch
    2003, SIAM J. Optim. 13): components with a multiplier of the wrong sign are
    released, and components that violate a bound are fixed at this bound. Discs are
@@ -23,9 +23,9 @@ the case if all bodies are supported.
    components decreases (block principal pivoting, Júdice and Pires 1994, Comput. Oper.
    Res. 21). Without discs, the algorithm ends after finitely many changes.
 
-The result belongs to an active set without multipliers of the wrong sign and without
-violated bounds. It is accurate to about rounding. No code of the solvers under test is
-used.
+The active set of the result has no multipliers of the wrong sign, and the result
+violates no bounds. The errors of the result are about as large as rounding errors. The
+module uses no code of the solvers under test.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ MAX_CG_STEPS = 300  #: largest number of CG steps in a round
 #: no further CG round starts if the norm of the projected residual is at most this
 #: factor times the norm of the projected q
 ROUNDING_RESIDUAL = 1e-14
-#: multipliers of the wrong sign and violations of bounds count as rounding errors below
-#: this value, relative to the largest multiplier or component
+#: multipliers of the wrong sign, relative to the largest multiplier, and violations of
+#: bounds, relative to the largest component, count as rounding errors below this value
 SIGN_ROUNDING = 1e-12
 #: largest final angle in radians between x and the normal at which a disc was
 #: linearised; the remaining error of Newton's method is about the square of the angle
@@ -65,13 +65,13 @@ MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 
 
 def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
-    """Solve a distributed dual, accurate to about rounding.
+    """Solve a distributed dual to about working precision.
 
     The call is collective over all ranks.
 
     qp : the dual, with the local components of this rank
-    start : solution of a dual that differs only in its bounds; the active set of this
-        solution is tried first
+    start : solution of a dual that differs only in its bounds; its active set is tried
+        first
 
     Raises
     ------
@@ -136,10 +136,10 @@ class _Point(NamedTuple):
 
 
 class _Face(NamedTuple):
-    """Face: components at bounds, and discs that are linearised on their boundary."""
+    """Face, described by components at bounds and by discs with x_I on the boundary."""
 
-    #: (n + k,): for components, −1 at the lower bound, 1 at the upper bound, else 0;
-    #: for discs, 1 on the boundary, else 0
+    #: (n + k,) states: −1 for a component at its lower bound, 1 for a component at its
+    #: upper bound and for a disc with x_I on the boundary, otherwise 0
     state: NDArray[np.int8]
     normal: NDArray[np.float64]  #: (k, d) outward unit normals
     curvature: Vector  #: (k,) η ≥ 0
@@ -190,7 +190,7 @@ class _Task:
         return float(self.G.ranks.total(np.array([part]))[0])
 
     def only_last(self, which: Mask) -> Mask:
-        """Return a mask with only the last True of all ranks, in order of ranks."""
+        """Return a mask with only the last True entry of all ranks, in rank order."""
         ranks = self.G.ranks
         local = np.flatnonzero(which)
         last_rank = ranks.extreme(float(ranks.rank if local.size else -1), np.max)
@@ -208,9 +208,10 @@ class _Task:
         return self.F(x) + self.q
 
     def moving(self, face: _Face) -> tuple[csr_array, Vector]:
-        """Return the projector (n, n) along the face, and the origin (n,) of the face.
+        """Return the projector (n, n) onto directions in the face, and an origin (n,).
 
-        The origin contains the fixed components of x; its projection is zero.
+        The origin contains the fixed components of x; the projection of the origin is
+        zero.
         """
         n, (index, radius) = self.q.size, (self.discs.index, self.discs.radius)
         at_bound, sliding = face.state[:n], self.on_disc(face)
@@ -248,12 +249,12 @@ class _Task:
             return np.asarray(v - spread(self.G @ v))
 
         def bent(v: Vector) -> Vector:
-            """Return the curvature terms of the boundaries of discs, times v."""
+            """Return the curvature terms of disc boundaries, multiplied by v."""
             return np.asarray(curvature * (moving @ v))
 
-        # M ≈ F⁻¹ is too large if the curvature exceeds F, as on small discs. Along
-        # redundant rows (friction on supported nodes), M is zero although the curvature
-        # is not.
+        # M ≈ F⁻¹ is too large an approximation of (F + curvature)⁻¹ if the curvature
+        # exceeds F, as on small discs. Along redundant rows (friction on supported
+        # nodes), M is zero, but the curvature is not.
         length = np.zeros(x.size)
         length[self.discs.index] = (self.length * on_disc)[:, None]
         soft = 1 / np.sqrt(1 + length * curvature)
@@ -266,7 +267,7 @@ class _Task:
         x += spread(self.e - self.G @ x)
         size = self.norm(project(self.q))
         for _ in range(MAX_CG_ROUNDS):
-            # the second projection removes the rounding errors of the first
+            # the second projection removes the rounding errors of the first projection
             w = project(project(-self.gradient(x) - bent(x)))
             if self.norm(w) <= ROUNDING_RESIDUAL * size:
                 break
@@ -285,7 +286,7 @@ class _Task:
         precondition: Callable[[Vector], Vector],
         bent: Callable[[Vector], Vector],
     ) -> Vector:
-        """Return a d along the face such that 𝒫(w − Fd − bent(d)) is small, by CG."""
+        """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG."""
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
         p = y = precondition(w)
         wy = self.total(float(w @ y))
@@ -293,7 +294,7 @@ class _Task:
             Fp = self.F(p) + bent(p)
             self.products += 1
             curvature = self.total(float(p @ Fp))
-            if not min(wy, curvature) > 0:  # only rounding errors along redundant rows
+            if not min(wy, curvature) > 0:  # only rounding errors of redundant rows
                 break
             alpha = wy / curvature
             d += alpha * p
@@ -309,8 +310,8 @@ class _Task:
         """Return the face that contains `point`, the solution of a similar problem."""
         x, z, index = point.x, point.z, self.discs.index
         at_bound = (z != 0) | (self.lower == self.upper)
-        # use the nearer bound instead of the sign of z, because rounding may change the
-        # sign of a multiplier near zero
+        # take the nearer bound instead of the bound that the sign of z indicates,
+        # because rounding may change the sign of a multiplier near zero
         below = x - self.lower <= self.upper - x
         at_bound[index] = False
         state = np.where(at_bound, np.where(below, -1, 1), 0)

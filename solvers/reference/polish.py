@@ -1,20 +1,21 @@
 """Refinement of a solution in extended precision, with active constraints as equations.
 
-For a fixed active set, the KKT conditions are linear. They are solved by iterative
-refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12), with
-residuals evaluated in `numpy.longdouble` and a factorisation of
+For a fixed active set, the KKT conditions are linear. These equations are solved by
+iterative refinement (Higham 2002, Accuracy and Stability of Numerical Algorithms, ch.
+12), with residuals evaluated in `numpy.longdouble` and a factorisation of
 
     [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
     [B_F       −δ  ]     B: A and the active rows of G.
 
-The shift δ makes the matrix regular for every P and B. The limit of the refinement does
-not depend on δ, because its steps are those of the proximal method of multipliers
-(Rockafellar 1976, Math. Oper. Res. 1). If the solution or its multipliers are not
-unique, the steps converge to a solution near the start.
+The shift δ makes the matrix regular for every P and B. The refinement steps are steps
+of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1), so their
+limit does not depend on δ. If the solution or its multipliers are not unique, the steps
+converge to a solution near the starting point.
 
 After convergence, violated constraints enter the active set, and constraints with a
 multiplier of the wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J.
-Optim. 13). This is repeated until the active set no longer changes.
+Optim. 13). The refinement and this update are repeated until the active set no longer
+changes.
 """
 
 from __future__ import annotations
@@ -33,15 +34,14 @@ from mortarbench.solvers.reference.saddle import saddle
 Extended = NDArray[np.longdouble]
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
 MAX_REFINEMENTS = 40  #: largest number of refinement steps per active set
-#: the refinement ends if the ratio of the lengths of two successive steps is not below
-#: this value
+#: the refinement ends if a step is not shorter than this factor times the previous step
 MAX_STEP_RATIO = 0.9
 MAX_ACTIVE_SETS = 30
 #: number of updates of the whole active set; in later updates, only the constraint with
 #: the largest error changes
 FULL_CHANGES = 10
-#: multipliers of the wrong sign and violations count as rounding errors below this
-#: value, relative to the largest component
+#: multipliers of the wrong sign and violations of constraints, relative to the largest
+#: component, count as rounding errors below this value
 SIGN_ROUNDING = 4 * float(np.finfo(float).eps)
 
 
@@ -73,12 +73,12 @@ class _Problem:
 
 @np.errstate(all="ignore")  # the caller rejects points whose residuals overflow
 def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
-    """Yield a refined point for each active set that is tried (often only one).
+    """Yield a refined point for each tested active set; often one active set suffices.
 
     qp : QP whose largest entries are about one, with P, A and G all dense or all sparse
     start : point near a solution, for example the result of an interior-point method
-    delta : δ; a smaller value resolves weaker curvature and more nearly parallel rows,
-        but brings the matrix closer to singularity
+    delta : δ; with a smaller value, weaker curvature and more nearly parallel rows can
+        be resolved, but the matrix is closer to singularity
     """
     problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
@@ -126,14 +126,15 @@ def _solve_active_set(
 def _update_active_set(
     problem: _Problem, active: _Active, at: _Point, *, one: bool
 ) -> _Active:
-    """Activate violated constraints; release those with a multiplier of wrong sign.
+    """Update the active set according to violated constraints and multiplier signs.
 
-    Nearly dependent active rows can all be satisfied only with huge multipliers.
-    Therefore, if no other constraint is wrong, active rows with a remaining slack are
-    released.
+    Nearly dependent active rows may require huge multipliers to be satisfied at the
+    same time. Therefore, if no other constraint is wrong, active rows with a remaining
+    slack are released.
 
-    one : True to change only the constraint with the largest error, relative to the
-        size of x (violations) or of the gradient (signs)
+    one : if True, change only the constraint with the largest error; violations are
+        measured relative to the size of x, and signs relative to the size of the
+        gradient
     """
     qp, side = problem.qp, active.side
     g = problem.gradient(at)
@@ -157,7 +158,7 @@ def _update_active_set(
 
 
 def _round(problem: _Problem, active: _Active, at: _Point) -> Solution:
-    """Round to double precision; compute z_box from stationarity at the rounded x."""
+    """Round to double precision; z_box follows from stationarity at the rounded x."""
     qp, side = problem.qp, active.side
     x = np.clip(at.x.astype(float), qp.lb, qp.ub)
     y, z = at.y.astype(float), np.maximum(at.z.astype(float), 0)

@@ -1,20 +1,20 @@
-"""Reference solve of QPs over arbitrary convex sets, which uses only projections.
+"""Reference solve of QPs over arbitrary convex sets that uses only projections.
 
 Let M = [A; G; I], and C = {b} × {w ≤ h} × S with the product S of the sets. The QP is
 to minimise ½xᵀPx + qᵀx subject to Mx ∈ C. Let Π be the projection onto C, and R > 0 a
-diagonal matrix that is constant within each set. Then a point t of the space of Mx
-defines both w = Π(t) in C and multipliers λ = R(t − w), which are normal to C at w. The
-remaining KKT conditions state that the normal map is zero (Robinson 1992, Math. Oper.
-Res. 17),
+diagonal matrix whose entries are equal within each set. Then a vector t of the size of
+Mx defines both the point w = Π(t) in C and the multipliers λ = R(t − w), which are
+normal to C at w. The remaining KKT conditions state that the normal map is zero
+(Robinson 1992, Math. Oper. Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
 1. ADMM with penalty R approaches a zero of (1) from any start (Stellato et al. 2020,
-   Math. Prog. Comp. 12). If P is singular, it needs Anderson acceleration with a
+   Math. Prog. Comp. 12). If P is singular, ADMM needs Anderson acceleration with a
    safeguard (Zhang, O'Donoghue and Boyd 2020, SIAM J. Optim. 30).
 2. Newton's method then converges to this zero. The derivative of Π is approximated by
    difference quotients, and residuals are evaluated in extended precision. The error √ε
-   of the quotients limits only the rate of convergence: each step reduces the residual
+   of the quotients affects only the rate of convergence: each step reduces the residual
    by about the factor √ε.
 """
 
@@ -30,10 +30,10 @@ from scipy.linalg import lu_factor, lu_solve
 from mortarbench.harness import QP, Solution, Status, Vector
 
 ROUNDS = 12  #: rounds of ADMM and Newton's method, each with a different penalty
-ADMM_STEPS = 400  #: ADMM steps in the first round; round k takes k times as many
+ADMM_STEPS = 400  #: ADMM steps in the first round; round k takes k times as many steps
 NEWTON_STEPS = 30  #: largest number of Newton steps per round
-MEMORY = 10  #: number of iterates per acceleration, and between two accelerations
-#: shift of the normal equations of an acceleration, relative to their trace
+MEMORY = 10  #: number of plain steps before an acceleration, which uses all of them
+#: diagonal shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
 #: penalty of rows of A relative to all other penalties, as in OSQP
@@ -68,7 +68,7 @@ class _Problem:
         return float(np.abs(self.P).max(initial=0)) or 1.0
 
     def penalty(self, rho: float) -> Vector:
-        """Return R (r,): rho for rows of G and variables, more for rows of A."""
+        """Return R (r,): rho for rows of G and variables, 1000 rho for rows of A."""
         m = self.qp.b.size
         R: Vector = rho * np.ones(self.M.shape[0])
         R[:m] *= EQUALITY_PENALTY
@@ -109,7 +109,7 @@ def refine(qp: QP, start: Solution) -> Solution:
 
 
 def projection_iterates(qp: QP) -> Iterator[Solution]:
-    """Yield the point of each round; later rounds take more steps."""
+    """Yield the point after each round; later rounds take more steps."""
     problem = _Problem.of(qp)
     P, M, project, q = problem.P, problem.M, problem.project, qp.q
     rho = problem.largest
@@ -143,7 +143,7 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
     """Iterate t ← step(t) `count` times, with an acceleration every `MEMORY` steps.
 
     An accelerated point is used only if its residual ‖step(t) − t‖ is not larger than
-    the last one. The residual of plain steps never increases, because `step` is an
+    the last residual. The residual of plain steps never increases, because `step` is an
     averaged operator.
     """
     images, changes = list[Vector](), list[Vector]()
@@ -171,10 +171,10 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop
 def _newton(problem: _Problem, R: Vector, t: Vector) -> Any:
-    """Run Newton's method from t; return the iterate with the smallest residual of (1).
+    """Run Newton's method for (1) from t; return the iterate with the least residual.
 
-    x is eliminated: it consists of the components of Π(t) for the rows of I. Therefore
-    t is the only unknown.
+    The unknown x is eliminated, because x consists of the components of Π(t) for the
+    rows of I. Therefore t is the only unknown.
     """
     P, M, q, k = problem.P, problem.M, problem.qp.q, problem.size.size
     t, rows = t.astype(np.longdouble), M[:k]

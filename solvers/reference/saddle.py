@@ -23,7 +23,7 @@ LEAST_FILL = dict(
     permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)
 )
 PIVOTED = dict(permc_spec="COLAMD", diag_pivot_thresh=1.0)
-#: largest relative residual of a solve for which one step of refinement suffices
+#: largest relative residual of a solve after which one step of refinement suffices
 MAX_SOLVE_RESIDUAL = 1e-6
 
 Solve = Callable[[Vector, Vector], tuple[Vector, Vector]]
@@ -33,7 +33,7 @@ Factorise = Callable[[Vector, Vector], Solve]
 def saddle(P: Matrix, B: Matrix) -> Factorise:
     """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    The returned function returns the solution operator (r, t) ↦ (u, v). It raises
+    The resulting function returns the solution operator (r, t) ↦ (u, v). It raises
     ArithmeticError if an entry of D or W is not finite or a pivot is zero.
 
     P, B : (n, n) and (r, n) matrices, both dense or both sparse

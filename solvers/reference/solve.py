@@ -1,4 +1,4 @@
-"""Reference solutions of QPs, computed without any of the solvers under test.
+"""Reference solutions of QPs, computed independently of the solvers under test.
 
 If P = LLᵀ is dense and positive definite and x ≥ lb is the only constraint, the QP is
 equivalent to the nonnegative least-squares problem min ½‖Lᵀy + L⁻¹(q + P lb)‖² over
@@ -9,11 +9,11 @@ solve with one step of iterative refinement.
 Every other QP is scaled (`equilibrate`) and solved by an interior-point method until
 the active constraints can be identified (`interior`). The equations of the active set
 are then solved with refinement in extended precision (`polish`). The result is the
-point with the smallest KKT residual, as the harness measures it on the original QP.
+point for which the harness measures the smallest KKT residual of the original QP.
 
-If the sets are bounds and discs, the point of the interior-point method is refined by a
-method that uses projections (`projection`). A QP with other sets is solved by the
-projection method alone.
+If the sets are bounds and discs, a method that uses projections (`projection`) refines
+the point of the interior-point method. The projection method alone solves QPs with
+other sets.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ from mortarbench.solvers.reference.interior import DELTA, interior_point
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates, refine
 
-#: Largest KKT residual of a reliable start for refinement; if the residual is larger,
-#: other starts are tried. From such a start, the refinement of a QP with many solutions
-#: ended at a solution of size 1e10, whose rounding hid errors of the optimal value.
+#: Largest KKT residual of a reliable starting point for refinement; if the residual is
+#: larger, other starting points are tried. From an unreliable starting point, the
+#: refinement of a QP with many solutions ended at a solution of size 1e10, whose
+#: rounding errors hid errors of the optimal value.
 MAX_START_RESIDUAL = 1e-3
-#: number of rounds of `projection` without a smaller residual after which a residual of
-#: at most MAX_REFERENCE_RESIDUAL is accepted
+#: largest number of further rounds of `projection` that do not reduce a residual
+#: between MAX_RESIDUAL and MAX_REFERENCE_RESIDUAL; the residual is then accepted
 MAX_IDLE_ROUNDS = 1
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
-#: δ of the interior-point method for discs and a singular P; with a smaller δ, steps
-#: along the kernel of P end so far outside discs that the linearisation fails
+#: δ of the interior-point method if there are discs and P is singular; with a smaller
+#: δ, steps along the kernel of P leave the discs so far that the linearisation fails
 SINGULAR_DELTA = 1e-7
 #: data of a scaled QP count as outliers above this factor times their median
 OUTLIER_FACTOR = 1e4
@@ -52,11 +53,11 @@ OUTLIER_FACTOR = 1e4
 def reference_solution(qp: QP) -> Solution:
     """Return a solution of a convex QP, with x and multipliers accurate to rounding.
 
-    The field `iterations` contains the number of steps of the interior-point method, if
-    it ran. The remaining residual is due to the rounding of x to double precision. It
-    is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for the
-    displacements of stiff bodies. P must be positive semidefinite, which is not
-    checked.
+    The field `iterations` contains the number of interior-point steps, if that method
+    ran. The remaining residual is caused by the rounding of x to double precision. The
+    residual is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for the
+    displacements of stiff bodies. The function does not check that P is positive
+    semidefinite.
 
     Raises
     ------
@@ -82,7 +83,7 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices; got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    ways: tuple[Iterator[Solution], ...] = (
+    attempts: tuple[Iterator[Solution], ...] = (
         _candidates(qp),
         _candidates_without_outliers(qp),
         _less_regularised_candidates(qp),
@@ -90,11 +91,11 @@ def reference_solution(qp: QP) -> Solution:
     if len(qp.sets) > 1:
         smooth = all(isinstance(one, Discs) for one in qp.sets[1:])
         shifts = (DELTA, SINGULAR_DELTA) if smooth else ()
-        ways = (
+        attempts = (
             *(_smooth_candidates(qp, delta) for delta in shifts),
             _projection_candidates(qp),
         )
-    for candidates in ways:
+    for candidates in attempts:
         residuals = list[float]()
         for point in candidates:
             residuals.append(worst := _residual(qp, point))
@@ -120,7 +121,7 @@ def _residual(qp: QP, s: Solution) -> float:
 
 
 def _candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points, each of them usually more accurate than the previous one."""
+    """Yield points with usually decreasing errors."""
     if _is_nonnegative(qp):
         # LinAlgError if P is singular; RuntimeError if nnls reached its step limit
         with suppress(np.linalg.LinAlgError, RuntimeError):
@@ -154,7 +155,7 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
 
 
 def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
-    """Yield points refined from a start that is computed without outlying data."""
+    """Yield points refined from a starting point that is computed without outliers."""
     scaled = equilibrate(qp)
     near = scaled.qp.h < _outlier_size(scaled.qp)
     tame = equilibrate(_without_outliers(scaled.qp, near))
@@ -169,7 +170,7 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
     """Yield points computed with a smaller δ.
 
-    Weak curvature and nearly parallel rows require a smaller δ.
+    If P has weak curvature or rows are nearly parallel, a smaller δ is necessary.
     """
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
@@ -185,11 +186,11 @@ def _outlier_size(qp: QP) -> float:
 
 
 def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
-    """Return a scaled QP without the outliers among its data, to compute a start.
+    """Return a scaled QP without outliers, from which a starting point is computed.
 
     Bounds and rows with outliers are omitted, on the assumption that they are inactive.
-    Coefficients of the objective that are outliers are clipped, on the assumption that
-    their variables stay at a bound. The residual on the original QP shows whether both
+    Outliers among the coefficients of the objective are clipped, on the assumption that
+    their variables are at a bound. The residual of the original QP shows whether both
     assumptions are true.
 
     near : (p,) mask of the rows to keep
@@ -204,7 +205,7 @@ def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
 def _is_nonnegative(qp: QP) -> bool:
     """Return True if P is dense and the only constraints are x ≥ lb with finite lb.
 
-    A QP without variables is excluded, because scipy's nnls (1.17.1) crashes on it.
+    A QP without variables is excluded, because scipy's nnls (1.17.1) crashes for n = 0.
     """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
     lower = qp.q.size > 0 and np.isfinite(qp.lb).all()

@@ -1,12 +1,12 @@
-# Products with sparse rows G, such as those for the rigid motions of subdomains, and
-# solves with the factor L of GGᵀ. On one process they run without Python.
+# Products with sparse rows G, such as the rows for the rigid motions of subdomains, and
+# solves with the factor L of GGᵀ. On one process, these operations run without Python.
 
 
 cdef class Coarse:
     """Operations, called through Python, with rows G (k, n) shared by several ranks.
 
-    Vectors (k,) have an entry for each row with entries in the columns of this process;
-    L⁻¹ maps them to vectors (r,).
+    Vectors (k,) have a component for each row with entries in the columns of this
+    process. L⁻¹ maps vectors (k,) to vectors (r,).
 
     source : a `solvers.smalbe.rows.SparseRows`
     """
@@ -79,13 +79,13 @@ cdef class Coarse:
         return copy_result(self.source.gram.backward(view(a, self.r)), self.k, y, "L⁻ᵀa")
 
     cdef in_face(self, double shift):
-        """Return the factor of G_F G_Fᵀ + shift·GGᵀ, F: components not `active`."""
+        """Return the factor of G_F G_Fᵀ + shift·GGᵀ; F: all components not `active`."""
         free = np.ones(self.n, dtype=bool)
         free[self.source.bounded] = view(self.active, self.places) == 0
         return self.source.gram.in_face(free, shift)
 
     cdef int solve(self, factor, const double *t, double *y) except -1:
-        """y ← the solution for the right-hand side t; `factor` is a result of `in_face`."""
+        """y ← the solution for the right-hand side t; `factor` comes from `in_face`."""
         return copy_result(factor(view(t, self.k)), self.k, y, "solution")
 
     cdef double error(self, const double *nu) except? -1:
@@ -101,12 +101,12 @@ cdef class Coarse:
 
 @cython.final
 cdef class LocalCoarse(Coarse):
-    """`Coarse` for rows on one process only; the operations run without Python."""
+    """Variant of `Coarse` for rows on one process; operations run without Python."""
 
     cdef CompressedRows rows  # G
     cdef CompressedRows by_components  # Gᵀ
     cdef CompressedRows of_bounded  # G_bᵀ
-    cdef CompressedRows given  # transpose of the original, unnormalised rows
+    cdef CompressedRows original  # transpose of the original, unnormalised rows
     cdef CompressedRows matrix  # GGᵀ
     cdef BorderedFactor factor
     cdef bint has_border
@@ -118,9 +118,9 @@ cdef class LocalCoarse(Coarse):
         self.by_components = source.unit.transposed
         self.rows = self.by_components.transposed()
         self.of_bounded = source.of_bounded.transposed
-        self.given = transposed_rows(source.G)
+        self.original = transposed_rows(source.G)
         self.matrix, self.factor = symmetric_rows(gram.matrix), gram.factor
-        self.has_border, self.missed = gram.has_border, Room(self.given.k)
+        self.has_border, self.missed = gram.has_border, Room(self.original.k)
 
     cdef int times(self, const double *v, double *t) except -1:
         self.rows.times(v, t)
@@ -172,9 +172,9 @@ cdef class LocalCoarse(Coarse):
         return 0
 
     cdef double error(self, const double *nu) except? -1:
-        memset(self.missed.at, 0, self.given.k * sizeof(double))
-        self.given.add_transposed(nu, self.missed.at)
-        return sqrt(dot(self.missed.at, self.missed.at, self.given.k))
+        memset(self.missed.at, 0, self.original.k * sizeof(double))
+        self.original.add_transposed(nu, self.missed.at)
+        return sqrt(dot(self.missed.at, self.missed.at, self.original.k))
 
 
 cdef CompressedRows transposed_rows(G):
@@ -183,5 +183,5 @@ cdef CompressedRows transposed_rows(G):
 
 
 cdef CompressedRows symmetric_rows(M):
-    """Return a symmetric matrix, an array or in CSC format, as compressed rows."""
+    """Return a symmetric matrix M, dense or in CSC format, as compressed rows."""
     return (CompressedRows.of_transpose if issparse(M) else CompressedRows.of_array)(M)

@@ -2,18 +2,18 @@
 # cython: initializedcheck=False
 """Compiled part of SMALBE: preparation, MPRGP, outer loop, recovery of the solution.
 
-One loop, written in terms of a few operations, serves all problems. On one process the
-operations run without Python if P is a matrix or a compiled linear map
-(`mortarbench.harness.distributed.sparse`). Sums over ranks, rows shared by ranks, and
-all other operators and preconditioners call back into Python.
+A single loop, written in terms of a few operations, solves all problems. On one
+process, the operations run without Python if P is a matrix or a compiled linear map
+(`mortarbench.harness.distributed.sparse`). Sums over ranks, products with rows that
+ranks share, and all other operators and preconditioners call Python functions.
 
 * operations.pxi: sums over processes, products with F, products with orthonormal rows
 * coarse.pxi: sparse rows and the factor of GGᵀ
-* feasible_set.pxi: steps to the boundary of the set, projections, parts of the gradient
+* feasible_set.pxi: steps to the boundary of the set, projections, φ and β
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
-* incomplete.pxi: incomplete Cholesky factors of the free part of a sparse P
-* judge.pxi: KKT residuals of the original problem, from the gradient
+* incomplete.pxi: incomplete Cholesky factors of the free block of a sparse P
+* judge.pxi: KKT residuals of the original problem, computed from the gradient
 * mprgp.pxi: the inner loop
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
@@ -22,12 +22,13 @@ all other operators and preconditioners call back into Python.
 tests/support/textbook contains the same algorithm in NumPy. Tests check that both
 versions take equal numbers of steps and reach the same points up to rounding.
 
-P is dense (one triangle is read), sparse, or an operator called through Python. A sparse
-P with few nonzero diagonals, such as a difference or finite element matrix on a grid, is
-stored by diagonals: products process neighbouring rows at once, and read half of the
-entries because P is symmetric. A CG step then passes over memory twice: first for the
-direction, its product and the step lengths, then for the step and the new gradient. The
-free gradient is not stored. The loops over vectors are in `vectors.h`.
+P is dense (one triangle is read), sparse, or an operator called through Python. A
+sparse P with few nonzero diagonals, such as a difference or finite element matrix on a
+grid, is stored by diagonals. Products then process neighbouring rows at the same time,
+and read only half of the entries because P is symmetric. A CG step then passes over
+memory twice: once for the direction, its product and the step lengths, and once for the
+step and the new gradient. The free gradient is not stored. The loops over vectors are
+in `vectors.h`.
 """
 
 cimport cython
@@ -194,7 +195,7 @@ cdef extern from "incomplete.h" nogil:
                           const double *lower, const double *upper, double *s,
                           Py_ssize_t n)
     void scaled_matrix(const int *indptr, const int *indices, const double *data,
-                       const double *s, double *scaled, Py_ssize_t n, double *told)
+                       const double *s, double *scaled, Py_ssize_t n, double *row_sums)
 
 cdef extern from "discs.h" nogil:
     ctypedef struct discs:

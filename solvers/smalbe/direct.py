@@ -10,10 +10,10 @@ P. The following steps are repeated for k = 0, 1, …:
    exactly, by an active-set method (`solvers.smalbe.faces`).
 2. a ← a + ρC(x − x̃), x_{k+1} = x.
 
-This is the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with exact
-inner solves, that is, M = 0. If P is singular on a face, the proximal term makes
-P + ρCᵀC + δD positive definite. The proximal term is zero at the solution, where x =
-x_k.
+These steps are the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with
+exact inner solves, that is, M = 0. Even if P is singular on a face, P + ρCᵀC + δD is
+positive definite because of the proximal term. This term is zero at the solution, where
+x = x_k.
 """
 
 from __future__ import annotations
@@ -33,11 +33,12 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: largest number of unknowns; a face costs O(n³), so `smalbe` is faster already for
-#: fewer unknowns
+#: largest number of unknowns; because a face costs O(n³), `smalbe` is faster even for
+#: fewer unknowns than this
 MAX_UNKNOWNS = 2000
 INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
-MAX_RHO = 1e9  #: largest ρ/‖P‖; ρ is increased if ‖C(x − x̃)‖ decreases slowly
+#: largest ρ/‖P‖, up to which ρ is increased if ‖C(x − x̃)‖ decreases slowly
+MAX_RHO = 1e9
 DELTA = 1e-10  #: weight δ of the proximal term
 
 
@@ -54,13 +55,13 @@ class Direct:
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)",
         licence="BSD-3-Clause",
-        method="augmented Lagrangian with an exact active-set method inside",
+        method="augmented Lagrangian with an exact inner active-set method",
         linear_solver="dense Cholesky factor, updated when the active set changes",
-        phases="the preparation orthonormalises the equality rows and factorises the "
-        "block of unbounded variables; the solve iterates",
+        phases="orthonormalisation of the equality rows and factorisation of the block "
+        "of unbounded variables (preparing); iterations (solving)",
         limits=(
-            "QPs with inequality rows are declined; the dual forms of a problem do not "
-            "have such rows.",
+            "QPs with inequality rows are declined; dual forms have no inequality "
+            "rows.",
             f"QPs with more than {MAX_UNKNOWNS} unknowns are declined. If P is sparse, "
             "`smalbe` is faster for more than 100 to 200 unknowns.",
         ),
@@ -73,7 +74,7 @@ class Direct:
         if qp.h.size:
             return "accepts bounds and equality rows, but no inequality rows"
         if qp.q.size > MAX_UNKNOWNS:
-            return f"is for small problems; accepts at most {MAX_UNKNOWNS} unknowns"
+            return f"accepts at most {MAX_UNKNOWNS} unknowns"
         return needs_dense(qp, 3)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -107,9 +108,9 @@ class _Task:
     def point(self, *, fitted: bool) -> _Point:
         """Return the current x with its multipliers and a bound on its KKT residuals.
 
-        fitted : True to fit a to the gradient on the free components by least squares.
-            The rounding error of an a that is updated is ρ times the rounding error of
-            C(x − x̃), which may be too large.
+        fitted : True to fit the multipliers a to the gradient on the free components by
+            least squares. Without the fit, the rounding error of a is ρ times the
+            rounding error of C(x − x̃), which may be too large.
         """
         qp, faces, a = self.qp, self.faces, self.faces.a
         x, Px, z_box = faces.at(a)
@@ -124,7 +125,7 @@ class _Task:
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
-        """Return a point as a `Solution` with status SOLVED; the caller checks it."""
+        """Return a point as a `Solution` with status SOLVED, not yet checked."""
         return Solution(
             status=Status.SOLVED,
             x=x,
@@ -135,7 +136,7 @@ class _Task:
         )
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
-        """Return the a that minimises ‖(g + Cᵀa)_F‖ on the free components F."""
+        """Return the minimiser a of ‖(g + Cᵀa)_F‖ on the free components F."""
         C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
         missing = g[free] + C.T[free] @ a
         change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)
@@ -175,7 +176,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Multiply ρ by 100 if the factorisation succeeds; return the new largest ρ."""
+    """Multiply ρ by 100 if the matrix can still be factorised; return the largest ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)

@@ -1,23 +1,24 @@
-/* Loops over the discs ‖x_I + c_I‖ ≤ r of the feasible set of MPRGP; vectors.h has those
-   over bounds.
+/* Loops over the discs ‖x_I + c_I‖ ≤ r of the feasible set of MPRGP; vectors.h contains
+   the loops over bounds.
 
-   A disc is active if x is within `slack` of its boundary. Active discs are not part of
-   the face: the free gradient φ is zero there. With the outward normal n, the chopped
-   gradient β is the gradient g; if nᵀg < 0, the normal component, which presses x
-   against the boundary, is subtracted. On a disc of radius zero φ = β = 0.
+   A disc is active if the distance of x to its boundary is at most `slack`. Active
+   discs are not part of the face: the free gradient φ is zero for their variables. The
+   chopped gradient β on an active disc is the gradient g, but if nᵀg < 0 with the
+   outward normal n, the normal component of g is subtracted. On a disc of radius zero,
+   φ = β = 0.
 
-   Each loop is compiled for discs of 2, of 3 and of any number d of variables: with a
-   constant d, the variables of a disc stay in registers. Square roots are taken only on
-   the boundary. */
+   Each loop is compiled for discs with d = 2, with d = 3 and with any number d of
+   variables, because with a constant d the variables of a disc stay in registers.
+   Square roots are computed only on the boundary. */
 
 typedef struct {
     Py_ssize_t count, ranges;
-    int dim; /* variables of every disc; 0 if these differ */
-    const int *start; /* (count + 1,) of each disc in `index` */
-    const int *index; /* its variables */
+    int dim; /* number of variables of each disc; 0 if not constant */
+    const int *start; /* (count + 1,) first entry of each disc in `index` */
+    const int *index; /* variables of the discs */
     const double *radius;
-    const double *slack; /* rounding of ‖x_I + c_I‖ */
-    const double *centre; /* (n,) −c; NULL for zero */
+    const double *slack; /* rounding error of ‖x_I + c_I‖ */
+    const double *centre; /* (n,) c, NULL if c = 0; the centre is −c */
     const Py_ssize_t *range; /* (2 ranges,) first and last variable without a disc */
 } discs;
 
@@ -51,7 +52,7 @@ INLINE int is_inside(const discs *D, Py_ssize_t i, double square)
     return r > 0 && square < r * r;
 }
 
-/* Scale a disc of x by `factor` about its centre. */
+/* Scale the variables of a disc in x by `factor` about the centre of the disc. */
 INLINE void scale_disc(const discs *D, int d, Py_ssize_t i, double factor, double *x)
 {
     FOR_VARIABLES(D, i, d, j) {
@@ -60,7 +61,7 @@ INLINE void scale_disc(const discs *D, int d, Py_ssize_t i, double factor, doubl
     }
 }
 
-/* Return the factor about the centre that projects x − g·length on the disc, 1 inside. */
+/* Return the factor about the centre that projects x − g·length onto the disc. */
 INLINE double projected_factor(const discs *D, int d, Py_ssize_t i, const double *x,
                                const double *g, double length)
 {
@@ -72,7 +73,7 @@ INLINE double projected_factor(const discs *D, int d, Py_ssize_t i, const double
     return square > r * r ? r / sqrt(square) : 1;
 }
 
-/* Return nᵀg/‖x + c‖ if nᵀg < 0 on the boundary, else 0; `square` = ‖x + c‖². */
+/* Return nᵀg/‖x + c‖ for x on the boundary if nᵀg < 0, else 0; `square` = ‖x + c‖². */
 INLINE double held_share(const discs *D, int d, Py_ssize_t i, const double *x,
                          const double *g, double square)
 {
@@ -102,11 +103,11 @@ INLINE void face_of_disc(const discs *D, int d, Py_ssize_t i, const double *x,
         }
         return;
     }
-    int is_point = D->radius[i] == 0; /* ‖x + c‖ is rounding there */
+    int is_point = D->radius[i] == 0; /* ‖x + c‖ is a rounding error */
     double inward = is_point ? 0 : held_share(D, d, i, x, g, square);
     FOR_VARIABLES(D, i, d, j) {
         double b = is_point ? 0 : g[j] - inward * about_centre(D, x, j);
-        result[1] += b * b; /* the difference of squares would cancel */
+        result[1] += b * b; /* a difference of squares would suffer from cancellation */
         if (phi)
             phi[j] = 0, free[j] = 0;
     }
@@ -121,7 +122,7 @@ INLINE void project_each(const discs *D, int d, double *y)
     }
 }
 
-/* y = Π(y), the projection onto the discs. */
+/* y = Π(y) with the projection Π onto the discs. */
 static void project_discs(const discs *D, double *y)
 {
     WITH_DIMENSION(D, project_each, y);
@@ -141,7 +142,7 @@ INLINE double first_of_each(const discs *D, int d, const double *x, const double
             b += u * p[j];
             c += u * u;
         }
-        /* a α² − 2bα + c − r² ≤ 0 in the disc: convex, and true at α = 0 */
+        /* in the disc, a α² − 2bα + c − r² ≤ 0; this is convex, and true for α = 0 */
         if (least < INFINITY && (a * least - 2 * b) * least + c < r * r)
             continue;
         c = (sqrt(c) - r) * (sqrt(c) + r); /* without cancellation */
@@ -199,8 +200,8 @@ INLINE void advance_each(const discs *D, int d, double alpha, double *x, double 
         result[k] += sums[k];
 }
 
-/* x = x − αp, set to the boundary within rounding of it, g = g − αHp and the sums of
-   `advance`, on discs.
+/* On discs, compute x = x − αp, g = g − αHp and the sums of `advance`; x is moved to
+   the boundary if it is within rounding of the boundary.
 
    phi, free : NULL if not needed */
 static void advance_discs(const discs *D, double alpha, double *x, double *g,
@@ -244,7 +245,7 @@ INLINE void step_on_each(const discs *D, int d, const double *x, const double *g
     result[1] += square;
 }
 
-/* s = x − Π(x − g·length) on discs, zero on active ones if `free_only`; adds gᵀs and
+/* s = x − Π(x − g·length) on discs, zero on active discs if `free_only`; add gᵀs and
    ‖s‖² to result. */
 static void step_on_discs(const discs *D, const double *x, const double *g,
                           double length, int free_only, double *s, double *result)
@@ -255,7 +256,7 @@ static void step_on_discs(const discs *D, const double *x, const double *g,
         WITH_DIMENSION(D, step_on_each, x, g, length, 0, s, result);
 }
 
-/* free = 1 on discs whose x is off the boundary, else 0; return 1 if any entry changed. */
+/* free = 1 on discs with x off the boundary, else 0; return 1 if any entry changed. */
 static int mark_discs(const discs *D, const double *x, double *free)
 {
     int changed = 0;
@@ -269,10 +270,10 @@ static int mark_discs(const discs *D, const double *x, double *free)
     return changed;
 }
 
-/* w = T(w + κv) on discs against whose boundary -g presses x, where T removes the
-   component along the normal n, and κ = −nᵀg/‖x + c‖ is the multiplier of ½(‖x + c‖² −
-   r²) ≤ 0, which adds the curvature of the boundary to that of the cost. Zero on discs
-   of radius zero.
+/* w = T(w + κv) on discs with x on the boundary and nᵀg < 0. T removes the component
+   along the normal n. κ = −nᵀg/‖x + c‖ is the multiplier of ½(‖x + c‖² − r²) ≤ 0, which
+   adds the curvature of the boundary to the curvature of the cost. On discs of radius
+   zero, w = 0.
 
    v : NULL for zero */
 static void tangential_discs(const discs *D, const double *x, const double *g,
@@ -294,7 +295,8 @@ static void tangential_discs(const discs *D, const double *x, const double *g,
     }
 }
 
-/* Return Σ (norm gᵢ)²/Dᵢᵢ over the projected gradient on discs, see `inward_energy`. */
+/* Return Σ (norm gᵢ)²/Dᵢᵢ with the projected gradient g on discs; see
+   `inward_energy`. */
 static double inward_energy_of_discs(const discs *D, const double *x, const double *g,
                                      const double *diagonal, double norm, double noise)
 {

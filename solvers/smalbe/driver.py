@@ -46,23 +46,25 @@ STEPS = {
     "p": "proportioning",
     "n": "newton",
 }
-#: a point is reported as solved if its KKT residuals are at most this times tol
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
-#: Additional factors by which the tolerance is tightened if a residual exceeds it,
-#: because the residual decreases more slowly than the projected gradient ‖g^P‖. The
-#: first one suffices for four out of five bodies whose residual exceeds the tolerance.
+#: If a residual exceeds the tolerance, the tolerance of the outer loop is tightened by
+#: these additional factors, because the residual decreases more slowly than ‖g^P‖, the
+#: norm of the projected gradient. The first factor suffices for four of five bodies
+#: whose residual exceeds the tolerance.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
-#: rounding of ‖x_I‖, relative to the sum of the radius and ‖x̃_I‖; twice that of
-#: feasible_set.pxi. With 16 EPS times the radius,
+#: rounding of ‖x_I‖, relative to the sum of the radius and ‖x̃_I‖; twice the value in
+#: feasible_set.pxi. With 16 EPS times the radius alone,
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-MIN_LANCZOS_STEPS = 5  #: smallest limit of Lanczos steps, used for few unknowns
-#: default penalty ρ. The models contain ρQ exactly; hence a large ρ costs no products.
-#: With 1e4, two or three outer iterations suffice
+#: lower bound of the limit of Lanczos steps; applies to few unknowns
+MIN_LANCZOS_STEPS = 5
+#: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
+#: products. With 1e4, two or three outer iterations suffice
 RHO = 1e4
-#: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG;
-#: with the thousands of rows of decomposed bodies, fewer outer iterations save time
+#: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG,
+#: so fewer outer iterations save time for decomposed bodies with thousands of rows
 PRECONDITIONED_RHO = 1e6
 #: default penalty ρ with discs. Spectral steps do not use the model, and a larger ρ
 #: would worsen the conditioning of H
@@ -75,7 +77,7 @@ ELIMINATION_PRECONDITIONERS = ("model", "none")
 
 
 class Carry(NamedTuple):
-    """Data that one problem of a sequence passes to the next."""
+    """Data that a problem of a sequence passes to the next problem."""
 
     x: Vector  #: (n,)
     side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper bound, else 0
@@ -108,7 +110,7 @@ def prepared(
     """Prepare a run: eliminate free variables, project the QP, estimate the spectrum.
 
     in_sequence : True if later QPs reuse the results; a factor of the free block and an
-        accurate spectrum are then worth more time
+        accurate spectrum are then worth their additional cost
     """
     has_discs = len(qp.sets) > 1
     if has_discs:
@@ -168,7 +170,7 @@ def _eliminated(
     """Eliminate the free variables if one factor serves the whole sequence.
 
     If the free block changes between problems, as in Newton's method, a new factor for
-    each problem would cost more than it saves.
+    each problem would cost more time than it saves.
     """
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (
         kind == "incomplete" and options.preconditioner == "auto"
@@ -191,8 +193,8 @@ def _projected(
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and qp.q.any():
-        # q is closer to the first eigenvector than a random vector is, and does not
-        # depend on the number of ranks; without rows, no step depends on the norm
+        # q is closer to the first eigenvector than a random vector, and does not depend
+        # on the number of ranks; without rows, no step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
@@ -202,7 +204,7 @@ def _projected(
     norm, diagonal = problem.spectrum.norm, problem.diagonal
     if scaled is not None:
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, scaled.diagonal, norm
+            scaled.original, qp, scaled.root, scaled.diagonal, norm
         )
     elif (
         options.expansion == "model"
@@ -225,8 +227,8 @@ def _estimated_spectrum(
 
     The previous spectrum is reused if the Rayleigh quotient of the Lanczos start
     vector, which is the same for all problems, has changed by less than a factor of
-    two. This is permitted only with model steps, because they detect and correct a
-    wrong model.
+    two. The reuse is permitted only with model steps, because model steps detect and
+    correct a wrong model.
     """
     if options.norm == "power":
         return by_power(F, C)
@@ -243,14 +245,14 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     """Return the maximum number of Lanczos steps for this problem.
 
     For few unknowns, more steps would cost as much as CG. Few steps also suffice if P
-    provides a preconditioner, since the spectrum of decomposed bodies is flat and only
-    the norm is used. With bounds alone fewer steps are enough: for 73 to 85 unknowns,
-    where CG takes about ten products, the steps beyond seven or eight save no more
-    products than they cost. Seven steps for all sizes would save up to a fifth of the
-    products on dense duals with bounds alone, but would require up to 1.9 times as many
-    on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
-    which makes more steps worthwhile: with n/10 instead of n/6 steps, the 24 problems
-    of greco/n=32/dual-bounds take 170 products instead of 152.
+    provides a preconditioner, because the spectrum of decomposed bodies is flat and
+    only the norm is used. Without equality rows, fewer steps are enough: for 73 to 85
+    unknowns, CG takes about ten products, and steps beyond the seventh or eighth save
+    no more products than they cost. Seven steps for all sizes would save up to a fifth
+    of the products on dense duals with bounds only, but would require up to 1.9 times
+    as many products on dense matrices whose spectrum decays slowly. A sequence reuses
+    the spectrum, so that more steps are worthwhile: with n/10 instead of n/6 steps, the
+    24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0
@@ -262,10 +264,11 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 
 
 def _start(task: _Task, tol: float) -> Iterate:
-    """Return the start: zero, or the solution of the previous problem of a sequence.
+    """Return the starting point: zero, or the solution of the previous problem.
 
-    A component that was at a bound starts at the same bound, even if its value has
-    changed: slipping nodes usually continue to slip when the friction bound changes.
+    A component that was at a bound starts at the same bound, even if the value of this
+    bound has changed: slipping nodes usually continue to slip when the friction bound
+    changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
     x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
@@ -279,7 +282,7 @@ def _start(task: _Task, tol: float) -> Iterate:
 
 
 def _penalty(rho: float, tol: float) -> float:
-    """Return ρ, limited so that the rounding of ρQν in the gradient is below tol."""
+    """Return ρ, limited such that rounding of ρQν in the gradient is below tol."""
     return min(rho, max(1.0, tol / (10 * EPS)))
 
 
@@ -290,13 +293,13 @@ class OuterLoop:
     solver: compiled.SMALBE
     problem: Projected
     options: Options
-    #: k, right-hand side → observer of the steps of outer iteration k; None for none
+    #: k, right-hand side → observer of the steps of outer iteration k; None without one
     watch: Callable[[int, Vector], Note] | None
 
     def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
         """Return the first iterate: x, projected onto the set, and the multipliers μ.
 
-        This takes one product, or none for x = 0.
+        The call takes one product, or no product for x = 0.
         """
         return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
 
@@ -347,11 +350,11 @@ def outer_loop(
 def _solve_to_tolerance(
     task: _Task, tol: float
 ) -> tuple[Solution, Callable[[], Carry | None]]:
-    """Tighten the outer loop until the KKT residuals of the original QP are within tol.
+    """Tighten the outer loop until the KKT residuals of the original QP are ≤ tol.
 
-    Residuals of up to CLAIM_FACTOR·tol are accepted; if they exceed tol, the tolerance
-    of the outer loop is tightened once or twice more, and the best of these points is
-    returned.
+    Residuals of up to CLAIM_FACTOR·tol are accepted. If they exceed tol, the tolerance
+    of the outer loop is tightened once or twice more, and the point with the smallest
+    residual is returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
     if at is None or task.options.expansion != "model":
@@ -372,17 +375,18 @@ def _solve_to_tolerance(
 def _claimed(
     task: _Task, tol: float
 ) -> tuple[tuple[Solution, Callable[[], Carry | None]], float, Iterate | None, float]:
-    """Tighten the tolerance until the KKT residuals of the QP are within 5·tol.
+    """Tighten the tolerance until the KKT residuals of the QP are at most 5·tol.
 
-    Returns the result, the worst residual, the iterate to continue from (None if more
-    iterations are useless), and the final tolerance in units of `tol`.
+    The return values are the result, the worst residual, the iterate from which the
+    loop may continue (None if more iterations are useless), and the final tolerance in
+    units of `tol`.
     """
     options, at = task.options, _start(task, tol)
     tighter, best, waited = 1.0, np.inf, 0
     while True:
         at = task.loop.solve(tighter * tol, at)
         if at.status is Status.INFEASIBLE:
-            message = "no point within the bounds meets the equality rows"
+            message = "no point within the bounds satisfies the equality rows"
             nowhere = Solution.without_point(task.qp, at.status, message)
             return (nowhere, _nothing), np.inf, None, tighter
         if at.status is Status.FAILED:
@@ -412,14 +416,14 @@ def _claimed(
 
 
 def _with_exact_gradient(task: _Task, at: Iterate, rho: float) -> Iterate:
-    """Return the iterate with a recomputed gradient, which steps only update."""
+    """Return the iterate with a recomputed gradient, without errors of its updates."""
     x = task.problem.rows.x_tilde + at.nu
     fresh = task.loop.first(x, at.mu, M=at.M, rho=min(at.rho, rho))
     return fresh._replace(outer=at.outer)
 
 
 def _nothing() -> None:
-    """Return None in place of a `Carry`, after a failed run."""
+    """Return None instead of a `Carry` after a failed run."""
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:
@@ -469,8 +473,8 @@ def recovered(
     """Return x, the multipliers a of Cx = Cx̃, z_box and Fx; takes one product.
 
     For a = ‖𝒫F𝒫‖μ − C(Fx − d), the residual Fx − d + Cᵀa equals the gradient of the
-    projected problem, up to rounding and terms of the order of ‖Cν‖. A least-squares
-    correction of a on the free components, where the residual must vanish, removes
+    projected problem up to rounding and terms of the order of ‖Cν‖. On the free
+    components, where the residual must vanish, a least-squares correction of a removes
     these errors.
     """
     C = problem.rows.C
@@ -488,7 +492,7 @@ def recovered(
         free[one.index[active]] = False
     Fx = problem.F(x)
     r = Fx + qp.q
-    if not r.any():  # x is the unconstrained minimum
+    if not r.any():  # x is the unconstrained minimiser
         return x, np.zeros_like(at.mu), np.zeros_like(x), Fx
     a = problem.spectrum.norm * at.mu - C @ r
     a += problem.rows.fitted(free, r + C.T @ a)
@@ -505,7 +509,7 @@ def recovered(
 def _on_boundary(discs: Discs, x: Vector, shift: Vector) -> NDArray[np.bool_]:
     """Return a mask (k,) of the discs whose variables in x (n,) are on the boundary.
 
-    shift : x̃ (n,), whose rounding errors enter x
+    shift : x̃ (n,), whose rounding errors affect x
     """
     sizes, shifts = (np.linalg.norm(v[discs.index], axis=1) for v in (x, shift))
     rounding = DISC_ROUNDING * (discs.radius + shifts)
@@ -524,7 +528,7 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
-    """Return an upper bound of the worst KKT residual, exact if it exceeds `enough`."""
+    """Return an upper bound of the worst KKT residual; exact if above `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
         diagonal = task.scaled.diagonal
@@ -541,7 +545,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
-    """Return `point` with products for residuals included in the count of products."""
+    """Return `point` with a count that includes the products for residuals."""
     products = task.problem.F.count
     if products == point.counts["P_products"]:
         return point
@@ -556,9 +560,9 @@ COLUMNS = (
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
     "active",  # number of components at bounds
-    "two_sided",  # how many of these have two bounds; omitted if no component has two
+    "two_sided",  # number of active components with two bounds; omitted without any
     "cost",  # value of the augmented Lagrangian
-    "seconds",  # since the start of `prepare`
+    "seconds",  # time since the start of `prepare`
 )
 
 

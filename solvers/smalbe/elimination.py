@@ -1,4 +1,4 @@
-"""Elimination of the variables without bounds from a QP, and their recovery.
+"""Elimination of the variables without bounds from a QP, and recovery of their values.
 
 Let E be the variables without bounds and I the other variables. The stationarity
 conditions of E and the equality rows that involve E,
@@ -33,9 +33,9 @@ from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
 #: Thresholds for the singular values of the orthonormal rows restricted to E. Values of
-#: at most RANK_ZERO count as zero, and values of at least RANK_GOOD are accepted. With
-#: values in between, there is no elimination, because their reciprocals would enter the
-#: reduced matrix and cause rounding errors above the tolerance.
+#: at most RANK_ZERO count as zero, and values of at least RANK_GOOD are accepted. If a
+#: value is between these thresholds, nothing is eliminated, because the reciprocal of
+#: this value would cause rounding errors above the tolerance in the reduced matrix.
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
@@ -55,8 +55,8 @@ class Eliminated(NamedTuple):
     qp: QP  #: reduced QP, with a dense P
     recover: Callable[[Solution], Solution]
     G: Array  #: (m, n) equality rows of the original QP
-    block: FreeBlock  #: factor for later QPs with the same P_EE
-    columns: int  #: number of columns of P_EE factorised; 0 if a stored factor was used
+    block: FreeBlock  #: block with the factor, for later QPs with the same P_EE
+    columns: int  #: number of factorised columns of P_EE; 0 if a stored factor was used
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +89,8 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     """Eliminate the variables without bounds; return None if this is not possible.
 
     Elimination requires an explicit P with positive definite P_EE, variables with and
-    without bounds, no inequality rows, and consistent equality rows whose restrictions
-    to E are either zero or well conditioned.
+    without bounds, and consistent equality rows whose restrictions to E are either zero
+    or well conditioned. A QP with inequality rows is not reduced.
 
     previous : block of an earlier problem, used if P_EE has not changed
     """
@@ -147,7 +147,7 @@ def _factorised(P_EE: Array, previous: FreeBlock | None) -> FreeBlock | None:
 
 
 def _cholesky(M: Array) -> Array:
-    """Return R with M = RᵀR in the upper triangle; the lower triangle is arbitrary."""
+    """Return R with M = RᵀR in the upper triangle of an array."""
     factor, info = dpotrf(M.T, clean=False)
     if info:
         raise LinAlgError("not positive definite")
@@ -173,7 +173,7 @@ def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Ar
 
 
 def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Return a mask as a slice if its true components are consecutive."""
+    """Convert a mask to a slice if its true components are consecutive."""
     at = np.flatnonzero(chosen)
     whole = at.size and at[-1] - at[0] == at.size - 1
     return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen

@@ -2,12 +2,12 @@
 
 A subclass of `solvers.smalbe.solver.SMALBE` overrides `preconditioner_for`,
 `step_rule_for`, or both. Each method is called once while a QP is prepared. It returns
-a function for this QP, or None to keep the built-in choice. Fields of the subclass are
-options like the fields of SMALBE.
+a function for this QP, or None to keep the built-in choice. The fields of the subclass
+are options, like the fields of SMALBE.
 
-Neither function can cause SMALBE to claim a wrong solution. A preconditioner changes
-only the directions of conjugate gradients. The trial point of a step rule is projected
-onto the bounds, and it is accepted only if the cost decreases sufficiently
+These functions cannot cause SMALBE to claim a wrong solution. A preconditioner changes
+only the directions of conjugate gradients. SMALBE projects the trial point of a step
+rule onto the bounds and accepts it only if the cost decreases sufficiently
 (`StepRule`). In addition, the harness measures the KKT residuals of every claim.
 """
 
@@ -42,15 +42,15 @@ class Step(NamedTuple):
     alpha_bar: float  #: length ᾱ of a gradient projection step, 1.9/‖H‖ by default
 
 
-#: Function of a `Step` that returns a trial point (n,). The trial point is projected
-#: onto the bounds. It is accepted if the cost decreases by at least φ̃ᵀφ/(2‖H‖), the
+#: Function of a `Step` that returns a trial point (n,). MPRGP projects the trial point
+#: onto the bounds and accepts it if the cost decreases by at least φ̃ᵀφ/(2‖H‖), the
 #: decrease from which the convergence rate of MPRGP follows (Dostál and Schöberl 2005).
 #: Otherwise MPRGP takes its standard expansion step.
 StepRule: TypeAlias = Callable[[Step], Vector]
 
 
 def checked(M: Operator) -> Operator:
-    """Return M with a check that vᵀMv is positive for each vector v.
+    """Return M with a check of vᵀMv > 0 for each vector v to which M is applied.
 
     If vᵀMv < 0, conjugate gradients would increase the cost.
 

@@ -2,10 +2,10 @@
 # cython: initializedcheck=False
 """Exact minimisation of a proximal augmented Lagrangian over a box, by faces.
 
-`Faces` updates the Cholesky factor of the Hessian on the free components. A row is
-appended for a component that becomes free. The row of a component that reaches a bound
-is removed, and the factor is restored by Givens rotations or by factorising the rows
-below again (Golub and Van Loan, Matrix Computations, 4th ed., 6.5.4).
+The class `Faces` updates the Cholesky factor of the Hessian on the free components. A
+row is appended for a component that becomes free. If a component reaches a bound, its
+row is removed, and the rows below are restored by Givens rotations or by a new
+factorisation of these rows (Golub and Van Loan, Matrix Computations, 4th ed., 6.5.4).
 `solvers.smalbe.direct` uses this class.
 """
 
@@ -18,11 +18,13 @@ from scipy.linalg.cython_lapack cimport dpotrf
 import numpy as np
 
 cdef double ROUNDING = 8 * 2.0 ** -52  # rounding of a sum, relative to the absolute terms
-# initial `share` of `minimise`: components whose gradient is at least this fraction of the
-# largest one are released together
+# initial `share` of `minimise`: components whose gradient is at least this fraction of
+# the largest gradient are released together
 cdef double RELEASE_SHARE = 0.9
-cdef double FLAT = 1e-12  # diagonal entries below this times their mean count as zero
-cdef int GIVENS_COST = 6  # cost of removing a row by rotations, in factorised rows
+# diagonal entries below this factor times their mean count as zero
+cdef double FLAT = 1e-12
+# cost of removing a row by rotations, in units of a factorised row
+cdef int GIVENS_COST = 6
 
 
 def _whole(a):
@@ -32,12 +34,13 @@ def _whole(a):
 cdef class Faces:
     """½xᵀPx + qᵀx + aᵀCν + ρ/2 ‖Cν‖² + δ/2 ‖x − x_k‖²_D over l ≤ x ≤ u, ν = x − x̃.
 
-    P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, with its
-    mean in place of entries near zero. The multipliers a and the proximal centre x_k
-    are initially zero. L (k, k) is the factor of P + ρCᵀC + δD in the order in which
-    components became free. L is stored by rows, which LAPACK reads as the columns of
-    Lᵀ; the rows of `among` are the columns of C in the same order. A component whose
-    distance to a bound is within the rounding of qᵢ/Dᵢ is set to the bound.
+    P (n, n) is positive semidefinite, and C has the shape (r, n). D is the diagonal of
+    P, in which the mean entry replaces entries near zero. The multipliers a and the
+    proximal centre x_k are initially zero. L (k, k) is the factor of P + ρCᵀC + δD in
+    the order in which components became free. L is stored by rows, which LAPACK reads
+    as the columns of Lᵀ; the rows of `among` are the columns of C in the same order. A
+    component whose distance to a bound is within the rounding of qᵢ/Dᵢ is set to the
+    bound.
     """
 
     cdef Py_ssize_t n, k
@@ -95,7 +98,8 @@ cdef class Faces:
     def at(self, const double[::1] a):
         """Return x, Px and z_box (n,) for multipliers a.
 
-        z_box is −(Px + q + Cᵀa) on bounds where this has the admissible sign, else 0.
+        A component of z_box is the component of −(Px + q + Cᵀa) if x is at a bound and
+        this value has the admissible sign, otherwise 0.
         """
         cdef Py_ssize_t i, m, n = self.n
         cdef double total
@@ -204,7 +208,7 @@ cdef class Faces:
             row[r] = size
 
     cdef void solve(self):
-        """step ← (LLᵀ)⁻¹ step, for the first k components."""
+        """Replace the first k components of `step` by (LLᵀ)⁻¹ step."""
         cdef int n = self.n, k = self.k, one = 1
         self.solves += 1
         if k:
@@ -214,7 +218,7 @@ cdef class Faces:
     # the method
 
     cdef void gradient(self, const double[::1] x, double[::1] g):
-        """g ← gradient at x, `off` ← Cν; takes one product."""
+        """g ← gradient at x, `off` ← Cν; take one product."""
         cdef Py_ssize_t i, m, n = self.n
         cdef double weight
         for i in range(n):
@@ -259,17 +263,20 @@ cdef class Faces:
     def minimise(self, long most):
         """Minimise from x; return False after `most` solves with factors of faces.
 
-        1. x ← the minimum on its face, reduced until no component leaves the box.
-        2. If no component at a bound has a feasible descent direction, x is the minimum.
-        3. Release those whose gradient, divided by √Pᵢᵢ, is at least `share` times the
-           largest, and repeat 1. If the cost has decreased, go to 2. `share` is halved
-           if no component left the face, and reset to RELEASE_SHARE otherwise.
+        1. Set x to the minimiser on its face, where the face is reduced until no
+           component leaves the box.
+        2. If no component at a bound has a feasible descent direction, x is the
+           minimiser.
+        3. Release the components whose gradient, divided by √Pᵢᵢ, is at least `share`
+           times the largest such value, and repeat step 1. Halve `share` if no
+           component left the face, otherwise reset it to RELEASE_SHARE. If the cost has
+           decreased, go to 2.
         4. Otherwise release only the component with the largest gradient. Step to the
-           minimum on that face or to the first bound, fix the component that reached it,
-           and repeat; go to 2.
+           minimiser on the new face, or to the first bound; in the latter case, fix the
+           component that reached the bound, and repeat the step. Go to 2.
 
-        Steps 3 and 4 decrease the cost, and each ends at the minimum on a face. So no
-        face occurs twice, and the method is finite.
+        Steps 3 and 4 decrease the cost, and each of them ends at the minimiser on a
+        face. Therefore no face occurs twice, and the method is finite.
         """
         cdef long left
         self.share = RELEASE_SHARE
@@ -297,8 +304,8 @@ cdef class Faces:
         return False
 
     cdef int shrink(self, double[::1] x, double[::1] g) except -1:
-        """Minimise on the face of `wanted`, fixing components that leave the box, until
-        none does.
+        """Minimise on the face `wanted`; fix components that leave the box, and repeat
+        until no component does.
         """
         cdef Py_ssize_t i, j
         cdef bint leaves = True
@@ -319,7 +326,7 @@ cdef class Faces:
         return 0
 
     cdef int advance(self, double[::1] x, double[::1] g) except -1:
-        """Step to the minimum on the face of `wanted`, fixing components at bounds."""
+        """Step to the minimiser on the face `wanted`; fix components at bounds."""
         cdef Py_ssize_t i, j
         cdef double length = 0.0, s, bound
         while length < 1:
@@ -346,10 +353,10 @@ cdef class Faces:
     cdef bint release(self, double share):
         """Add the components to be released to `wanted`; return True if there are any.
 
-        Released are components at bounds with a feasible descent direction whose
-        gradient, divided by √Pᵢᵢ, is at least `share` times the largest such value. The
-        gradient must also exceed its rounding, for which Σ|Pᵢⱼxⱼ| is bounded by √Pᵢᵢ
-        Σ√Pⱼⱼ|xⱼ|.
+        A component at a bound is released if it has a feasible descent direction and if
+        its gradient, divided by √Pᵢᵢ, is at least `share` times the largest of these
+        quotients. The gradient must also exceed its rounding error, for which Σ|Pᵢⱼxⱼ|
+        is bounded by √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
         """
         cdef Py_ssize_t i, m
         cdef double most = 0.0, total = 0.0, inward, terms, force
@@ -376,7 +383,7 @@ cdef class Faces:
         return most > 0
 
     cdef bint lowered(self):
-        """Return True if the cost falls from x to y by more than rounding.
+        """Return True if the cost decreases from x to y by more than rounding errors.
 
         The change of a quadratic cost is ½(g_x + g_y)ᵀ(y − x).
         """

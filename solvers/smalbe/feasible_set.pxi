@@ -1,5 +1,5 @@
-# The feasible set and all operations on it that MPRGP uses; the loop itself does not
-# depend on the kind of set.
+# The feasible set and all its operations that MPRGP uses. The loop of MPRGP does not
+# depend on the type of the set.
 
 
 # Relative rounding of the distance from the centre of a disc, after sixteen operations.
@@ -9,17 +9,17 @@ cdef double DISC_ROUNDING = 16 * 2.0 ** -52
 
 cdef struct Line:
     double cg  # α that minimises the cost along x − αp; inf if pᵀHp ≤ 0
-    double feasible  # the largest feasible α; may be set to inf if it is not below cg
+    double feasible  # largest feasible α; may be inf if this α is not below `cg`
     double slope  # gᵀp
     double curvature  # pᵀHp
 
 
 cdef struct Parts:
-    double phi_square  # ‖φ‖², φ the free gradient: g off the boundary
-    # ‖β‖², β the chopped gradient: on the boundary, the part of g whose descent is
-    # feasible
+    double phi_square  # ‖φ‖²; φ, the free gradient, is g off the boundary
+    # ‖β‖²; β, the chopped gradient, is the part of g on the boundary for which −β is a
+    # feasible direction
     double beta_square
-    double reduced_square  # φ̃ᵀφ, φ̃ = φ reduced so that x − φ̃/τ stays feasible
+    double reduced_square  # φ̃ᵀφ; φ̃ is φ, reduced such that x − φ̃/τ is feasible
     double phi_Hp  # φᵀHp after a step along p
 
 
@@ -27,19 +27,19 @@ cdef struct Parts:
 cdef class FeasibleSet:
     """The box l ≤ x ≤ u, and discs over variables without bounds.
 
-    Vectors may be distributed over processes, with each disc on one of them. Each
-    operation passes over the vectors once and computes all sums that a step needs:
-    separate operations would read each vector several times per CG step. All variables
-    of a disc are free, or all are active (discs.h).
+    Vectors may be distributed over processes, but each disc belongs to one process.
+    Each operation passes over the vectors once and computes all sums that a step needs,
+    because separate operations would read each vector several times per CG step. Either
+    all variables of a disc are free, or all of them are active (discs.h).
     """
 
     cdef Py_ssize_t n
     cdef const double *lower
     cdef const double *upper
-    cdef const double *upper_if_any  # NULL where all are inf
+    cdef const double *upper_if_any  # NULL if all upper bounds are inf
     cdef Reduction over
-    cdef discs D  # of this process; its count may be zero
-    cdef bint has_discs  # on any process
+    cdef discs D  # discs of this process; the count may be zero
+    cdef bint has_discs  # true if any process has discs
     cdef object arrays  # keeps the memory that D points to
 
     @staticmethod
@@ -54,9 +54,9 @@ cdef class FeasibleSet:
         return new
 
     cdef int add_discs(self, sets, const double *shift) except -1:
-        """Add discs ‖x_I + shift_I‖ ≤ r; called by all processes, or by none.
+        """Add discs ‖x_I + shift_I‖ ≤ r; a collective call on all processes.
 
-        sets : `harness.sets.discs.Discs`, at least one, with the discs of this process
+        sets : at least one `harness.sets.discs.Discs`, with the discs of this process
         shift : (n,), NULL for zero
         """
         cdef const int[::1] start, index
@@ -143,7 +143,7 @@ cdef class FeasibleSet:
     ) noexcept:
         """p ← φ − γp, Hp ← s F p, and the `lengths` along p, in one pass over memory.
 
-        Not for sets with discs.
+        The set must not contain discs.
         """
         sparse_update_direction(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
@@ -171,8 +171,8 @@ cdef class FeasibleSet:
                      Parts *parts) except -1:
         """x ← x − αp, g ← g − αHp, and `split`.
 
-        Components within rounding of a bound are set to the bound: otherwise a step of
-        the largest feasible length could miss the face by rounding.
+        Components within rounding of a bound are set to the bound. Otherwise, rounding
+        could prevent a step of the largest feasible length from reaching the face.
 
         phi, free : NULL if they are not stored
         """
@@ -197,7 +197,7 @@ cdef class FeasibleSet:
         return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """beta ← β, the part of g on the boundary whose descent is feasible."""
+        """beta ← β, the part of g on the boundary with a feasible direction −β."""
         cdef Py_ssize_t i
         for i in range(self.n):
             beta[i] = 0.0
@@ -226,9 +226,9 @@ cdef class FeasibleSet:
     ) noexcept:
         """w ← T(w + κv), where T projects onto the tangents of the boundary at x.
 
-        Bounds that x attains stay active, and so do discs that −g presses against their
-        boundary. The multiplier κ of such a disc adds curvature to the cost along the
-        boundary (discs.h).
+        Bounds that x attains remain active. A disc also remains active if −g points
+        outwards from its boundary at x. The multiplier κ of this disc adds curvature to
+        the cost along the boundary (discs.h).
 
         v : NULL for zero
         """
@@ -261,7 +261,7 @@ cdef class FeasibleSet:
 
     cdef double step_back(self, const double *x, const double *g, double tau, double *s,
                           double *square) except? -1:
-        """s ← x − Π(x − g/τ), square ← ‖s‖²; returns gᵀs."""
+        """s ← x − Π(x − g/τ), square ← ‖s‖²; return gᵀs."""
         cdef double sums[2]
         cdef Py_ssize_t i, j, first, last
         sums[:] = [0.0, 0.0]
@@ -283,8 +283,8 @@ cdef class FeasibleSet:
                        double *piece) noexcept:
         """s ← argmin of gᵀs + τ/2‖s‖² over all s with x + s in the set.
 
-        piece : receives −1 at the lower bound, 1 at the upper bound, else 0; may be
-            NULL
+        piece : receives −1 for components at the lower bound, 1 at the upper bound,
+            else 0; may be NULL
         """
         model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
         if self.D.count:
@@ -304,9 +304,9 @@ cdef class FeasibleSet:
         """Step to the boundary, x ← x − αp; save the old state in x₀, g₀, `free`.
 
         face : receives the set for the next step, in which components on the boundary
-            are fixed unless `release`
+            are fixed unless `release` is true
         z, z_g : receive the point x − βp outside the set, with the new x, and the
-            gradient there
+            gradient at this point
         """
         leave_box(alpha, beta, release, x, g, p, Hp, self.lower, self.upper, x0, g0, free,
               <double *> face.lower, <double *> face.upper, z, z_g, self.n)
@@ -315,16 +315,16 @@ cdef class FeasibleSet:
         self, const double *z, const double *z_g, double tau, const double *x,
         const double *g, double *s
     ) except? -1:
-        """s ← z + r − x, where r is the result of `minimise` at z; returns gᵀs."""
+        """s ← z + r − x, where r is the result of `minimise` at z; return gᵀs."""
         return self.over.total(model_minimiser_within(
             z, z_g, tau, x, g, self.lower, self.upper, s, self.n
         ))
 
     cdef double within(self, const double *z, const double *x, const double *g,
                        bint release, double *s) except? -1:
-        """s ← z + s − x; within rounding of a bound, x + s is set to it; returns gᵀs.
+        """s ← z + s − x, with x + s set to a bound within rounding of it; return gᵀs.
 
-        s is zero on components that the set fixes, unless `release`.
+        s is zero for components that the set fixes, unless `release` is true.
         """
         return self.over.total(within(
             z, x, g, self.lower, self.upper, release, s, self.n

@@ -1,20 +1,21 @@
 /* Incomplete Cholesky factors of principal submatrices of a sparse symmetric matrix.
 
-   M = (I + L) D (I + L)' in an order of elimination, where the pattern of L is that of P.
-   Fill-in outside this pattern is dropped, and `keep` times each dropped entry is added to
-   the diagonal entries of its row and column, which preserves row sums for keep = 1
-   (Gustafsson 1978, modified incomplete Cholesky; Meijerink and van der Vorst 1977 for
-   keep = 0; survey: Benzi 2002).
+   M = (I + L) D (I + L)' in an order of elimination, where L has the pattern of P.
+   Fill-in outside this pattern is dropped, and `keep` times each dropped entry is added
+   to the diagonal entries of its row and column. For keep = 1, this preserves row sums
+   (modified incomplete Cholesky, Gustafsson 1978); keep = 0 is the method of Meijerink
+   and van der Vorst (1977). Benzi (2002) surveys these methods.
 
-   The order is 0, 1, ... up to `half`, then n - 1, n - 2, ... down to it (twisted
-   factorisation). Within each part, a column depends on the previous column, with the
-   latency of a division or several multiplications. The two parts are independent of
-   each other, except within the distance `reach` of the end of the second part. So
-   their columns are eliminated alternately, in the time of one part.
+   The order is 0, 1, ..., half - 1, then n - 1, n - 2, ..., half (twisted
+   factorisation). Within each of these two parts, a column depends on the previous
+   column, with the latency of a division or several multiplications. The two parts are
+   independent of each other, except within the distance `reach` of the end of the
+   second part. Their columns are therefore eliminated alternately, in the time that one
+   part takes.
 
-   Only free components are included. If P has few diagonals, L is also stored by
-   diagonals. Then only the entries next to the main diagonal form a recurrence, and the
-   others are subtracted for a few hundred rows at once. */
+   Only free components are included. If P has few diagonals, L is stored by
+   diagonals. Only the entries next to the main diagonal then form a recurrence, and
+   all other entries are subtracted for a few hundred rows at the same time. */
 
 #ifndef INCOMPLETE_H
 #define INCOMPLETE_H
@@ -24,14 +25,15 @@ enum {
 };
 
 typedef struct {
-    /* count: number of diagonals on one side; 0 if stored by columns */
+    /* count: number of diagonals on one side of the main diagonal; 0 if L is stored
+       by columns */
     Py_ssize_t n, half, reach, count;
     Py_ssize_t runs, first_of_second, first_of_tail;
     Py_ssize_t width;            /* stored length of a diagonal: n + reach */
     const int *start, *row;      /* (n + 1,), (nnz,) later rows of each column */
     const Py_ssize_t *pair;      /* (n,) the first pair of entries of each column */
     const int *target;           /* entry changed by each pair; -1 if it is dropped */
-    const double *below, *diagonal; /* the matrix, stored as L is */
+    const double *below, *diagonal; /* the matrix, stored like L */
     const double *scale;         /* (n,) S of the inverse S M^-1 S */
     const Py_ssize_t *offset;    /* (count,) offsets of the diagonals, ascending */
     const int *between;          /* diagonal whose offset is the difference of two, or -1 */
@@ -78,7 +80,7 @@ INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, doub
     int first = F->start[j], last = F->start[j + 1];
     Py_ssize_t t = F->pair[j];
     F->inverse[j] = inverse;
-    for (int k = first; k < last; k++) { /* all but the product with 1/p is known */
+    for (int k = first; k < last; k++) { /* L[k] is known, except the factor 1/p */
         double l = L[k], dropped = 0;
         for (int m = k + 1; m < last; m++, t++) {
             double fill = l * L[m];
@@ -96,8 +98,9 @@ INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, doub
     return (p > least * F->diagonal[j]) & (p < INFINITY);
 }
 
-/* Eliminate column j of a matrix stored by diagonals; their number `count` is a
-   compile-time constant. Entries that are not in the pattern of P are zero. */
+/* Eliminate column j of a matrix stored by diagonals. The number `count` of
+   diagonals is a compile-time constant. Entries that are not in the pattern of P are
+   zero. */
 INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t count,
                               double keep, double least)
 {
@@ -115,7 +118,7 @@ INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t coun
         for (Py_ssize_t d = c + 1; d < count; d++) {
             double fill = l[c] * l[d];
             int e = F->between[c * MAX_DIAGONALS + d];
-            /* the entry is in the column of the row that is eliminated first */
+            /* the entry is stored in the column of the row that is eliminated first */
             if (e >= 0) {
                 Py_ssize_t near = j + sign * F->offset[c], far = j + sign * F->offset[d];
                 Py_ssize_t column = sign > 0 && near >= half ? far : near;
@@ -176,7 +179,8 @@ factorise_incompletely(incomplete *F, in free, double keep, double shift, double
     const int *restrict start = F->start, *restrict row = F->row;
     Py_ssize_t n = F->width;
     memset(F->inverse, 0, F->n * sizeof(double));
-    memset(F->y, 0, F->n * sizeof(double)); /* stays zero where nothing is free */
+    memset(F->y, 0, F->n * sizeof(double)); /* stays zero for components that are not
+    free */
     memset(F->L, 0, (F->count ? F->count * n : start[F->n]) * sizeof(double));
     for (Py_ssize_t r = 0; r < F->runs; r++) {
         Py_ssize_t a = F->from[r], b = F->to[r], sign = a < F->half ? 1 : -1;
@@ -202,8 +206,8 @@ factorise_incompletely(incomplete *F, in free, double keep, double shift, double
     }
 }
 
-/* y = S v on a run [a, b), minus the products with earlier columns of L, except for the
-   recurrence with the entries next to the main diagonal. */
+/* y = S v on a run [a, b), minus the products with earlier columns of L. The
+   recurrence with the entries next to the main diagonal is not included. */
 INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v)
 {
     double *y = F->y;
@@ -214,7 +218,7 @@ INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v
     for (Py_ssize_t c = 0; c < F->count; c++) {
         Py_ssize_t o = F->offset[c], first, last;
         const double *band = F->bands + c * F->width;
-        if (second) { /* columns of the first part, then of the second */
+        if (second) { /* columns of the first part, then columns of the second part */
             last = b < F->half + o ? b : F->half + o;
             for (Py_ssize_t i = a; i < last; i++)
                 y[i] -= band[i - o] * y[i - o];
@@ -232,8 +236,8 @@ INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v
     }
 }
 
-/* Backward substitution on a run: y = D^-1 y, then the products with L', starting at the
-   last column. */
+/* Backward substitution on a run: y = D^-1 y, minus the products with L'. The
+   recurrence is not included. */
 INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
 {
     double *y = F->y;
@@ -256,22 +260,23 @@ INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
 #pragma GCC ivdep
             for (Py_ssize_t i = a; i < last; i++)
                 y[i] -= band[i] * y[i + o];
-        } else if (b == F->half && b < F->n) { /* the recurrence begins in the other part */
+        } else if (b == F->half && b < F->n) { /* the recurrence starts in the other
+        part */
             y[b - 1] -= band[b - 1] * y[b];
         }
     }
 }
 
-/* The recurrence y_i = y_i - l y_j with the previous row j on a run: start and
-   coefficients. */
+/* Start and coefficients of the recurrence y_i = y_i - l y_j on a run, where j is
+   the row before i. */
 typedef struct {
     Py_ssize_t at, left, step;
     const double *l;
     double last;
 } recurrence;
 
-/* The forward sweep ascends in the first part and descends in the second; the backward
-   sweep is reversed. */
+/* The forward sweep ascends in the first part and descends in the second part. The
+   backward sweep descends in the first part and ascends in the second part. */
 INLINE recurrence
 begin_recurrence(const incomplete *F, Py_ssize_t a, Py_ssize_t b, int backward)
 {
@@ -290,7 +295,7 @@ INLINE void go_on(recurrence *c, double *y, Py_ssize_t size)
     Py_ssize_t i = c->at, step = c->step;
     double last = c->last;
     const double *l = c->l;
-    /* a previous row may not exist: its entry is not read if the coefficient is zero */
+    /* without a previous row, `last` is zero, and the coefficient is not read */
     if (size) {
         last = y[i] - (last != 0 ? l[i] * last : 0);
         y[i] = last;
@@ -312,7 +317,7 @@ INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
     Py_ssize_t i = c->at, j = d->at, up = c->step, down = d->step;
     double first = c->last, second = d->last;
     const double *l = c->l, *m = d->l;
-    if (size) { /* there may be no previous rows */
+    if (size) { /* there may be no previous row */
         go_on(c, y, 1);
         go_on(d, y, 1);
         i = c->at, j = d->at, first = c->last, second = d->last;
@@ -329,7 +334,7 @@ INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
     go_on(d, y, d->left);
 }
 
-/* z = S M^-1 S v by diagonals. */
+/* y = M^-1 S v with L stored by diagonals. */
 INLINE void solve_by_bands(const incomplete *F, in v)
 {
     int chained = F->offset[0] == 1;
@@ -389,7 +394,7 @@ INLINE void forward_column(const incomplete *F, Py_ssize_t j, in v)
     double *y = F->y, done = y[j] + F->scale[j] * v[j];
     y[j] = done;
     for (int k = F->start[j]; k < F->start[j + 1]; k++)
-        y[F->row[k]] -= F->L[k] * done; /* L is zero where a row is not free */
+        y[F->row[k]] -= F->L[k] * done; /* L is zero in rows that are not free */
 }
 
 INLINE void backward_column(const incomplete *F, Py_ssize_t j)
@@ -400,8 +405,8 @@ INLINE void backward_column(const incomplete *F, Py_ssize_t j)
     y[j] = rest;
 }
 
-/* z = S M^-1 S v for v that is zero off the free set; returns the dot product of z and
-   `along`. */
+/* z = S M^-1 S v for a v that is zero off the free set; return the dot product of z
+   and `along`. */
 TWICE static double solve_incompletely(const incomplete *F, in v, in along, out z)
 {
     double *y = F->y, sum = 0;
@@ -433,7 +438,7 @@ TWICE static double solve_incompletely(const incomplete *F, in v, in along, out 
     return sum;
 }
 
-/* s = P(x - z) - x with the projection P onto lower <= x <= upper; returns g's. */
+/* s = P(x - z) - x with the projection P onto lower <= x <= upper; return g's. */
 TWICE static double
 projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
 {
@@ -453,7 +458,7 @@ projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
    to the diagonal entry. */
 TWICE static void
 scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
-              Py_ssize_t n, out told)
+              Py_ssize_t n, out row_sums)
 {
     double norm = 0, least = INFINITY, least_scaled = INFINITY;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -470,9 +475,9 @@ scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
         least = least < sum ? least : sum;
         least_scaled = least_scaled < sum_scaled ? least_scaled : sum_scaled;
     }
-    told[0] = norm;
-    told[1] = least;
-    told[2] = least_scaled;
+    row_sums[0] = norm;
+    row_sums[1] = least;
+    row_sums[2] = least_scaled;
 }
 
 #endif

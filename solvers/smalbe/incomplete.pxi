@@ -3,27 +3,28 @@
 
 # Fraction of each dropped entry that is added to the diagonal. With 1, a few pivots are
 # small and CG is slow on irregular faces: torsion with n = 50 takes 45 products instead
-# of 32. With 0, journal bearings take twice as many.
+# of 32. With 0, journal bearings take twice as many products.
 cdef double KEEP = 0.95
 
-# Smallest pivot, relative to the diagonal entry. The relative rounding of entries is
-# 2⁻⁵², so that larger pivots have six correct digits.
+# Smallest pivot, relative to the diagonal entry. The relative rounding error of entries
+# is 2⁻⁵², so larger pivots have at least six correct digits.
 cdef double LEAST_PIVOT = 1e-10
 
-# First relative shift of the diagonal if a pivot is too small although no dropped
-# entries are added to the diagonal, and growth of the shift until no pivot is too small
-# (Manteuffel 1980). The pivots of a diagonally dominant matrix are large enough.
+# If a pivot is too small although no dropped entries are added to the diagonal, the
+# diagonal is shifted (Manteuffel 1980). The first relative shift is FIRST_SHIFT, and it
+# is multiplied by SHIFT_GROWTH until no pivot is too small. The pivots of a diagonally
+# dominant matrix are large enough.
 cdef double FIRST_SHIFT = 1e-3
 cdef double SHIFT_GROWTH = 4.0
 
 cdef enum:
-    # Smallest distance of a diagonal from the main diagonal for which eliminating a run
-    # of columns at once is faster than eliminating column by column.
+    # Smallest distance of a diagonal from the main diagonal for which it is faster to
+    # eliminate a run of columns at the same time than column by column.
     LEAST_OFFSET = 8
 
 
 cdef inline bint is_later(Py_ssize_t i, Py_ssize_t j, Py_ssize_t half) noexcept nogil:
-    """Return True if i follows j in the order 0, …, half − 1, n − 1, …, half."""
+    """Return True if i comes after j in the order 0, …, half − 1, n − 1, …, half."""
     return i > j if j < half else half <= i < j
 
 
@@ -38,10 +39,10 @@ def sparsity(matrix):
     """
     cdef Py_ssize_t i, k, n = matrix.shape[0], below, away = 0, others = 0
     cdef double pairs = 0.0, least = INFINITY, most = 0.0, diagonal
-    cdef list held = [_integers(matrix.indptr), _integers(matrix.indices)]
-    cdef const int *indptr = <const int *> cnp.PyArray_DATA(held[0])
-    cdef const int *indices = <const int *> cnp.PyArray_DATA(held[1])
-    cdef const double *data = read(matrix.data, held)
+    cdef list owners = [_integers(matrix.indptr), _integers(matrix.indices)]
+    cdef const int *indptr = <const int *> cnp.PyArray_DATA(owners[0])
+    cdef const int *indices = <const int *> cnp.PyArray_DATA(owners[1])
+    cdef const double *data = read(matrix.data, owners)
     for i in range(n):
         below, diagonal = 0, 0.0
         for k in range(indptr[i], indptr[i + 1]):
@@ -58,40 +59,39 @@ def sparsity(matrix):
 
 
 def scaled_by_diagonal(matrix, scale):
-    """Return the entries of SPS, and bounds from its row sums.
+    """Return the entries of SPS, and row sums that bound eigenvalues.
 
-    The bounds are the largest row sum of absolute values of SPS, and the smallest row
-    sums of P and of SPS relative to their diagonals, where S² is the inverse diagonal
-    of P.
+    The row sums are the largest row sum of absolute values of SPS, and the smallest row
+    sums of P and of SPS relative to their diagonals. S² is the inverse diagonal of P.
 
     matrix : P in SciPy's csr format; scale : S (n,)
     """
-    cdef list held = []
+    cdef list owners = []
     cdef int[::1] indptr = _integers(matrix.indptr), indices = _integers(matrix.indices)
-    cdef double told[3]
+    cdef double row_sums[3]
     entries = np.empty(len(matrix.data))
-    scaled_matrix(&indptr[0], &indices[0], read(matrix.data, held), read(scale, held),
-                  address(entries), len(scale), told)
-    return entries, told[0], told[1], told[2]
+    scaled_matrix(&indptr[0], &indices[0], read(matrix.data, owners), read(scale, owners),
+                  address(entries), len(scale), row_sums)
+    return entries, row_sums[0], row_sums[1], row_sums[2]
 
 
 @cython.final
 cdef class IncompleteFactor:
-    """M ≈ P_FF on the free set F, by an incomplete Cholesky factorisation.
+    """Incomplete Cholesky factorisation M ≈ P_FF on the free set F.
 
-    The sparsity pattern of L is that of P. Dropped entries, multiplied by `keep`, which
-    is KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson,
-    BIT 18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002,
-    418-477). On a tridiagonal matrix nothing is dropped, and M = P_FF. If a pivot is
-    below LEAST_PIVOT times the diagonal entry, `keep` is set to 0, and if that does not
-    suffice, the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math.
-    Comp. 34, 1980, 473-497). Hence M is finite and positive definite for every
-    symmetric P with a positive diagonal. Both `keep` and σ are retained for all later
+    L has the sparsity pattern of P. Dropped entries, multiplied by `keep`, which is
+    KEEP or 0, are added to the diagonal (modified incomplete Cholesky, Gustafsson, BIT
+    18, 1978, 142-156; see also Benzi's survey, J. Comput. Phys. 182, 2002, 418-477).
+    For a tridiagonal matrix, no entry is dropped, and M = P_FF. If a pivot is below
+    LEAST_PIVOT times the diagonal entry, `keep` is set to 0. If this is not sufficient,
+    the diagonal is multiplied by 1 + σ with increasing σ (Manteuffel, Math. Comp. 34,
+    1980, 473-497). M is therefore finite and positive definite for every symmetric P
+    with a positive diagonal. The final values of `keep` and σ are used for all later
     faces.
 
-    The matrix that is factorised is WPW with a positive diagonal W; with `keep` = 1 its
-    row sums would be preserved. Therefore the vector of weights should be one that P
-    maps to zero in the interior of a domain.
+    The factorised matrix is WPW with a positive diagonal W. With `keep` = 1, its row
+    sums would be preserved. Therefore P should map the vector of weights to zero in the
+    interior of a domain.
 
     matrix : P in SciPy's csr or csc format, with sorted indices
     weights : (n,) diagonal of W
@@ -103,15 +103,16 @@ cdef class IncompleteFactor:
     cdef Py_ssize_t n, most
     cdef const int *indptr
     cdef const int *indices
-    cdef list held
+    cdef list owners
     cdef Room room
     cdef Room values
     cdef int *integers
     cdef Py_ssize_t *first_pairs
-    cdef double *face  # (n,) 1 where a component is free in the present factor
+    # (n,) 1 for components that are free in the present factor, else 0
+    cdef double *face
     cdef double *wanted  # (n,) mask of a trial face
     cdef int *queue  # (n,)
-    cdef int *besides  # (idle,) components in the present factor that are not free
+    cdef int *besides  # (idle,) components of the present factor that are not free
     cdef Py_ssize_t idle
     cdef bint is_ready
     cdef readonly double keep, shift
@@ -123,12 +124,12 @@ cdef class IncompleteFactor:
         cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
         cdef int first, last
         cdef bint by_bands
-        self.n, self.held, self.keep = n, [], KEEP if keep else 0.0
+        self.n, self.owners, self.keep = n, [], KEEP if keep else 0.0
         cdef int[::1] indptr = _integers(matrix.indptr)
         cdef int[::1] indices = _integers(matrix.indices)
         self.indptr, self.indices = &indptr[0], &indices[0]
-        cdef const double *data = read(matrix.data, self.held)
-        cdef const double *w = read(weights, self.held)
+        cdef const double *data = read(matrix.data, self.owners)
+        cdef const double *w = read(weights, self.owners)
         # 1. The order of elimination, and the distances of entries from the diagonal.
         for i in range(n):
             for k in range(indptr[i], indptr[i + 1]):
@@ -139,13 +140,13 @@ cdef class IncompleteFactor:
                     m += 1
                 if far and m == count:
                     if count == MAX_DIAGONALS:
-                        count = n + 1  # too many
+                        count = n + 1  # too many diagonals diagonals
                     else:
                         offset[count] = far
                         count += 1
         half = n // 2 if n >= 4 * reach and n > 1 else n
-        # 2. The numbers of entries in later rows, and of pairs of them, over all
-        #    columns.
+        # 2. The total number of entries in later rows, and of pairs of these entries,
+        # over all columns.
         for i in range(n):
             used = 0
             for k in range(indptr[i], indptr[i + 1]):
@@ -200,8 +201,8 @@ cdef class IncompleteFactor:
                         entries += 1
                     below[m] = data[k] * w[i] * w[indices[k]]
             start[i + 1] = <int> entries
-        # 5. The entry that couples two later rows of a column, if it exists: it is
-        #    stored in the column of the row that is eliminated first.
+        # 5. The entry that couples two later rows of a column, if it exists. This entry
+        # is stored in the column of the row that is eliminated first.
         for m in range(count):
             for k in range(count):
                 between[m * MAX_DIAGONALS + k] = -1
@@ -223,12 +224,12 @@ cdef class IncompleteFactor:
                     if first < last and row[first] == other:
                         target[pairs] = first
                     pairs += 1
-        self.held += [indptr, indices, at_offset]
+        self.owners += [indptr, indices, at_offset]
         self.F.n, self.F.half, self.F.reach, self.F.count = n, half, reach, count
         self.F.width, self.F.offset, self.F.between = n + reach, &at_offset[0], between
         self.F.start, self.F.row, self.F.target = start, row, target
         self.F.pair, self.F.below, self.F.diagonal = self.first_pairs, below, diagonal
-        self.F.scale = read(scale, self.held)
+        self.F.scale = read(scale, self.owners)
         self.F.L = self.F.bands = self.room.at
         self.F.pivot = self.F.L + stored
         self.F.inverse = self.F.pivot + n + reach
@@ -240,11 +241,11 @@ cdef class IncompleteFactor:
         release_memory(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
-        """Factorise on the face whose free components have `free` (n,) = 1.
+        """Factorise on the face with the mask `free` (n,) of free components.
 
-        The present factor M̃ is reused if it belongs to this face or, with
-        `may_exceed`, to a larger free set. M⁻¹ is then the block of M̃⁻¹ on the face,
-        which is positive definite.
+        The present factor M̃ is reused if it belongs to this face. With `may_exceed`,
+        it is also reused if it belongs to a larger free set; M⁻¹ is then the block of
+        M̃⁻¹ on the face, which is positive definite.
         """
         cdef Py_ssize_t i
         cdef bint inside = self.is_ready
@@ -275,7 +276,7 @@ cdef class IncompleteFactor:
     cdef double inverse(
         self, const double *v, const double *along, double *z
     ) noexcept:
-        """z ← S M⁻¹ S v for a v that is zero off the face; returns zᵀ`along`."""
+        """z ← S M⁻¹ S v for a v that is zero off the face; return zᵀ`along`."""
         cdef Py_ssize_t i
         cdef double sum_ = solve_incompletely(&self.F, v, along, z)
         self.solves += 1
@@ -302,7 +303,7 @@ cdef class IncompleteFactor:
         return count
 
     def solve(self, free, v):
-        """Return S M⁻¹ S v (n,) on the face of the true `free` (n,), zero elsewhere."""
+        """Return S M⁻¹ S v (n,) on the face with the mask `free` (n,), else zero."""
         result, face = np.empty(self.n), np.asarray(free, dtype=float)
         masked_v = _whole(np.where(free, v, 0.0))
         self.enter(address(face))
@@ -311,5 +312,5 @@ cdef class IncompleteFactor:
 
 
 cdef _integers(a):
-    """Return an array of C ints; [0] for an empty array, to have an address."""
+    """Return an array of C ints; [0] for an empty array, which has no address."""
     return np.ascontiguousarray(a if len(a) else [0], dtype=np.int32)

@@ -7,19 +7,19 @@ import numpy as np
 from mortarbench.harness import Vector
 from mortarbench.solvers.smalbe.rows import Rows
 
-#: value that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof applies only
-#: to points within these bounds
+#: finite value that replaces infinite bounds, relative to ‖x̃‖ + ‖ν‖; the proof applies
+#: only to points within these finite bounds
 SEARCH_RADIUS = 1e6
 #: rounding of a sum of products, relative to the size of the terms
 PRODUCT_ROUNDING = 1e-12
 
 
 def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
-    """Return True if ν proves that no point of the box satisfies Cν' = 0.
+    """Return True if ν proves that no point ν' of the box satisfies Cν' = 0.
 
-    With r = CᵀCν, every ν' with Cν' = 0 satisfies rᵀν' = 0. So no such ν' exists in the
-    box if the minimum of rᵀν' over the box is positive (Farkas' lemma). Infinite bounds
-    are replaced by finite ones (`SEARCH_RADIUS`).
+    With r = CᵀCν, every ν' with Cν' = 0 satisfies rᵀν' = 0. If the minimum of rᵀν' over
+    the box is positive, the box therefore contains no ν' with Cν' = 0 (Farkas' lemma).
+    Infinite bounds are replaced by finite bounds (`SEARCH_RADIUS`).
     """
     lower, upper = bounds
     Cnu = rows.C @ nu

@@ -1,18 +1,18 @@
-# KKT residuals of a QP with bounds only, computed without a product from the gradient
-# of the scaled and normalised problem that MPRGP solves.
+# KKT residuals of a QP with bounds only. They are computed without a product, from the
+# gradient of the scaled and normalised problem that MPRGP solves.
 
 
 @cython.final
 cdef class Judge:
     """Upper bound of the worst KKT residual of a QP at a point of its normalised form.
 
-    With the scale d of the variables, x = y/d componentwise (exactly at a bound if y
-    is), and the gradient g of the normalised form satisfies Px + q = ‖H‖ d g. From
-    these, the bound is computed as in `residual_bound`.
+    With the scale d of the variables, x = y/d componentwise (exactly at a bound if y is
+    at a bound), and the gradient g of the normalised form satisfies Px + q = ‖H‖ d g.
+    The bound of the residual is computed from x and Px as in `residual_bound`.
 
     qp : the original QP
     scaled : the QP in y = d x
-    root : d (n,); None if all are 1
+    root : d (n,); None if all components are 1
     diagonal : (n,) diagonal of the original P
     norm : ‖H‖, by which the scaled QP is divided
     """
@@ -32,19 +32,19 @@ cdef class Judge:
     cdef double *size
     cdef double *z
     cdef Room room
-    cdef list held
+    cdef list owners
 
     def __init__(self, qp, scaled, root, diagonal, double norm):
         cdef Py_ssize_t n = len(diagonal)
-        self.n, self.norm, self.held = n, norm, []
+        self.n, self.norm, self.owners = n, norm, []
         box, scaled_box = qp.sets[0], scaled.sets[0]
-        self.q, self.lb = read(qp.q, self.held), read(box.lower, self.held)
-        self.ub = read(box.upper, self.held)
+        self.q, self.lb = read(qp.q, self.owners), read(box.lower, self.owners)
+        self.ub = read(box.upper, self.owners)
         if root is not None:
-            self.root = read(root, self.held)
-        self.low = read(scaled_box.lower, self.held)
-        self.high = read(scaled_box.upper, self.held)
-        self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
+            self.root = read(root, self.owners)
+        self.low = read(scaled_box.lower, self.owners)
+        self.high = read(scaled_box.upper, self.owners)
+        self.diagonal, self.room = read(diagonal, self.owners), Room(5 * n)
         self.x = self.room.at
         self.Px, self.forces = self.x + n, self.x + 2 * n
         self.size, self.z = self.x + 3 * n, self.x + 4 * n

@@ -1,11 +1,11 @@
-# Quadratic model of H, which is minimised over the set without products with H.
+# Quadratic model of H. The model is minimised over the set without products with H.
 
 
 cdef enum:
-    # Limits of Newton's method and of its line search. The search keeps 5 % away from
-    # the ends of its interval, so that 60 steps shrink it to 5 % at most. If Newton's
-    # method does not end, the step is taken with the model norm·I of the largest
-    # eigenvalue. Without the search
+    # Limits of Newton's method and of its line search. The search keeps a distance of
+    # 5 % from the ends of its interval, so that 60 steps reduce the interval to at most
+    # 5 %. If Newton's method does not end, the step is computed with the model norm·I,
+    # where norm is the largest eigenvalue. Without the line search,
     # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
@@ -16,12 +16,12 @@ cdef class Model:
     """B = τI + Uᵀ diag(w) U, where U (k, n) are the first rows of an orthonormal basis.
 
     The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
-    bounds H on their complement. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the
-    minimiser of the right side over the set is a gradient projection step in the metric
-    of B. Without U this is the ordinary step x ← Π(x − g/τ), whose length is determined
-    by ‖H‖; with U, the length is determined by the rest of the spectrum. The product
-    that each step takes anyway tests whether B ≥ H along the step; if not, τ is
-    increased.
+    bounds H on the complement of these directions. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs
+    + ½sᵀBs, and the minimiser of the right-hand side over the set is a gradient
+    projection step in the metric of B. Without U, this step is the ordinary step x ←
+    Π(x − g/τ), whose length is determined by ‖H‖. With U, the remaining spectrum
+    determines the length. Each step takes a product with H, which shows whether B ≥ H
+    along the step; if not, τ is increased.
     """
 
     cdef double tau
@@ -39,7 +39,7 @@ cdef class Model:
         return B
 
     cdef Model with_tail(self, double tau):
-        """Return a model with a new τ and the same w + τ, where these exceed it."""
+        """Return a model with a new τ and unchanged w + τ; drop rows with w ≤ 0."""
         if self.basis is None:
             return Model.of_norm(tau, self.n)
         return self.basis.model(self.k, self.w, self.tau - tau, tau)
@@ -47,10 +47,11 @@ cdef class Model:
     cdef int step(self, const double *x, const double *g, FeasibleSet box, double *s) except -1:
         """s ← argmin of gᵀs + ½sᵀBs over all s with x + s in the set.
 
-        With the multiplier y = WUs, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
-        and y maximises the dual function, which is concave, piecewise quadratic and has
-        the gradient Us(y) − W⁻¹y in k variables. Newton's method with a line search
-        ends on the quadratic piece that contains the maximum.
+        For a multiplier y, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set. The
+        solution has the multiplier y = WUs, which maximises the dual function. This
+        function of k variables is concave and piecewise quadratic, with the gradient
+        Us(y) − W⁻¹y. Newton's method with a line search ends on the quadratic piece
+        that contains the maximum.
         """
         cdef Basis U = self.basis
         cdef Py_ssize_t i, newton, search, k = self.k
@@ -96,7 +97,7 @@ cdef class Model:
         return Model.of_norm(self.tau + U.largest(self), self.n).step(x, g, box, s)
 
     cdef Model raised(self, const double *s, double square, double sHs):
-        """Return the model with τ increased, at most tenfold, until sᵀBs ≥ sᵀHs.
+        """Return the model with τ increased until sᵀBs ≥ sᵀHs, but at most tenfold.
 
         w + τ is unchanged.
 
@@ -128,12 +129,12 @@ cdef class Model:
 cdef class Basis:
     """Orthonormal rows U (k, n) of models, and the workspace for their multipliers.
 
-    `slope`, `piece` and `y` belong to the iterate of Newton's method, the variables
-    with the suffix `_there` to the trial point.
+    `slope`, `piece` and `y` belong to the iterate of Newton's method. Variables with
+    the suffix `_there` belong to the trial point.
     """
 
     cdef Py_ssize_t n, k
-    cdef Py_ssize_t places  # number of components that can be on a bound
+    cdef Py_ssize_t places  # number of components that can be at a bound
     cdef Reduction over  # processes that share vectors (n,)
     cdef Reduction over_dual  # processes that share multipliers (k,)
     cdef Room dual
@@ -156,7 +157,7 @@ cdef class Basis:
         return 0
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        """Return a model of those of the first k rows with a weight w + shift > 0."""
+        """Return a model of the rows i < k with a weight w[i] + shift > 0."""
         raise NotImplementedError
 
     cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
@@ -203,8 +204,8 @@ cdef class Basis:
 cdef class DenseBasis(Basis):
     """Rows U (k, n) as an array, with U_F U_Fᵀ for the components F of the last face.
 
-    Bounds occur only in the range of `size` components from `first` on; all others are
-    free in every face.
+    Only the `size` components from index `first` on can have bounds. All other
+    components are free on every face.
     """
 
     cdef Py_ssize_t stride, first, size, flips
@@ -212,9 +213,9 @@ cdef class DenseBasis(Basis):
     cdef Room room
     cdef int *where  # (size + 3,)
     cdef double *U
-    cdef double *bounded  # (k, size) columns of U in that range
-    cdef double *columns  # the same, stored by columns (size, stride)
-    cdef double *others  # U_f U_fᵀ of the components outside of it; rows as in `gram`
+    cdef double *bounded  # (k, size) columns of U for these components
+    cdef double *columns  # `bounded`, stored by columns (size, stride)
+    cdef double *others  # U_f U_fᵀ of all other components f, stored like `gram`
     cdef double *gram  # (k, k) upper triangle
     cdef double *active
     cdef double *core  # τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², factorised
@@ -248,7 +249,7 @@ cdef class DenseBasis(Basis):
         return new
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        # omitted rows are usually the last ones; then the basis itself is used
+        # omitted rows are usually the last rows; the basis is then used without a copy
         cdef Model B = Model.__new__(Model)
         cdef Py_ssize_t i, kept = 0, last = -1, n = self.n
         cdef DenseBasis chosen = self
@@ -274,7 +275,7 @@ cdef class DenseBasis(Basis):
         return B
 
     cdef void split(self) noexcept:
-        """Copy the columns of components that may have bounds; only once."""
+        """Copy columns of components that may have bounds, unless already copied."""
         cdef Py_ssize_t i, j, stride = self.stride
         if self.is_split:
             return
@@ -295,7 +296,7 @@ cdef class DenseBasis(Basis):
                 self.others[i * stride + j] = self.others[j * stride + i]
 
     cdef void change(self, Py_ssize_t count, double *gram) noexcept:
-        """Subtract from gram the now active components in `where`; add the others."""
+        """Subtract the components in `where` that became active; add all others."""
         cdef Py_ssize_t c, q
         cdef double sign[4]
         for c in range(0, count, 4):
@@ -310,9 +311,10 @@ cdef class DenseBasis(Basis):
     cdef void face(self, const double *piece) noexcept:
         """Update `gram` for the face on which `piece` (size,) is zero.
 
-        Since the rows are orthonormal, gram is I minus the sum over active components.
-        To limit rounding errors, gram is summed anew after as many changes as there are
-        components, over the active or the free components, whichever are fewer.
+        Because the rows are orthonormal, gram is I minus the sum over active
+        components. To limit rounding errors, gram is recomputed after as many changes
+        as there are components. The sum is then taken over the active or the free
+        components, whichever are fewer.
         """
         cdef Py_ssize_t i, count, stride = self.stride
         cdef bint sums_active
@@ -336,7 +338,7 @@ cdef class DenseBasis(Basis):
     cdef int factor(self, Model B, const double *piece) except -1:
         """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², F: components with `piece` zero.
 
-        This form is bounded below by τI, however large W is.
+        This matrix is bounded below by τI for every W.
         """
         self.face(piece)
         scaled(B.root, self.gram, B.tau, self.core, B.k, self.stride)
@@ -377,8 +379,8 @@ cdef class DenseBasis(Basis):
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` is their part of
-        # −Ug/τ
+        # for components without bounds, s = −(g + Uᵀy)/τ; `fixed` is the contribution
+        # of these components to −Ug/τ
         cdef Py_ssize_t i
         rows_times(self.bounded, s + self.first, self.slope_there, B.k, self.size)
         for i in range(B.k):
@@ -435,18 +437,18 @@ cdef class DenseBasis(Basis):
 
 @cython.final
 cdef class FactoredBasis(Basis):
-    """Rows C = L⁻¹G with a sparse G, with a common weight w, that of the penalty.
+    """Rows C = L⁻¹G with a sparse G and with the weight w of the penalty.
 
-    B = τI + w Gᵀ(GGᵀ)⁻¹G with multipliers y = w(GGᵀ)⁻¹Gs; the gradient of the dual
-    function is Gs(y) − GGᵀy/w. Components without bounds have s = −(g + Gᵀy)/τ, so that
-    for each y only the components b with bounds are evaluated:
+    B = τI + w Gᵀ(GGᵀ)⁻¹G with multipliers y = w(GGᵀ)⁻¹Gs. The gradient of the dual
+    function is Gs(y) − GGᵀy/w. Components without bounds have s = −(g + Gᵀy)/τ. For
+    each y, only the components b with bounds are therefore evaluated:
 
         Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
     """
 
     cdef Rows rows
     cdef Coarse coarse
-    cdef object factor  # of the face
+    cdef object factor  # factor for the face
     cdef Room room
     cdef double *x_b  # (places,)
     cdef double *g_b

@@ -1,39 +1,41 @@
-# MPRGP, independent of the kind of feasible set and of the distribution over processes.
+# MPRGP, independent of the type of the feasible set and of the distribution over
+# processes.
 
 
-# Rounding of a cost, relative to the sum of its absolute terms: the error of a sum of k
-# terms grows like √k·2⁻⁵³, so that this covers 8·10⁵ terms. With zero,
+# Rounding of a cost, relative to the sum of its absolute terms. The error of a sum of k
+# terms grows like √k·2⁻⁵³, so this value suffices for 8·10⁵ terms. With zero,
 # `test_a_solve_that_rounding_stops_ends` takes 4000 products instead of 1000.
 cdef double NOISE = 1e-13
 
-# Smallest accepted ratio of gᵀp to φᵀz, where the CG direction p is the part of the
-# preconditioned gradient z that is conjugate to the earlier directions. In exact
-# arithmetic both products are equal, because g is orthogonal to all earlier directions.
-# A smaller ratio shows that rounding has reintroduced components of g along these
-# directions. Without it `test_rounding_along_directions_that_were_taken_is_taken_out`
-# fails.
+# Smallest accepted ratio of gᵀp to φᵀz, where the CG direction p is the component of
+# the preconditioned gradient z that is conjugate to the earlier directions. In exact
+# arithmetic, both products are equal, because g is orthogonal to all earlier
+# directions. A smaller ratio shows that rounding has reintroduced components of g along
+# these directions. Without this limit,
+# `test_rounding_along_directions_that_were_taken_is_taken_out` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
 
 cdef enum:
-    # Limit of CG directions stored for a face: two passes over them read 400 vectors,
-    # as much as a product with the triangle of a dense F of 800 unknowns. With 3
-    # directions
+    # Largest number of CG directions stored for a face. Two passes over 200 directions
+    # read 400 vectors, as many numbers as a product with the triangle of a dense F of
+    # 800 unknowns. With 3 directions,
     # `test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns` fails.
     MAX_DIRECTIONS = 200
-    # Number of consecutive proportionings by the model that may fail to halve ‖β‖²
-    # before a step along −β is taken. Without a limit
+    # Number of consecutive proportioning steps by the model that may fail to halve ‖β‖²
+    # before a step along −β is taken. Without this limit,
     # `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
     MAX_IDLE = 2
-    # Steps before the first check for stagnation, ten times what a preconditioned dual
-    # takes. Without it `test_a_solve_that_rounding_stops_ends` fails.
+    # Number of steps before the first check for stagnation, ten times the number of
+    # steps for a preconditioned dual. Without the check,
+    # `test_a_solve_that_rounding_stops_ends` fails.
     FIRST_CHECK = 500
     # Number of CG steps on a face before a factor of a larger free set is replaced by a
-    # factor of this face. A factor costs as much as two or three steps; with 2, as with
-    # a new factor for every face, journal bearings and torsion with n = 100 to 300 take
-    # up to a quarter more time.
+    # factor of this face. A factor costs as much as two or three steps. With 2, and
+    # also with a new factor for every face, journal bearings and torsion with n = 100
+    # to 300 take up to a quarter more time.
     SETTLED = 5
-    # Smallest limit of CG steps beyond the boundary if CG uses a factor, with which few
-    # steps suffice to predict the next face: with 1, torsion with n = 300 takes 293
+    # Smallest limit of CG steps beyond the boundary if CG uses a factor; with a factor,
+    # few steps suffice to predict the next face. With 1, torsion with n = 300 takes 293
     # products instead of 186, and a journal bearing with n = 600 takes 318 instead of
     # 274.
     BEYOND = 8
@@ -44,40 +46,42 @@ cdef enum:
     OWN = 4
     SPECTRAL = 5
     # Number of previous costs with which the nonmonotone line search compares. In a
-    # prototype, Mindlin's problem with 88 to 1468 discs takes equally many products
-    # with 10 or 40, 2 % more with 5 and 35 % more with 1 (a monotone search); with 10
-    # 428 discs, 12 % more with 10.
+    # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
+    # and with 40, 2 % more with 5, and 35 % more with 1 (a monotone search). With
+    # 10 428 discs, it takes 12 % more products with 10.
     MEMORY = 20
     # Number of steps on an unchanged face before a Newton step. On contact patches with
     # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
     # by up to a half.
     SETTLED_FACE = 3
-    # Number of steps before the first Newton step, about the number of products that a
-    # Newton step takes on these patches. With 10, Mindlin's problem with 1468 discs
-    # takes up to 40 % more products.
-    # On n unknowns it is √n if that is larger: Mindlin's problem, ν = 0.3, then takes
-    # 61, 154 and 246 products with 1468, 41 684 and 166 740 discs. With Newton steps
-    # after 100, it took 61, 217 and 444 products, and five times the memory.
+    # Number of steps before the first Newton step, about the number of products of a
+    # Newton step on these patches. With 10, Mindlin's problem with 1468 discs takes up
+    # to 40 % more products.
+    # With n unknowns, the number is √n if this is larger than 100. Mindlin's problem,
+    # ν = 0.3, then takes 61, 154 and 246 products with 1468, 41 684 and 166 740 discs.
+    # With 100 steps in all three cases, it took 61, 217 and 444 products, and five
+    # times the memory.
     FIRST_NEWTON = 100
-    # Number of bits of the length of a spectral step. These steps amplify a change of
-    # their lengths to another sequence of steps; with rounded lengths, sums in another
-    # order (on another number of ranks) yield the same lengths, unless they are within
-    # rounding of the middle between two such numbers.
+    # Number of bits of the length of a spectral step. A small change of a length leads
+    # to another sequence of spectral steps. If lengths are rounded, sums in another
+    # order (on another number of ranks) yield the same lengths, unless a length is
+    # within rounding of the middle between two numbers with this number of bits.
     LENGTH_BITS = 8
 
 
 # Fraction of the linear decrease that a spectral step must achieve (Armijo condition).
 cdef double SUFFICIENT_DECREASE = 1e-4
-# If the step to the boundary is longer than this fraction of the CG step, it is the
-# whole expansion. With 1, which means that a spectral step always follows, Mindlin's
+# If the step to the boundary is longer than this fraction of the CG step, the expansion
+# consists of this step alone. With 1, a spectral step always follows, and Mindlin's
 # problem with 88 discs takes up to 11 % more products.
 cdef double LONG_STEP = 0.5
 
 
-# Relative difference of the lengths at which two components or discs count as reaching
-# the boundary at once: a step to the boundary is longer by this, and both end on it. In
-# symmetric problems, such as greco/dim=3, the lengths of mirror images differ by rounding
-# (3e-14), and which of them is shorter depends on the number of ranks.
+# Two components or discs count as reaching the boundary at the same time if their step
+# lengths differ by at most this fraction. A step to the boundary is longer by this
+# fraction, so that both reach the boundary. In symmetric problems, such as greco/dim=3,
+# the lengths of mirror images differ by rounding (3e-14), and the number of ranks
+# determines which of the two lengths is shorter.
 cdef double TIE = 2.0 ** -42
 
 
@@ -85,14 +89,15 @@ cdef double TIE = 2.0 ** -42
 # patches take up to 1.7 times as many products.
 cdef double NEWTON_ACCURACY = 0.01
 
-# Smallest penalty, with discs, of the model in a structural preconditioner. Its inverse
-# has to be nearly the projector onto the kernel of the rows; with the ρ = 1 of discs it
-# would be the identity. With 1 the subdomains of contact-patch/dim=3 with ratio=100 and
-# distort=0.25 take 7692 products instead of 575; values from 1e2 to 1e6 are alike.
+# Smallest penalty of the model in a structural preconditioner if there are discs. The
+# inverse of this model must be nearly the projector onto the kernel of the rows; with ρ
+# = 1, the default with discs, it would be the identity. With 1, contact-patch/dim=3 in
+# subdomains with ratio=100 and distort=0.25 takes 7692 products instead of 575. Values
+# from 1e2 to 1e6 lead to similar numbers of products.
 cdef double MIN_PROJECTING = 1e4
 
-# Factor of Γ² for spectral steps, which decrease both φ and β. Over Mindlin's problem
-# with 60 to 1468 discs 0.01 and 1 take 5 % more products on average.
+# Factor of Γ² for spectral steps, which decrease both φ and β. With 0.01 and with 1,
+# Mindlin's problem with 60 to 1468 discs takes 5 % more products on average.
 cdef double SPECTRAL_GAMMA = 0.1
 
 EXPANSIONS = {
@@ -101,7 +106,7 @@ EXPANSIONS = {
 
 
 cdef double rounded(double length) noexcept:
-    """Return a positive length, rounded to LENGTH_BITS bits."""
+    """Return a positive length rounded to LENGTH_BITS bits."""
     cdef int exponent
     cdef double fraction = frexp(length, &exponent)
     return ldexp(rint(ldexp(fraction, LENGTH_BITS)), exponent - LENGTH_BITS)
@@ -112,25 +117,25 @@ cdef double change_along(const Line *line, double alpha) noexcept:
     return -alpha * line.slope + 0.5 * alpha**2 * line.curvature
 
 
-cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
+cdef double *enlarged(double *array, Py_ssize_t size) except NULL:
     """Reallocate an array to `size` numbers, preserving its contents."""
-    held = <double *> realloc(held, max(size, 1) * sizeof(double))
-    if not held:
+    array = <double *> realloc(array, max(size, 1) * sizeof(double))
+    if not array:
         raise MemoryError
-    return held
+    return array
 
 
 @cython.final
 cdef class Directions:
     """The latest conjugate directions of CG on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
 
-    In exact arithmetic, conjugacy to the last direction implies conjugacy to all k.
-    This property is lost by rounding after a few dozen steps, and immediately if the
-    right-hand side changes on the same face (in a multiplier step). Explicit
-    conjugation to all directions costs two passes over k vectors per step (Farhat,
-    Crivelli and Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, 195-209).
+    In exact arithmetic, conjugacy to the last direction implies conjugacy to all k
+    directions. Rounding destroys this property after a few dozen steps. A change of the
+    right-hand side on the same face (in a multiplier step) destroys it immediately.
+    Explicit conjugation to all directions costs two passes over k vectors per step
+    (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, 195-209).
 
-    free : the face, 1 where a component is off the boundary (n,)
+    free : (n,) mask of the face, 1 for components off the boundary, else 0
     """
 
     cdef Py_ssize_t n, count, most, oldest, room
@@ -153,7 +158,7 @@ cdef class Directions:
         release_memory(self.share)
 
     cdef void begin(self, const double *free) noexcept:
-        """Discard all directions; later ones belong to the face `free`."""
+        """Discard all directions; new directions belong to the face `free`."""
         self.count = self.oldest = 0
         if self.n and self.most:
             memcpy(self.free, free, self.n * sizeof(double))
@@ -163,7 +168,7 @@ cdef class Directions:
         return not self.over.any(not same(self.free, free, self.n))
 
     cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
-        """Add p with curvature = pᵀHp; replaces the oldest direction if all are in use."""
+        """Store p with curvature = pᵀHp; replaces the oldest direction if full."""
         cdef Py_ssize_t at = self.count
         if not self.most:
             return 0
@@ -179,7 +184,7 @@ cdef class Directions:
         return 0
 
     cdef double conjugate(self, const double *phi, double *p) except? -1:
-        """Make p conjugate to all directions; return φᵀp of the old p, 0 without any."""
+        """Make p conjugate to all directions; return φᵀp of the old p, else 0."""
         if not self.count:
             return 0.0
         rows_times(self.Hp, p, self.share, self.count, self.n)
@@ -202,50 +207,52 @@ cdef class Directions:
 cdef class MPRGP:
     """Modified proportioning with reduced gradient projections.
 
-    Minimises ½xᵀHx − bᵀx over a set (Dostál 2009, the paper's reference [3], Chapter 5;
-    Dostál and Schöberl 2005), with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. With the gradient g = Hx − b,
-    the free gradient φ (g where x is off the boundary), the chopped gradient β (the
-    part of g on the boundary whose descent direction is feasible) and the projected
-    gradient g^P = φ + β, each step is one of the following:
+    The method minimises ½xᵀHx − bᵀx over a set (Dostál 2009, the paper's reference [3],
+    Chapter 5; Dostál and Schöberl 2005), with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. Let g = Hx − b be the
+    gradient. The free gradient φ equals g for components off the boundary. The chopped
+    gradient β is the part of g on the boundary for which −β is a feasible direction.
+    The projected gradient is g^P = φ + β. Each step is one of the following:
 
-    * c, conjugate gradient: minimise along p on the face, if the step is feasible; p is
-      made conjugate to all `Directions` taken on the face, not only to the last one
-    * b, beyond: conjugate gradients on the face without its bounds, to prepare an
-      expansion
-    * e, expansion of the active set, by one of the expansions of
+    * c, conjugate gradient: minimise along p on the face if the step is feasible; p is
+      conjugate to all `Directions` of the face, not only to the last one
+    * b, beyond: take a CG step on the face without its bounds, to prepare an expansion
+    * e, expansion: expand the active set by one of the rules of
       `solvers.smalbe.options`
-    * f, fallback: the safe expansion, after an expansion with too small a decrease
+    * f, fallback: take a safe expansion step after an expansion with too small a
+      decrease
     * p, proportioning: release components, by the model, along −β or by a spectral step
-    * n, Newton: minimise on the tangents of discs, see below
+    * n, Newton: minimise on the tangents of discs, as described below
 
     A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient
     φ̃, defined by x − φ̃/τ = Π(x − φ/τ) with the projection Π onto the set.
 
-    A *spectral step* is x ← x + t(Π(x − αg) − x) with the length α = sᵀs/sᵀHs of
-    Barzilai and Borwein for the last step s, and with the nonmonotone line search of
-    Birgin, Martínez and Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2). On discs,
-    whose boundary is curved, the number of steps of a fixed length would be
-    proportional to the condition number of H. CG is not suited to varying directions of
-    slip: it begins on a face only if a step of length α along −φ stays in the set.
+    A *spectral step* is x ← x + t(Π(x − αg) − x). Its length α = sᵀs/sᵀHs is the
+    Barzilai-Borwein length for the last step s, and t is determined by the nonmonotone
+    line search of Birgin, Martínez and Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2).
+    Because the boundary of a disc is curved, the number of steps of a fixed length
+    would be proportional to the condition number of H. CG is not suitable while
+    directions of slip change. CG therefore begins on a face only if a step of length α
+    along −φ stays in the set.
 
-    The number of spectral steps also grows in proportion to the condition number. On a
-    face that no longer changes, *Newton steps* (n) replace them: x ← Π(x − d), where CG
-    solves T(H + κ)Td = Tg with the projector T onto the tangents of the boundary and
-    the product κ of its curvature and the multiplier. Newton steps are taken only if
-    the cost decreases.
+    The number of spectral steps is also proportional to the condition number. On a face
+    that no longer changes, *Newton steps* (n) replace spectral steps: x ← Π(x − d),
+    where CG solves T(H + κ)Td = Tg. T is the projector onto the tangents of the
+    boundary, and κ is the product of the curvature of the boundary and the multiplier.
+    A Newton step is taken only if the cost decreases.
 
-    Every step except spectral steps and those of projcg decreases the cost, with the
-    model τI by at least the amount on which the rate of convergence in the book is
-    based. Except for the first expansion by a model with directions, an expansion does
-    not release components that its half step put on the boundary: between proportioning
-    steps the active set only grows. docs/smalbe-theory.md draws conclusions from this.
+    Every step decreases the cost, except spectral steps and projcg steps. With the
+    model τI, the decrease is at least the amount on which the rate of convergence in
+    the book is based. An expansion does not release components that its half step moved
+    to the boundary, except the first expansion by a model with directions. Between
+    proportioning steps, the active set therefore only grows. docs/smalbe-theory.md
+    discusses the consequences.
     """
 
     cdef Product F
     cdef Py_ssize_t n
     cdef Rows rows
     cdef FeasibleSet set
-    cdef FeasibleSet face_set  # set of the step that follows a half step
+    cdef FeasibleSet face_set  # feasible set of the step that follows a half step
     cdef Reduction over
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
@@ -278,23 +285,26 @@ cdef class MPRGP:
     cdef double z_Hp
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
-    cdef Model B  # of H; ᾱ = 1/τ is the length of gradient projection steps
-    cdef Model preconditioner  # inverted on the face; None without preconditioning
+    cdef Model B  # model of H; ᾱ = 1/τ is the length of gradient projection steps
+    # model inverted on the face; None without preconditioning
+    cdef Model preconditioner
     cdef object M  # product v → Mv with a structural preconditioner, or None
-    cdef LinearMap M_map  # the same, if it is compiled; else None
-    cdef double M_scale  # ‖𝒫F𝒫‖: M approximates F⁻¹, not H⁻¹
+    cdef LinearMap M_map  # M as a compiled linear map, or None
+    cdef double M_scale  # ‖𝒫F𝒫‖, because M approximates F⁻¹ rather than H⁻¹
     cdef object counts  # counts of applications of M
-    cdef object step_rule  # of a subclass (`solvers.smalbe.extension`), or None
-    cdef IncompleteFactor factor  # of the free block of a sparse P, or None
+    # step rule of a subclass (`solvers.smalbe.extension`), or None
+    cdef object step_rule
+    cdef IncompleteFactor factor  # factor of the free block of a sparse P, or None
     cdef long layers  # number of layers of neighbours released by `step_by_factor`
     cdef Directions directions
-    cdef Directions tangents  # of CG for a Newton step
-    cdef double *marked  # 1 off the boundary, else 0, at the last spectral step
-    cdef long settled  # number of steps since then on an unchanged face
+    cdef Directions tangents  # directions of CG for a Newton step
+    # (n,) 1 off the boundary, else 0, at the last check of the face
+    cdef double *marked
+    cdef long settled  # number of steps on an unchanged face since that check
     cdef long patience  # number of steps before the next Newton step
     cdef double spectral_length  # α of the last step; 0 before the first one
-    cdef double cost_now  # relative to the cost at the start of the run
-    cdef double costs[MEMORY]  # the last ones
+    cdef double cost_now  # cost relative to the cost at the start of the run
+    cdef double costs[MEMORY]  # last values of `cost_now`
     cdef long n_costs
 
     cdef int make_room(self) except -1:
@@ -318,31 +328,32 @@ cdef class MPRGP:
     # the algorithm
 
     cdef bint minimise(self, long most, bytearray trace, note) except -1:
-        """Run MPRGP from x and g; return True if it ended by `stops`.
+        """Run MPRGP from x and g; return True if `stops` ended the run.
 
-        Otherwise `most` steps were taken, no step was possible, or the run *stagnated*:
-        since the previous check, the smallest ‖g^P‖ was not halved and the cost
-        decreased by no more than the rounding of its terms. The first check is after
-        `FIRST_CHECK` steps, each further one after twice as many.
+        The run returns False after `most` steps, if no step is possible, or if it
+        *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
+        cost decreased by no more than the rounding of its terms. The first check is
+        made after `FIRST_CHECK` steps, and each further check after twice as many
+        steps.
 
         trace : receives the letters of the steps
-        note : called with letter, x and g after each step; or None
+        note : function called with the letter, x and g after each step, or None
         """
-        cdef long idle = 0, inside = 0  # CG steps in this face
+        cdef long idle = 0, inside = 0  # number of CG steps on this face
         cdef long check = FIRST_CHECK
         cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at the last check
         cdef int letter
         cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
-        cdef double weight, began, gamma = 0.0  # of the deferred update p ← φ − γp
+        cdef double weight, began, gamma = 0.0  # γ of the deferred update p ← φ − γp
         self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
             not self.is_preconditioned()
         ) and not self.set.has_discs and self.expansion != SPECTRAL
         self.cost_now, self.n_costs = 0.0, 0
         self.settled = 0
         self.record_cost(0.0)
-        # 1. The face of x, the minimum along the stored directions on it, and the first
-        #    direction of conjugate gradients.
+        # 1. The face of x, the minimiser along the stored directions on this face, and
+        # the first direction of conjugate gradients.
         self.split()
         self.minimise_along_directions()
         began, self.phi_square_at_drift = self.parts.phi_square, INFINITY
@@ -371,8 +382,8 @@ cdef class MPRGP:
                 continue
             weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
             if self.parts.beta_square > self.Gamma_square * weight:
-                # 3. Proportioning: releasing components promises more decrease than the
-                #    face.
+                # 3. Proportioning, because releasing components promises a larger
+                # decrease than a step on the face.
                 idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
                 chopped = self.parts.beta_square
                 letter = self.proportion(
@@ -382,8 +393,8 @@ cdef class MPRGP:
             elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:
-                # 4. The trial step of conjugate gradients: α_cg, and α_f, the largest
-                #    feasible length.
+                # 4. The trial step of conjugate gradients, with α_cg and the largest
+                # feasible length α_f.
                 if self.in_two:
                     self.lengths_of_next(gamma)
                 else:
@@ -407,8 +418,8 @@ cdef class MPRGP:
                 has_expanded = True
             if not letter:
                 return 0
-            # 7. Restart CG on the new face with the preconditioned free gradient; after
-            #    a spectral step, only if CG begins on this face.
+            # 7. Restart CG on the new face with the preconditioned free gradient. After
+            # a spectral step, restart only if CG begins on this face.
             inside, began, gamma = 0, self.parts.phi_square, 0.0
             self.phi_square_at_drift = INFINITY
             begun = self.expansion != SPECTRAL
@@ -418,7 +429,7 @@ cdef class MPRGP:
             self.record_step(letter, trace, note)
 
     cdef int settle(self) except -1:
-        """Restart CG with a factor of this face if the present one has more components."""
+        """Restart CG with a factor of this face if the factor has more components."""
         if self.factor.idle:
             self.factor.enter(self.free)
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
@@ -465,7 +476,7 @@ cdef class MPRGP:
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
         if self.in_two:
-            # φ is added later, together with the product
+            # φ is added later, in the pass that computes the product
             memset(self.p, 0, self.n * sizeof(double))
             return 0
         if self.factor is not None:
@@ -476,12 +487,13 @@ cdef class MPRGP:
         return 0
 
     cdef const double *preconditioned_gradient(self) except NULL:
-        """Return z, φ preconditioned on the face; stores the local part of zᵀHp.
+        """Return z, the preconditioned φ on the face; store the local part of zᵀHp.
 
-        With P = B_FF⁻¹ of the model alone, z = Pφ; with an M that approximates F⁻¹
-        without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`). With
-        discs, whose ρ is small, P is that of the penalty MIN_PROJECTING, and the
-        remainder, on which ρQ dominates H, is added: (φ − Pφ)/ρ.
+        With P = B_FF⁻¹ of the model alone, z = Pφ. With a matrix M that approximates
+        F⁻¹ without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
+        With discs, ρ is small, and P belongs to the penalty MIN_PROJECTING instead.
+        Then (φ − Pφ)/ρ is added for the complement of the range of P, where ρQ
+        dominates H.
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *rest = self.t
@@ -518,7 +530,7 @@ cdef class MPRGP:
     cdef int proportion(self, bint by_model) except -1:
         """Take a step that releases components; return its letter, or 0 without a step.
 
-        The step ends at the opposite boundary at the latest.
+        The step does not go beyond the opposite boundary.
         """
         cdef double *beta = self.s
         cdef double length
@@ -539,12 +551,13 @@ cdef class MPRGP:
     cdef int step_by_model(self) except -1:
         """Minimise the model over the set, then the cost along that step.
 
-        Returns 0 if the step is zero or the cost is unbounded along it. If B ≥ H the
-        minimising length is at least 1. If the product shows that B ≥ H is violated, τ
-        is increased; the line search decreases the cost in either case.
+        The function returns 0 if the step is zero or the cost is unbounded along the
+        step. If B ≥ H, the minimising length is at least 1. If the product shows that B
+        ≥ H is violated, τ is increased. The line search decreases the cost in both
+        cases.
         """
         cdef double length
-        if self.set.has_discs:  # any other length would leave curved boundaries
+        if self.set.has_discs:  # any other length would leave a curved boundary
             length = self.searched_projection(self.B.tau, 0.0)
         else:
             self.B.step(self.x, self.g, self.set, self.s)
@@ -559,8 +572,9 @@ cdef class MPRGP:
     cdef double searched(self, double *s, double *Hs) except? -1:
         """Return the α that minimises the cost along x + αs, at most max(1, α_f).
 
-        0 for s = 0, inf if the cost is unbounded. Replaces s by −s, so that the step is
-        x − αs, and stores its `lengths` in `line`; one product.
+        The length is 0 for s = 0, and inf if the cost is unbounded. The function
+        replaces s by −s, so that the step is x − αs, and stores the `lengths` of this
+        step in `line`. It takes one product.
         """
         if not self.over.any(negate(s, self.n)):
             return 0
@@ -568,7 +582,7 @@ cdef class MPRGP:
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
 
     cdef int raise_model(self, const double *s, const double *Hs) except -1:
-        """Raise the model until sᵀBs ≥ sᵀHs, given the product Hs."""
+        """Increase the model until sᵀBs ≥ sᵀHs, with the product Hs."""
         cdef double sums[2]
         sums[0], sums[1] = dot(s, s, self.n), dot(s, Hs, self.n)
         self.over.add(sums, 2)
@@ -586,7 +600,7 @@ cdef class MPRGP:
     cdef bint spectral_step_leaves(self, bint begun) except -1:
         """Return True if x − αp is not in the set for the length α of spectral steps.
 
-        begun : false if CG has no first direction yet on this face
+        begun : false if CG does not yet have a first direction on this face
         """
         if not begun:
             self.split()
@@ -598,9 +612,9 @@ cdef class MPRGP:
         )
 
     cdef int step_spectrally(self) except -1:
-        """Take a spectral step; one product. Returns 0 if the step is zero.
+        """Take a spectral step, with one product; return 0 if the step is zero.
 
-        Since the cost is quadratic along the step, one product suffices for the line
+        Because the cost is quadratic along the step, one product suffices for the line
         search and for the next α.
         """
         cdef Py_ssize_t i
@@ -616,7 +630,7 @@ cdef class MPRGP:
         return 1
 
     cdef bint is_settled(self) except -1:
-        """Return True if the face has not changed lately and a Newton step is due."""
+        """Return True if the face has settled and a Newton step is due."""
         if self.over.any(self.set.marks(self.x, self.marked)):
             self.settled = 0
         else:
@@ -625,14 +639,15 @@ cdef class MPRGP:
         return self.settled >= SETTLED_FACE and self.patience <= 0
 
     cdef bint step_by_newton(self, long most, bytearray trace) except -1:
-        """Step to the minimum on the tangents of the boundary, projected onto the set.
+        """Step to the minimiser on tangents of the boundary, projected onto the set.
 
-        Returns False, with x unchanged, if this does not decrease the cost. If it does
-        not halve the projected gradient, the next Newton step is taken only after as
-        many other steps as this one took products, so that useless Newton steps take no
-        more than about half of all products.
+        If this step does not decrease the cost, x is unchanged and the result is False.
+        If the step does not halve the projected gradient, the next Newton step is taken
+        only after as many other steps as this step took products. Useless Newton steps
+        therefore take no more than about half of all products.
 
-        most : limit of the letters of `trace`, which receives one per step of CG
+        most : largest number of letters in `trace`, which receives one letter per CG
+            step
         """
         cdef Py_ssize_t i, n = self.n
         cdef double before = self.parts.phi_square + self.parts.beta_square
@@ -691,9 +706,9 @@ cdef class MPRGP:
     cdef double searched_projection(self, double tau, double rise) except? -1:
         """Return the length of the step along −s = Π(x − g/τ) − x, or 0 if s = 0.
 
-        The length is 1 if the cost there is sufficiently below its present value plus
-        `rise`, else the minimising length. Takes one product. Stores s, Hs, slope and
-        curvature, and the length α of the next spectral step.
+        The length is 1 if the resulting cost is sufficiently below the present cost
+        plus `rise`, otherwise the minimising length. The function takes one product. It
+        stores s, Hs, slope and curvature, and the length α of the next spectral step.
         """
         cdef double square
         cdef Line *line = &self.line
@@ -702,8 +717,8 @@ cdef class MPRGP:
             return 0
         self.H(self.s, self.Hs)
         line.curvature = self.over.total(dot(self.s, self.Hs, self.n))
-        # gᵀs ≥ τ‖s‖² for projections. At the end of a run this may be violated by the
-        # rounding of large normal components of g, and the step would be rejected.
+        # gᵀs ≥ τ‖s‖² for projections. At the end of a run, rounding of large normal
+        # components of g may violate this inequality, and the step would be rejected.
         line.slope = fmax(line.slope, tau * square)
         if line.curvature > NOISE * line.slope:
             self.spectral_length = rounded(square / line.curvature)
@@ -761,11 +776,12 @@ cdef class MPRGP:
         """Take the CG step along `line` and compute the next direction.
 
         If rounding has reintroduced components of the gradient along earlier
-        directions, the cost is minimised along all of them again, without a product.
-        This is done only if ‖φ‖ has been halved since the last time: at the level of
-        rounding it would be repeated for ever.
+        directions, the cost is again minimised along all earlier directions, without a
+        product. This minimisation is repeated only if ‖φ‖ has been halved since the
+        last one, because it would otherwise be repeated endlessly when only rounding
+        errors remain.
 
-        Returns γ of a deferred update p ← φ − γp, 0 if p is up to date.
+        The result is γ of a deferred update p ← φ − γp, or 0 if p is up to date.
         """
         cdef double length = self.line.cg, curvature = self.line.curvature, z_Hp
         cdef const double *z
@@ -790,14 +806,14 @@ cdef class MPRGP:
             self.first_direction()
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
-        # `Cv` is Cp, stored by the product Hp
+        # `Cv` contains Cp, which the product Hp has stored
         add(-length, self.Cv, self.Cx, self.rows.r)
         self.knows_Cx = knows_Cx
         z_Hp = self.parts.phi_Hp
         if self.in_two:
             return z_Hp / curvature
         z = self.preconditioned_gradient()
-        if self.directions.count:  # p is one of them
+        if self.directions.count:  # p is one of the stored directions
             memcpy(self.p, z, self.n * sizeof(double))
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
@@ -809,7 +825,7 @@ cdef class MPRGP:
     cdef int to(
         self, double alpha, const double *p, const double *Hp, bint stored=True
     ) except -1:
-        """x ← x − αp; updates gradient, `parts` and face without a product.
+        """x ← x − αp; update the gradient, `parts` and the face without a product.
 
         stored : false if φ and `free` are not needed
         """
@@ -827,17 +843,17 @@ cdef class MPRGP:
     ) except -1:
         """Expand the active set; return the letter of the step, or 0 without a step.
 
-        is_first : true for the first expansion of the run
+        is_first : True for the first expansion of the run
         most, enough : see `minimise_beyond`
         """
         cdef Py_ssize_t n = self.n
         cdef double cg = self.line.cg
         self.knows_Cx = False
-        cdef double required = 0.0  # twice the decrease that x2 must attain
+        cdef double required = 0.0  # twice the decrease of the cost that x2 must attain
         cdef bint has_trial = self.expansion == OWN
         if has_trial:
             self.trial_of_rule(self.x2)
-            # B = τI with τ = ‖H‖/`alpha` here: φ̃ᵀφ/(2‖H‖), times 2
+            # 2 φ̃ᵀφ/(2‖H‖), because B = τI with τ = ‖H‖/`alpha` here
             required = self.parts.reduced_square / (self.alpha * self.B.tau)
         elif self.expansion in (PROJCG, MIXED) and isfinite(cg):
             has_trial = True
@@ -863,7 +879,7 @@ cdef class MPRGP:
         return b"f" if self.expansion in (MIXED, OWN) else b"e"
 
     cdef int expand_spectrally(self) except -1:
-        """Step to the boundary; add a spectral step unless it was most of the CG step."""
+        """Step to the boundary; add a spectral step unless the step is long enough."""
         cdef double feasible = (1 + TIE) * self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
             self.spectral_length = rounded(
@@ -874,10 +890,10 @@ cdef class MPRGP:
         return feasible > LONG_STEP * cg or self.step_spectrally()
 
     cdef int trial_of_rule(self, double *y) except -1:
-        """y ← Π(x_trial − x̃) with the trial point of a subclass's step rule.
+        """y ← Π(x_trial − x̃) with the trial point x_trial of a subclass's step rule.
 
-        The rule receives x = x̃ + ν, and the gradient and lengths without the factor
-        1/‖𝒫F𝒫‖ of H, which are those of the augmented Lagrangian of the original QP.
+        The rule receives x = x̃ + ν. It also receives the gradient and lengths of the
+        augmented Lagrangian of the original QP, without the factor 1/‖𝒫F𝒫‖ of H.
         """
         cdef Py_ssize_t i, n = self.n
         cdef const double *shift = self.rows.x_tilde
@@ -907,20 +923,21 @@ cdef class MPRGP:
     ) except -1:
         """Project the infeasible CG point z onto the set in the metric of the model.
 
-        z is x − α_cg p; in a flat spectrum, where a step changes the active set little,
-        CG continues from there on the face without its bounds. The cost is known at z
-        and, if B ≥ H, bounded around it by
+        The CG point is z = x − α_cg p. In a flat spectrum, where a step changes the
+        active set only slightly, CG continues from z on the face without its bounds.
+        The cost at z is known. If B ≥ H, the cost near z is bounded by
 
             f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr.
 
-        z + r minimises the right side over the set, with the tail of B divided by the
-        relaxation ᾱ‖H‖, by which steps of gradient projection exceed 1/‖H‖. Components
-        that the half step, the step to the boundary, put on the boundary stay there,
-        except in the first expansion with a model that has directions: before it the
-        active set is only a guess. From the half step the method moves to z + r if the
-        cost there is below that at x, else to the minimum along the line. If B = τI and
-        the decrease is less than φ̃ᵀφ/2τ, which gradient projection from x attains for
-        τ ≥ ‖H‖, a gradient projection step from x is taken instead.
+        The point z + r minimises the right-hand side over the set. The tail of B is
+        divided by the relaxation factor ᾱ‖H‖, by which gradient projection steps exceed
+        1/‖H‖. Components that the half step (the step to the boundary) moves to the
+        boundary stay there. The first expansion with a model that has directions is an
+        exception, because the active set before this expansion is only a guess. From
+        the half step, the method moves to z + r if the cost at z + r is below the cost
+        at x, otherwise to the minimiser along the line. If B = τI and the decrease is
+        less than φ̃ᵀφ/2τ, the decrease of gradient projection from x for τ ≥ ‖H‖, a
+        gradient projection step from x is taken instead.
         """
         cdef Py_ssize_t n = self.n
         cdef double *s = self.s
@@ -929,7 +946,8 @@ cdef class MPRGP:
         cdef double *z_g = self.g2
         cdef double cg = self.line.cg, feasible = self.line.feasible, tau = self.B.tau
         cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, slope
-        cdef double change = change_along(&self.line, feasible)  # of the cost, from x
+        # change of the cost from x
+        cdef double change = change_along(&self.line, feasible)
         cdef double least = self.parts.reduced_square / (2 * tau)
         cdef bint is_flat = self.B.basis is None, release = is_first and not is_flat
         self.set.leave_box(feasible, beyond, release, self.x, self.g, self.p, self.Hp,
@@ -969,9 +987,9 @@ cdef class MPRGP:
     cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
         """Continue CG from z on the face without its bounds.
 
-        enough : ‖φ‖² at which to stop: its value when the face was entered
-        most : largest number of steps, that of the CG steps on this face, but at least 1,
-            and BEYOND if CG is preconditioned by a factor
+        enough : ‖φ‖² at which CG stops, the value of ‖φ‖² when the face was entered
+        most : largest number of steps: the number of CG steps on this face, but at
+            least 1, or at least BEYOND if CG is preconditioned by a factor
         """
         cdef Py_ssize_t n = self.n
         cdef long step
@@ -1013,7 +1031,7 @@ cdef class MPRGP:
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
-        """Take a step of gradient projection from the point before the expansion."""
+        """Take a gradient projection step from the point before the expansion."""
         cdef Py_ssize_t n = self.n
         cdef double length
         memcpy(self.x, self.x0, n * sizeof(double))
@@ -1030,7 +1048,7 @@ cdef class MPRGP:
     # 2. Sums of the stopping tests
 
     cdef double cost(self, const double *x, const double *g) except? -1:
-        """Return xᵀHx − 2bᵀx, twice the cost, from the gradient."""
+        """Return xᵀHx − 2bᵀx, twice the cost, computed from the gradient."""
         cdef double sum_ = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -1038,7 +1056,7 @@ cdef class MPRGP:
         return self.over.total(sum_)
 
     cdef int terms_of_cost(self) except -1:
-        """`sums` ← twice the cost at x, and the sum of its terms' absolute values."""
+        """`sums` ← twice the cost at x, and the sum of |terms| of this cost."""
         cdef double term, sum_ = 0.0, size = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):

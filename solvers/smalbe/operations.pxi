@@ -1,15 +1,14 @@
 # The basic operations of SMALBE: sums over processes, products with F, and products
-# with orthonormal rows. On one process they run without Python; sums over MPI ranks
-# call Python.
+# with orthonormal rows. On one process, these operations run without Python. Sums over
+# MPI ranks call Python.
 
 
 # --- numbers ------------------------------------------------------------------------
-#
 # Creating a memoryview takes as long as a pass over a thousand numbers, and creating a
-# buffer or an array through Python as long as a pass over a hundred: small problems would
-# spend more time on this than on products. Arrays are therefore created and accessed
-# through NumPy's C interface. The caller passes the lengths and keeps a reference to each
-# array.
+# buffer or an array through Python takes as long as a pass over a hundred numbers. For
+# small problems, this would take more time than the products. Arrays are therefore
+# created and accessed through NumPy's C interface. The caller passes the lengths and
+# keeps a reference to each array.
 
 
 @cython.final
@@ -86,7 +85,7 @@ cdef copied(const double *v, Py_ssize_t n):
 
 
 cdef view(const double *v, Py_ssize_t n):
-    """Return an array (n,) that shares the memory of v and is valid as long as v is."""
+    """Return an array (n,) that shares the memory of v; valid only while v is valid."""
     cdef cnp.npy_intp size = n
     return cnp.PyArray_SimpleNewFromData(1, &size, cnp.NPY_DOUBLE, <void *> v)
 
@@ -94,7 +93,7 @@ cdef view(const double *v, Py_ssize_t n):
 cdef int copy_result(
     result, Py_ssize_t n, double *y, str what, double s=1.0
 ) except -1:
-    """y ← s·result for an array from Python; raises ValueError unless its size is n."""
+    """y ← s·result for an array from Python; raise ValueError unless its size is n."""
     array = _whole(result)
     if array.size != n:
         raise ValueError(f"{what} has {array.size} components; expected {n}")
@@ -123,7 +122,7 @@ cdef class Reduction:
         self.ranks, self.as_slice = ranks, as_slice
 
     cdef vector(self, array):
-        """Return an array as the vector that operators take, distributed over ranks."""
+        """Return an array as a vector for operators, distributed over the ranks."""
         return array if self.ranks is None else self.as_slice(array, self.ranks)
 
     cdef inline int add(
@@ -134,8 +133,9 @@ cdef class Reduction:
         return 0 if self.ranks is None else self.gather(terms, k, least)
 
     cdef int gather(self, double *terms, Py_ssize_t k, double *least) except -1:
-        # Summed in the order of the ranks: an Allreduce could round differently on each
-        # rank or run, and ranks that branch differently would deadlock.
+        # The sum is taken in the order of the ranks. The result of an Allreduce could
+        # be rounded differently on each rank or in each run, and ranks that take
+        # different branches would deadlock.
         cdef Py_ssize_t i, p, width = k + (1 if least else 0)
         cdef const double *of_rank
         own = np.empty(width)
@@ -170,9 +170,9 @@ cdef class Reduction:
 
 
 cdef enum:
-    # From this many unknowns on, products with a dense P use BLAS: the triangle of 1.4
-    # MB no longer fits into the caches of one core, and memory bandwidth limits both
-    # kernels alike.
+    # Smallest number of unknowns for which products with a dense P use BLAS. At this
+    # size, the triangle of 1.4 MB no longer fits into the caches of one core, so that
+    # memory bandwidth limits BLAS and our kernel equally.
     BLAS_SIZE = 600
 
 
@@ -189,8 +189,8 @@ cdef class Product:
     cdef bint is_sparse
     cdef object matrix
     cdef const double *dense
-    cdef sparse rows  # data is NULL unless P is sparse
-    cdef LinearMap map  # P as a compiled linear map; else None
+    cdef sparse rows  # `data` is NULL unless P is sparse
+    cdef LinearMap map  # P as a compiled linear map, or None
     cdef object owners, argument
 
     def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
@@ -251,10 +251,11 @@ cdef class Product:
             self.map.apply(v, y, 1)
             if s != 1:
                 scale(s, y, self.n)
-        # pass a copy of v: an operator may change its argument or keep a reference
+        # pass a copy of v, because an operator may change its argument or keep a
+        # reference
         else:
-            # reuse the copy, unless the operator keeps a reference: new memory causes
-            # page faults
+            # reuse the copy unless the operator keeps a reference, because new memory
+            # causes page faults
             if self.argument is None or getrefcount(self.argument) > 2:
                 self.argument = np.empty(self.n)
             memcpy(address(self.argument), v, self.n * sizeof(double))
@@ -281,7 +282,7 @@ cdef class Rows:
     cdef const double *C  # NULL for C = L⁻¹G
     cdef const double *GC
     cdef const double *x_tilde
-    cdef Coarse coarse  # for C = L⁻¹G, else None
+    cdef Coarse coarse  # used for C = L⁻¹G, otherwise None
     cdef readonly object source
     cdef list owners
     cdef Reduction over
@@ -335,7 +336,7 @@ cdef class Rows:
         return 0
 
     cdef int project(self, double *v, double *Cv) except -1:
-        """v ← v − CᵀCv; Cv receives Cv of the old v."""
+        """v ← v − CᵀCv; Cv receives the product with the old v."""
         self.times(v, Cv)
         self.combine(-1.0, Cv, v, v)
         return 0
@@ -349,8 +350,8 @@ cdef class Rows:
     ) except -1:
         """Return True if ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
 
-        If e = 0, or x̃ is within rounding of zero relative to ν, the test is
-        ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
+        If e = 0, or if x̃ is zero up to rounding errors relative to ν, the test is ‖Cν‖
+        ≤ tol·max(‖ν‖, `least`).
         """
         cdef double error = self.size(Cnu), square = 0.0, part
         cdef Py_ssize_t i
@@ -367,16 +368,16 @@ cdef class Rows:
         return sqrt(square) <= tol * self.e_size
 
     def met(self, nu, double tol, double least):
-        """Return True if ν (n,) satisfies the rows to `tol`, see `are_met`."""
+        """Return True if ν (n,) satisfies the rows to `tol`, by the test `are_met`."""
         cdef Room Cnu = Room(self.r)
         self.times(address(nu), Cnu.at)
         return self.are_met(address(nu), Cnu.at, tol, least)
 
     cdef int fit(self, const double *free, double *r, double *a) except -1:
-        """a ← the least-squares multipliers defined in `fitted`, for sparse rows.
+        """a ← the result of `fitted`, for sparse rows.
 
-        free : 1 on the free components, else 0 (n,)
-        r : (n,) vector of `fitted`; set to zero off the free components
+        free : (n,) 1 for free components, else 0
+        r : (n,) argument of `fitted`; entries of other components are set to zero
         """
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -390,16 +391,17 @@ cdef class Rows:
         return self.coarse.forward(self.coarse.t, a)
 
     def fitted(self, free, r):
-        """Return a (r,) with the least ‖(r + Cᵀa)_F‖ on the free components F (n,)."""
+        """Return the minimiser a (r,) of ‖(r + Cᵀa)_F‖ for the free components F."""
         rest, multipliers = np.array(r, dtype=float), np.empty(self.r)
         is_free = np.array(free, dtype=float)
         self.fit(address(is_free), address(rest), address(multipliers))
         return multipliers
 
 
-# If ‖x̃‖/‖ν‖ is below this, x̃ counts as rounding of e = 0: several hundred times 2⁻⁵³.
-# Without it `test_a_right_hand_side_of_rounding_is_none` fails.
+# If ‖x̃‖/‖ν‖ is at most this value, which is several hundred times 2⁻⁵³, x̃ counts as a
+# rounding error of e = 0. Without this test,
+# `test_a_right_hand_side_of_rounding_is_none` fails.
 cdef double SHIFT_ROUNDING = 1e-13
 # Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face with free
-# components F: smaller eigenvalues of G_F G_Fᵀ relative to GGᵀ count as zero.
+# components F. Eigenvalues of G_F G_Fᵀ relative to GGᵀ below this value count as zero.
 cdef double FREE_RANK = 1e-10

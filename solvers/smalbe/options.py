@@ -12,23 +12,25 @@ from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
-#: Rule of the expansion step; the number of products with F is in brackets.
-#: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
+#: Rule of the expansion step. The origin of a rule and its number of products with F
+#: are in brackets.
+#: std: the CG step, shortened to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
 #: projcg: x ← Π(x − α_cg p), even if the cost rises (PERMON; 2)
 #: mixed: projcg, or std if projcg would increase the cost (ESPRESO; 2 or 3)
 #: model: the CG point, projected in the metric of the model (new; 2, or 1 if the step
-#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
-#: decrease is below that of gradient projection)
-#: spectral: a step to the boundary and, unless it is most of the CG step, a projected
-#: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
-#: replace every proportioning step, and CG if its first step would leave the set (1).
-#: With discs, the value model selects spectral, since model steps require bounds
+#: to the boundary is the whole step; 1 more per CG step beyond the box, and 1 more if
+#: the decrease is below the decrease of gradient projection)
+#: spectral: a step to the boundary and, unless this step is most of the CG step, a
+#: projected Barzilai-Borwein step with a nonmonotone line search (1 or 2).
+#: Barzilai-Borwein steps also replace every proportioning step, and CG if the first CG
+#: step would leave the set (1). With discs, the value model selects spectral, because
+#: model steps require bounds
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
-#: Rule of the proportioning step; each takes 1 product.
-#: cg: minimise along −β, as far as feasible (textbook). With discs, where −β is not a
-#: feasible direction, the rule model is used instead
+#: Rule of the proportioning step, which takes 1 product.
+#: cg: minimise along −β as far as feasible (textbook). With discs, −β is not a feasible
+#: direction, so the rule model is used instead
 #: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
-#: gradient step. After two such steps that did not halve ‖β‖², a step of the rule cg
+#: gradient step. After two model steps that did not halve ‖β‖², a step of the rule cg
 #: follows
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
@@ -46,10 +48,10 @@ class Options:
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0 selects 1 with discs, 1e6 if P provides a
     #: preconditioner, else 1e4
     rho: float = 0.0
-    rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grows too little
-    M: float = 1.0  #: initial M, in units of ‖𝒫F𝒫‖: inner runs end at ‖g^P‖ ≤ M‖Cν‖
-    beta: float = 0.5  #: factor of M if the Lagrangian grows too little
-    eta: float = 0.1  #: limit of ‖g^P‖/‖b‖ at the end of an inner run
+    rho_growth: float = 1.0  #: multiplies ρ if the Lagrangian grows too little
+    M: float = 1.0  #: initial M in units of ‖𝒫F𝒫‖; inner runs end at ‖g^P‖ ≤ M‖Cν‖
+    beta: float = 0.5  #: multiplies M if the Lagrangian grows too little
+    eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # if P is sparse, conjugation against stored directions costs more than a product
     #: store the CG directions of a face and make new ones conjugate to them, unless P
@@ -58,11 +60,11 @@ class Options:
     reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
-    # n/10 applies to bounds alone
-    lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
-    # only with the preconditioners model and none: the others require the original P
+    # n/10 is the limit without equality rows
+    lanczos_steps: int = 12  #: limit of Lanczos steps; at most n/6 or n/10, at least 5
+    # only with the preconditioners model and none; others require the original P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables
-    energy: float = 50.0  #: limit of the energy error estimate, times tol; 0: none
+    energy: float = 50.0  #: largest energy error estimate relative to tol; 0: no limit
     history: bool = False  #: True to record each step
     max_steps: int = 200_000  #: limit of MPRGP steps plus outer iterations
 
@@ -110,15 +112,15 @@ class Options:
         """Return v ↦ Mv for this QP, or None to use the option `preconditioner`.
 
         Subclasses may override this method (`solvers.smalbe.extension`). M approximates
-        P⁻¹ and must be symmetric positive definite; SMALBE restricts it to the face.
+        P⁻¹ and must be symmetric positive definite. SMALBE restricts M to the face.
         """
         return None
 
     def step_rule_for(self, qp: QP) -> StepRule | None:
-        """Return a rule for this QP, or None to use the option `expansion`.
+        """Return a step rule for this QP, or None to use the option `expansion`.
 
-        Subclasses may override this method (`solvers.smalbe.extension`). The rule is
-        called for a trial point whenever a CG step would leave the box.
+        Subclasses may override this method (`solvers.smalbe.extension`). Whenever a CG
+        step would leave the box, SMALBE calls the rule for a trial point.
         """
         return None
 

@@ -1,27 +1,29 @@
 # The outer loop, and the recovery of x and its multipliers.
 
 
-# Largest penalty. At this value the rounding of ρQν, 2⁻⁵³ρ‖ν‖, reaches 1e-6·‖ν‖; with
-# larger values it would dominate the gradient. Without a limit models become indefinite
-# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`); with 1e3
-# `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
+# Largest penalty. At this value, the rounding error 2⁻⁵³ρ‖ν‖ of ρQν reaches 1e-6·‖ν‖;
+# with larger values, it would dominate the gradient. Without a limit, models become
+# indefinite (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With
+# 1e3, `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
 cdef double MAX_RHO = 1e10
-# Limit of the total number of products, relative to their number when the gradient is
-# small enough: the reduction of the energy error may cost a quarter more
+# Limit of the total number of products, relative to the number of products at which the
+# gradient is small enough. The reduction of the energy error may therefore take a
+# quarter more products
 # (`test_an_energy_error_that_is_too_large_costs_some_more_products`).
 cdef double ENERGY_BUDGET = 1.25
-# Smallest τ of a model relative to the norm: steps are at most 1e4 times as long as
-# those of ordinary gradient projection. With zero, an F of low rank leads to τ = 0 and
-# thus to no step (`test_what_once_failed`).
+# Smallest τ of a model, relative to the norm. Steps are therefore at most 1e4 times as
+# long as the steps of ordinary gradient projection. With zero, an F of low rank leads
+# to τ = 0, so that no step is possible (`test_what_once_failed`).
 cdef double MIN_TAIL = 1e-4
-# ‖g^P‖ in units of tol‖b‖: the KKT residual is first evaluated below FIRST_JUDGED;
-# below MOST_JUDGED it is no longer decisive. At a KKT residual of 1e-6, strings have
-# ‖g^P‖/‖b‖ = 1e-4, and journal bearings 1e-5.
+# Values of ‖g^P‖ in units of tol‖b‖. The KKT residual is first evaluated below
+# FIRST_JUDGED. Below MOST_JUDGED, the inner run ends even if the KKT residual exceeds
+# the tolerance. At a KKT residual of 1e-6, ‖g^P‖/‖b‖ is 1e-4 for strings and 1e-5 for
+# journal bearings.
 cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
-# Pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact force of a
-# sphere on a plane differs from the load by 3e-9 without projections and by 2e-10 with
-# four; each pair takes two products with C.
+# Number of pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact
+# force of a sphere on a plane differs from the load by 3e-9 without projections and by
+# 2e-10 with four pairs. Each pair takes two products with C.
 cdef int ALTERNATIONS = 4
 
 
@@ -29,14 +31,14 @@ cdef int ALTERNATIONS = 4
 cdef class SMALBE(MPRGP):
     """Semimonotonic augmented Lagrangians: the outer loop over MPRGP.
 
-    Minimises ½νᵀHν − bᵀν over a set, subject to Cν = 0, with H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ, Q =
-    CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
-    Algorithm 6.1).
+    The method minimises ½νᵀHν − bᵀν over a set, subject to Cν = 0, with H = 𝒫F𝒫/‖𝒫F𝒫‖ +
+    ρQ, Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference
+    [3], Algorithm 6.1).
 
     problem : a `solvers.smalbe.projected.Projected`
     options : a `solvers.smalbe.options.Options`
     M : product v → Mv with a structural preconditioner, or None
-    preconditioned : true if CG is preconditioned on the face, by M or by the model
+    preconditioned : True if M or the model preconditions CG on the face
     step_rule : a `solvers.smalbe.extension.StepRule` that replaces the expansion, or
         None
     """
@@ -44,18 +46,20 @@ cdef class SMALBE(MPRGP):
     cdef double norm, tail, b_size
     cdef bint plain, preconditioned
     cdef Py_ssize_t n_directions  # number of rows of C and Ritz vectors in the model
-    cdef list owners  # references to the arrays that are read
-    cdef Basis basis  # these directions; None without any
-    cdef Room above  # (n_directions,) their eigenvalues above the tail
+    cdef list owners  # references to the arrays that pointers refer to
+    cdef Basis basis  # rows of C and Ritz vectors; None without any
+    # (n_directions,) eigenvalues of the rows of `basis`, minus the tail
+    cdef Room above
     cdef const double *b
     cdef const double *q
     cdef const double *diagonal  # NULL for an operator without a diagonal
     cdef Model cached_model
     cdef double cached_rho
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
-    cdef Judge judge  # stopping test by KKT residuals; None if ‖g^P‖ is tested
+    cdef Judge judge  # stopping test by KKT residuals; None for the test of ‖g^P‖
     cdef double next_judged  # ‖g^P‖ at or below which `judge` is evaluated next
-    cdef long most_products  # limit up to which the energy error is reduced
+    # number of products up to which the energy error is reduced
+    cdef long most_products
 
     def __init__(self, problem, options, bint preconditioned, M=None, step_rule=None):
         cdef const double *lower
@@ -94,7 +98,7 @@ cdef class SMALBE(MPRGP):
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
         self.directions = Directions(self.n, kept, self.over)
-        # n is that of all ranks, so that they take the same decisions
+        # n is summed over all ranks, so that all ranks take the same decisions
         self.patience = <long>fmax(FIRST_NEWTON, sqrt(self.over.total(self.n)))
         self.tangents = Directions(
             self.n, MAX_DIRECTIONS if self.expansion == SPECTRAL else 0, self.over
@@ -107,15 +111,16 @@ cdef class SMALBE(MPRGP):
     cdef int choose_directions(self, ritz) except -1:
         """Choose the directions of the models and the tail, the value of τ.
 
-        The tail estimates the norm of 𝒫F𝒫 on the complement of the selected directions:
-        it is the second to last Ritz value plus its residual. If the process ended
-        because β = 0, the last value is taken; if an earlier residual exceeds its
-        value, the first such value. If the tail is too small, MPRGP raises τ to the
-        curvature shown by its products. ρQ enters the models exactly. In a flat
-        spectrum a short process does not converge even to the first eigenvector, and
-        Ritz vectors that are not eigenvectors would slow CG down: then only the norm is
-        used. With sparse rows also only the norm is used, since they come from many
-        subdomains, whose spectrum is flat.
+        The tail estimates the norm of 𝒫F𝒫 on the complement of the selected directions.
+        It is the second to last Ritz value plus its residual, or the last value plus
+        its residual if the process ended because β = 0. If the residual of an earlier
+        pair exceeds its value, the first pair with this property is used instead. If
+        the tail is too small, MPRGP increases τ to the curvature that its products
+        show. The models contain ρQ exactly. In a flat spectrum, a short Lanczos process
+        does not converge even to the first eigenvector, and Ritz vectors that are not
+        eigenvectors would slow down CG. In this case, only the norm is used. With
+        sparse rows, also only the norm is used, because sparse rows come from many
+        subdomains, for which the spectrum is flat.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef Py_ssize_t first = 0, last = n
@@ -156,7 +161,7 @@ cdef class SMALBE(MPRGP):
         memcpy(basis.U, self.rows.C, r * n * sizeof(double))
         if kept:
             memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
-        # share one copy, which stays in the cache
+        # share one copy, so that it stays in the cache
         self.basis, self.rows.C = basis, basis.U
         self.rows.owners.append(basis)
         return 0
@@ -176,7 +181,7 @@ cdef class SMALBE(MPRGP):
         return self.cached_model
 
     cdef Model model_of_penalty(self, double rho):
-        """Return the model I + (ρ − 1)Q of H without Ritz pairs; I for ρ < 1."""
+        """Return the model I + (ρ − 1)Q of H, without Ritz pairs; I for ρ < 1."""
         cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
         cdef Room w = Room(of_rows)
         if not self.rows.exist:
@@ -186,7 +191,7 @@ cdef class SMALBE(MPRGP):
         return self.basis.model(of_rows, w.at, 0.0, 1.0)
 
     cdef int choose_models(self) except -1:
-        """Choose B and the preconditioner for this ρ."""
+        """Choose the model B and the preconditioner for the present ρ."""
         if self.plain:  # no model, only ‖H‖
             self.B = Model.of_norm(
                 fmax(1.0, self.rho if self.rows.exist else 0.0) / self.alpha, self.n
@@ -213,7 +218,7 @@ cdef class SMALBE(MPRGP):
         return self.over.vector(copied(self.p, n))
 
     def face_and_gradients(self, x, g):
-        """Return `free` (1 for free components, else 0), φ and β, vectors (n,)."""
+        """Return vectors (n,): the mask of free components (1, else 0), φ and β."""
         cdef list owners = []
         cdef Parts parts
         free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
@@ -225,10 +230,10 @@ cdef class SMALBE(MPRGP):
     # the start
 
     def begin(self, x, mu, double rho):
-        """Return ν (n,), the projection of x onto the set minus x̃, and its gradient.
+        """Return ν = Π(x) − x̃ (n,), where Π projects onto the set, and the gradient.
 
-        The gradient includes Cᵀμ. This takes one product, or none for x = 0, where 𝒫ν =
-        −𝒫x̃ = 0 and Hν = ρQν.
+        The gradient includes Cᵀμ. The call takes one product, or no product for x = 0,
+        where 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
@@ -258,32 +263,34 @@ cdef class SMALBE(MPRGP):
 
         For k = 0, 1, …:
 
-        1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
+        1. Run MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
         2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²
            since the last k: M ← βM, and ρ ← ρ·growth.
-        3. μ ← μ + ρCν; the gradient grows by ρQν, without a product. H is unchanged, so
-           that the directions of CG stay conjugate on an unchanged face.
+        3. μ ← μ + ρCν. The gradient changes by ρQν, without a product. H is unchanged,
+           so the directions of CG remain conjugate on an unchanged face.
 
         until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, for the original rows, ‖Gν‖ ≤ tol‖e‖.
         (If b = 0, the initial gradient replaces b; if e = 0, ν replaces x̃.) In
         addition, the error in the energy norm is estimated (`energy_error`), because
-        ‖b‖ may be dominated by the displacements of supports, compared with which
-        contact forces contribute little. Its reduction may take at most a quarter more
-        products: if stiffnesses differ widely, rounding can keep the estimate above its
-        limit for ever.
+        the displacements of supports may dominate ‖b‖, while contact forces contribute
+        little. The reduction of this error may take at most a quarter more products: if
+        stiffnesses differ widely, rounding can keep the estimate permanently above its
+        limit.
 
-        4. Safeguards. If two consecutive outer iterations did not halve ‖Cν‖: ρ ← 10ρ,
-           at most MAX_RHO, or, if ‖Cν‖ is small enough and only the gradient is not,
-           M ← M/10, so that an inner run finally meets the tolerance, or stagnates.
-           CᵀCν is tested as a certificate of infeasibility.
+        4. Apply safeguards. If two consecutive outer iterations did not halve ‖Cν‖,
+           then ρ ← 10ρ, but at most MAX_RHO. If ‖Cν‖ is small enough, but the gradient
+           is not, then M ← M/10 instead, so that an inner run finally meets the
+           tolerance or stagnates. CᵀCν is tested as a certificate of infeasibility.
 
-        Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
-        `OuterIteration`, and the status: `Status.FAILED` if the iterates diverged.
+        The return values are ν, g, μ, M, ρ, the outer iterations as tuples in the order
+        of `OuterIteration`, and the status, which is `Status.FAILED` if the iterates
+        diverged.
 
         at : an `Iterate`
         infeasible : ν → True if ν proves that there is no feasible point
-        watch : k, right-hand side → observer of outer iteration k, called with the
-            letter of each step, x and g; or None
+        watch : function of k and the right-hand side that returns an observer of outer
+            iteration k, or None; the observer is called after each step with its
+            letter, x and g
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
@@ -379,9 +386,9 @@ cdef class SMALBE(MPRGP):
         """Return True if the KKT residual of the original problem is within tol.
 
         The evaluation costs as much as several steps. It is therefore repeated only
-        when `size`, which is ‖g^P‖, has decreased enough, on the assumption that the
-        residual is proportional to it. If the residual has no scale (at x = 0), ‖g^P‖
-        is tested instead.
+        when ‖g^P‖ (the argument `size`) has decreased enough, on the assumption that
+        the residual is proportional to ‖g^P‖. If the residual has no scale (at x = 0),
+        ‖g^P‖ is tested instead.
         """
         cdef double residual
         if size > self.next_judged:
@@ -397,7 +404,8 @@ cdef class SMALBE(MPRGP):
     cdef bint is_accurate(self) except -1:
         """Return True if the rows are satisfied and the energy error is acceptable.
 
-        It is accepted if it is small or its budget of products is used up.
+        The energy error is accepted if it is small or if its budget of products is used
+        up.
         """
         self.rows.times(self.x, self.Cv)
         if not self.rows.are_met(self.x, self.Cv, self.tol, self.b_size):
@@ -412,9 +420,10 @@ cdef class SMALBE(MPRGP):
         """Estimate the relative energy error from the remaining gradient.
 
         With the gradient r on the free components f, ‖x − x*‖_F² = rᵀF_ff⁻¹r, and each
-        rᵢ²/F_ii is a lower bound of it. On contact problems the certified error was 0.8
-        to 8.4 times the root of their sum. Gradients within the rounding of q are
-        omitted. The estimate is zero for an operator F without a known diagonal.
+        rᵢ²/F_ii is a lower bound of this number. On contact problems, the certified
+        error was 0.8 to 8.4 times the square root of the sum of these bounds.
+        Components of the gradient within the rounding of q are omitted. The estimate is
+        zero for an operator F without a known diagonal.
         """
         cdef double energy = 0.0, most = 0.0, error
         cdef Py_ssize_t i
@@ -430,7 +439,7 @@ cdef class SMALBE(MPRGP):
         return sqrt(error / fabs(energy)) if energy else 0.0
 
     cdef double lagrangian(self, const double *mu) except? -1:
-        """Return L(ν, μ), computed from the gradient; expects Cν in `Cv`."""
+        """Return L(ν, μ), computed from the gradient; `Cv` must contain Cν."""
         cdef double sum_ = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -450,14 +459,15 @@ cdef class SMALBE(MPRGP):
     # recovery
 
     def onto_rows(self, nu):
-        """Return ν (n,), moved towards Cν = 0 without leaving its face; no product.
+        """Move ν (n,) towards Cν = 0 without leaving its face or taking a product.
 
         The outer loop ends with a violation ‖Cν‖ of the order of the tolerance. This
-        violation is the resultant of forces in balance, which users compare with the
-        load. Projections onto {Cν = 0} and onto the free components alternate (von
-        Neumann), so active bounds and discs stay active and multipliers keep their
-        meaning. The factor per projection is 1 − λ, where λ is the smallest eigenvalue
-        of C_F C_Fᵀ on the free components F: 0.5 for a sphere on a plane.
+        violation is the error of the force balance, which is visible when users compare
+        contact forces with the load. Projections onto {Cν = 0} and onto the free
+        components alternate (von Neumann). Active bounds and discs therefore remain
+        active, and multipliers remain valid. Each projection multiplies the violation
+        by 1 − λ, where λ is the smallest eigenvalue of C_F C_Fᵀ on the free components
+        F. For a sphere on a plane, this factor is 0.5.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
@@ -483,10 +493,10 @@ cdef class SMALBE(MPRGP):
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        The computation is that of `solvers.smalbe.driver.recovered`, with normal
-        equations for the correction of a. Returns None with discs, or if the rows of a
-        dense C are so nearly dependent on the free components that normal equations
-        would be inaccurate.
+        The computation is the same as in `solvers.smalbe.driver.recovered`, but uses
+        normal equations for the correction of a. The result is None if there are discs,
+        or if the rows of a dense C are so nearly dependent on the free components that
+        normal equations would be inaccurate.
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef int order = r, one = 1, info = 0
@@ -543,7 +553,7 @@ cdef class SMALBE(MPRGP):
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, C, da, rest, r, n)
-        if any_left:  # else x is the unconstrained minimum
+        if any_left:  # otherwise x is the unconstrained minimiser
             bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
         x_array, z_array, Fx_array = map(
             self.over.vector, (restored_x, boxes, product)

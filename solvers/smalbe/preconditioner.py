@@ -1,29 +1,30 @@
 """Preconditioners of the CG steps on a face of the box.
 
-`model` is inverted on each face (model.pxi), and `incomplete` is factorised there
-(incomplete.pxi; `solvers.smalbe.scaled`). All other preconditioners use the same matrix
-M for all faces, restricted to the free components of the face: z = Mφ with the free
-gradient φ. For a dual with F = BK⁺Bᵀ, the structural preconditioners are
+The preconditioner `model` is inverted on each face (model.pxi), and `incomplete` is
+factorised on each face (incomplete.pxi; `solvers.smalbe.scaled`). All other
+preconditioners use the same matrix M for all faces, restricted to the free components
+of the face: z = Mφ with the free gradient φ. For a dual with F = BK⁺Bᵀ, the structural
+preconditioners are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
 
-where b are the displacements that occur in B, i the others, and B_D = (BWBᵀ)⁻¹BW with
-the compliances W = diag(K_bb)⁻¹ as weights, so that the softer of two bodies takes the
-larger part of a jump (Rixen and Farhat 1999). An operator P may provide its own
-preconditioners (`harness.operators.Preconditioned`).
+where the index b denotes the displacements that occur in B, and i all other
+displacements. B_D = (BWBᵀ)⁻¹BW has the compliances W = diag(K_bb)⁻¹ as weights, so that
+the softer of two bodies takes the larger part of a jump (Rixen and Farhat 1999). An
+operator P may provide its own preconditioners (`harness.operators.Preconditioned`).
 
 Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated by the model of the penalty, B = I +
-(ρ − 1)Q. On the free components, here denoted by the index F, its inverse P = B_FF⁻¹ is
-nearly the projector onto C_Fν = 0. M replaces the identity on the range of that
+(ρ − 1)Q. On the free components, here denoted by the index F, the inverse P = B_FF⁻¹ is
+nearly the projector onto C_Fν = 0. M replaces the identity on the range of this
 projector:
 
     P (‖𝒫F𝒫‖ M_FF − I) P + P
 
-This matrix is positive definite (0 < P ≤ I), and accurate even if C_F C_Fᵀ has small
-eigenvalues, such as those of motions that contact constraints resist but gluing
-constraints hardly resist. The projector 𝒫 of all components, in place of P, would mix
-free components with active ones and cancel the effect of a large ρ.
+This matrix is positive definite (0 < P ≤ I). It is accurate even if C_F C_Fᵀ has small
+eigenvalues, which occur for motions that contact constraints resist but gluing
+constraints hardly resist. With the projector 𝒫 of all components instead of P, free and
+active components would be mixed and the effect of a large ρ would be lost.
 """
 
 from __future__ import annotations
@@ -48,28 +49,30 @@ PRECONDITIONERS = get_args(Preconditioner)
 #: preconditioners with a matrix or operator M
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Largest number of pairs of entries in the columns of an incomplete factor, per entry
-#: of P; the pairs determine the cost of elimination. Meshes of more than 24³ trilinear
-#: elements have more than two pairs per entry, and their factors cost twice the time
-#: that they save. With a limit of 1.5 instead of 2, two of 1800 runs on random AᵀA
-#: failed at tol 1e-12.
+#: of P. The number of pairs determines the cost of elimination. Meshes of more than 24³
+#: trilinear elements have more than two pairs per entry, and factors of these matrices
+#: cost twice the time that they save. With a limit of 1.5 instead of 2, two of 1800
+#: runs on random AᵀA failed at tol 1e-12.
 MAX_PAIRS = 2.0
-#: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. On thirty
-#: string, obstacle, journal bearing and torsion problems of 20 to 20 000 unknowns:
-#: below this value, a factor takes up to 2.8 times as long as `model` and saves at most
-#: 0.2 ms; above it, a factor takes at most a quarter longer (a flat obstacle, n = 110)
-#: and saves up to 97 %.
+#: Smallest levels·spread^¼ (see `Sparsity`) for which a factor is used. The value was
+#: chosen on thirty string, obstacle, journal bearing and torsion problems of 20 to
+#: 20 000 unknowns. Below this value, a solve with a factor takes up to 2.8 times as
+#: long as with `model` and saves at most 0.2 ms. Above this value, a solve with a
+#: factor takes at most a quarter longer (a flat obstacle, n = 110) and saves up to
+#: 97 %.
 MIN_DIFFICULTY = 50.0
-#: smallest spread for which a factor is used whatever the number of levels: journal
-#: bearings with an eccentricity of 0.9 have spreads of 2000 to 7000
+#: smallest spread for which a factor is used for any number of levels; journal bearings
+#: with an eccentricity of 0.9 have spreads of 2000 to 7000
 MIN_SPREAD = 1000.0
-#: largest spread for which variables are not scaled before a factorisation: scaling
-#: takes as long as several products
+#: largest spread for which variables are not scaled before a factorisation, because
+#: scaling takes as long as several products
 MAX_UNSCALED = 2.0
-#: smallest spread·n for which variables are scaled if no factor is used: below it, as
-#: in journal bearings of 100 to 400 unknowns, scaling takes longer than the products
-#: that it saves
+#: smallest spread·n for which variables are scaled if no factor is used; below this
+#: value, as in journal bearings of 100 to 400 unknowns, scaling takes longer than the
+#: products that it saves
 MIN_SCALED = 1e5
-DEPENDENT = 1e-10  #: relative addition to diag(BWBᵀ), since B may contain repeated rows
+#: relative increase of diag(BWBᵀ), because B may contain repeated rows
+DEPENDENT = 1e-10
 
 
 def preconditioned_operator(qp: QP) -> Preconditioned | None:
@@ -82,29 +85,30 @@ def preconditioned_operator(qp: QP) -> Preconditioned | None:
 class Sparsity(NamedTuple):
     """Properties of a sparse P that determine the choice of a preconditioner."""
 
-    #: number of pairs of entries below the diagonal in the same column: the steps of an
-    #: incomplete factorisation. inf if a diagonal entry is not a finite positive number
+    #: number of pairs of entries below the diagonal in the same column, which is the
+    #: number of steps of an incomplete factorisation; inf if a diagonal entry is not a
+    #: finite positive number
     pairs: float
     #: n divided by twice the mean distance of the off-diagonal entries from the
-    #: diagonal; an estimate of the number of levels of the graph of P. n/2 for a
-    #: string, about √n for a grid in its natural order, less than 2 for a random order;
-    #: 0 for a diagonal P
+    #: diagonal, as an estimate of the number of levels of the graph of P; n/2 for a
+    #: string, about √n for a grid in its natural order, less than 2 for a random order,
+    #: and 0 for a diagonal P
     levels: float
     spread: float  #: ratio of the largest to the smallest diagonal entry
 
 
 def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Resolve ``auto``: dirichlet if available, incomplete if faster, else model."""
+    """Replace ``auto`` by dirichlet if available, incomplete if faster, else model."""
     return resolved(qp, kind)[0]
 
 
 def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
-    """Return the preconditioner for `kind`, and whether variables are to be scaled.
+    """Return the preconditioner for `kind`, and True if variables should be scaled.
 
     A CG step with an incomplete factor costs four to seven times as much as a step
-    without one: the factor saves time if CG without it takes more than about 150 steps.
-    The number of these steps grows with `Sparsity.levels` and with the fourth root of
-    `spread`.
+    without a factor. The factor therefore saves time if CG without a factor takes more
+    than about 150 steps. This number of steps grows with `Sparsity.levels` and with the
+    fourth root of `Sparsity.spread`.
     """
     if kind not in ("auto", "incomplete"):
         return kind, False
@@ -125,9 +129,10 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 def has_sparse_factor(qp: QP) -> bool:
     """Return True if an incomplete factor of the free block of P is cheap.
 
-    A factor requires a sparse P with a positive diagonal, stored by this process, and
-    bounds only, since a factor of P would not include the penalty of rows. The columns
-    of P must have so few entries that a factor costs no more than several products.
+    A factor requires a sparse P with a positive diagonal that this process stores. The
+    QP must have bounds only, because a factor of P does not include the penalty of
+    rows. The columns of P must have so few entries that a factor costs no more than
+    several products.
     """
     return _is_sparse(qp) and _sparsity(qp).pairs <= MAX_PAIRS * qp.P.nnz
 

@@ -4,9 +4,9 @@
 def orthonormal(G, e):
     """Orthonormalise the rows of G (m, n) in Gx = e by a pivoted QR factorisation.
 
-    Returns two tuples: the fields of `DenseRows` except `multipliers`, and the data
-    that the function `multipliers` needs: R (r, r), the indices of the independent rows
-    (r,), and the norms of all rows (m,).
+    The result consists of two tuples. The first contains the fields of `DenseRows`
+    except `multipliers`. The second contains the data for the function `multipliers`: R
+    (r, r), the indices of the independent rows (r,), and the norms of all rows (m,).
     """
     cdef Py_ssize_t i, j, m = G.shape[0], n = G.shape[1], w = min(m, n)
     cdef int rows = m, columns = n, info = 0, most = 64 * (m + n), r = 0
@@ -64,9 +64,9 @@ def orthonormal(G, e):
     )
 
 
-# Pivots of normalised rows below this are rounding: several hundred times 2⁻⁵³. With
-# zero `test_a_repeated_row_must_ask_for_the_same` fails, with 1e-9
-# `test_nearly_parallel_rows_are_independent` does.
+# Pivots of normalised rows below this value, which is several hundred times 2⁻⁵³, count
+# as rounding errors. With zero, `test_a_repeated_row_must_ask_for_the_same` fails; with
+# 1e-9, `test_nearly_parallel_rows_are_independent` fails.
 cdef double RANK = 1e-13
 
 
@@ -92,24 +92,25 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     return result
 
 
-# A spectrum counts as flat if the ratio of its Ritz values after FLAT_STEPS steps is at
-# most this: with condition number 10, CG halves its error in every step, and more
-# products for the Lanczos process would cost more than they save.
+# A spectrum counts as flat if the ratio of the largest to the smallest Ritz value after
+# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG halves its
+# error in every step, and further products of the Lanczos process would cost more than
+# they save.
 cdef double FLAT_RATIO = 10.0
 
 cdef enum:
     FLAT_STEPS = 5
-    # limit of QR steps per eigenvalue; convergence is cubic, and two steps usually
-    # suffice
+    # largest number of QR steps per eigenvalue; convergence is cubic, and two steps
+    # usually suffice
     QR_STEPS = 30
 
 
 cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept nogil:
-    """Compute the eigenpairs of a symmetric tridiagonal matrix (k, k), ascending.
+    """Compute the eigenpairs of a symmetric tridiagonal matrix (k, k), sorted.
 
-    QR steps with Wilkinson's shift (Golub and Van Loan, Matrix Computations, 4th ed.,
-    Algorithm 8.3.3). For k = 6, LAPACK's `dstev` takes twice as long, 1.3 µs, the time
-    of four products with 73 unknowns.
+    The algorithm takes QR steps with Wilkinson's shift (Golub and Van Loan, Matrix
+    Computations, 4th ed., Algorithm 8.3.3). For k = 6, LAPACK's `dstev` takes 1.3 µs,
+    which is twice as long, and the time of four products with 73 unknowns.
 
     diagonal : (k,) receives the eigenvalues
     off : (k − 1,) off-diagonal entries, overwritten
@@ -124,7 +125,7 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
         most = fmax(most, fabs(off[i]) if i + 1 < k else 0.0)
     if not 0 < most < INFINITY:
         return
-    for i in range(k):  # scaled so that squares neither overflow nor underflow
+    for i in range(k):  # scale, so that squares neither overflow nor underflow
         diagonal[i] /= most
     for i in range(k - 1):
         off[i] /= most
@@ -141,7 +142,7 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
             r = sqrt(half * half + z * z)
             x = diagonal[first] - diagonal[last] + z * z / (half + (r if half > 0 else -r))
             z = off[first]
-            for i in range(first, last):  # chase the bulge outside the three diagonals
+            for i in range(first, last):  # chase the entry outside the three diagonals
                 r = sqrt(x * x + z * z)
                 c, s = (x / r, z / r) if r > 0 else (1.0, 0.0)
                 if i > first:
@@ -174,7 +175,7 @@ cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
     """Return True if the ratio of the Ritz values of FLAT_STEPS steps is ≤ FLAT_RATIO.
 
     The diagonal entries are Rayleigh quotients, which lie between the smallest and the
-    largest Ritz value, so that their ratio is a cheap first test.
+    largest Ritz value. The ratio of these entries is therefore a cheap first test.
     """
     cdef double theta[FLAT_STEPS]
     cdef double between[FLAT_STEPS]
@@ -209,11 +210,11 @@ def lanczos(Product F, Rows C, start, int steps):
 
     The Lanczos process with full reorthogonalisation takes one product per step, and at
     most rank(𝒫) steps. After the three-term recurrence, the vector is about as long as
-    the next β, so that one pass of reorthogonalisation suffices. The residual of the
-    pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
-    FLAT_STEPS steps if the spectrum `is_flat`: CG then needs few steps and no model. No
-    vectors are returned if the first pair has not converged, since no model would use
-    them.
+    the next β, so one pass of reorthogonalisation suffices. The residual of the pair
+    (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
+    FLAT_STEPS steps if the spectrum `is_flat`, because CG then needs few steps and no
+    model. If the first pair has not converged, no vectors are returned, because no
+    model would use them.
 
     C : rows that span the kernel of 𝒫
     """
@@ -280,15 +281,15 @@ def lanczos(Product F, Rows C, start, int steps):
     return values, residuals, vectors, at_start
 
 
-# The first Ritz pair counts as converged if its residual, relative to its value, is at
-# most this. After twelve steps the residual is at most 1e-12 on duals of contact
-# problems, and 1e-2 on a Laplacian. With 1 or 1e-14
+# Largest ratio of the residual of the first Ritz pair to its value at which the pair
+# counts as converged. After twelve steps, the relative residual is at most 1e-12 on
+# duals of contact problems, and 1e-2 on a Laplacian. With 1 or 1e-14,
 # `test_compiled_and_written_steps_are_the_same` fails.
 cdef double RITZ_RESIDUAL = 1e-3
 
 
-# 𝒫F𝒫 counts as zero if its norm is below this times the mean eigenvalue of F: several
-# hundred times 2⁻⁵³.
+# 𝒫F𝒫 counts as zero if its norm is at most this factor, which is several hundred times
+# 2⁻⁵³, times the mean eigenvalue of F.
 cdef double NORM_ROUNDING = 1e-13
 
 

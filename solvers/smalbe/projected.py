@@ -43,11 +43,11 @@ class Spectrum(NamedTuple):
 
 @dataclass(eq=False)
 class Projected:
-    """Result of steps 1 to 3 of SMALBE: the data of H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ, and b."""
+    """Result of steps 1 to 3 of SMALBE: data of H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ, and b."""
 
     F: Product
     rows: Rows
-    C: compiled.Rows  #: `rows` in the form for the compiled algorithm
+    C: compiled.Rows  #: `rows` for the compiled algorithm
     spectrum: Spectrum
     b: Vector
     bounds: tuple[Vector, Vector]  #: bounds of ν = x − x̃
@@ -57,7 +57,7 @@ class Projected:
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: preconditioner on the face; None to use the option `preconditioner`
     preconditioner: Preconditioner | None = None
-    #: incomplete factor of the free part of a sparse F in scaled variables, if any
+    #: incomplete factor of the free block of a sparse F in scaled variables, or None
     factor: compiled.IncompleteFactor | None = None
     #: stopping test by KKT residuals of the original QP; None if the test is on ‖g^P‖
     judge: compiled.Judge | None = None
@@ -78,9 +78,9 @@ class Projected:
 class OuterIteration(NamedTuple):
     """Result of one outer iteration."""
 
-    trace: str  #: letters of the steps of its inner run
-    M: float  #: precision M of its inner run
-    rho: float  #: penalty ρ of its inner run
+    trace: str  #: letters of the steps of the inner run
+    M: float  #: precision M of the inner run
+    rho: float  #: penalty ρ of the inner run
     infeasibility: float  #: ‖Cν‖
     lagrangian: float  #: L(ν, μ) with the μ of the inner run
 
@@ -105,7 +105,9 @@ class Iterate(NamedTuple):
 def projected_problem(
     qp: QP, find: Callable[[Product, compiled.Rows], Spectrum]
 ) -> Projected:
-    """Homogenise, project and normalise a QP, with one product and those of `find`.
+    """Homogenise, project and normalise a QP.
+
+    This takes one product in addition to the products of `find`.
 
     find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
     """
@@ -131,7 +133,7 @@ def projected_problem(
 
 
 def _diagonal(qp: QP) -> Vector:
-    """Return a copy of the diagonal of P; empty if the diagonal is unknown."""
+    """Return a copy of the diagonal of P, or an empty array if it is unknown."""
     if isinstance(qp.P, np.ndarray):
         return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()

@@ -14,20 +14,20 @@ cdef double gain_of_projection(MPRGP at) except? -1:
 cdef bint step_by_factor(MPRGP at) except -1:
     """Release components at bounds and step with the factor of the enlarged free set.
 
-    Let F be the free components and those at a bound from which −g points into the set.
-    With the projection Π onto the set,
+    Let F be the free components and the components at a bound from which −g points into
+    the set. With the projection Π onto the set,
 
         s = Π(x − M⁻¹g_F) − x,    x ← x + αs
 
     where M ≈ P_FF is the incomplete factorisation and α minimises the cost along s
-    within the set. This is a projected Newton step if M is exact. The boundary of a
-    contact zone moves by only one component in such a step, because only adjacent
-    components are released. Therefore `layers` of neighbours in the graph of P are
-    released too; those that the step would move out of the set stay at their bounds. If
-    most of these neighbours leave their bounds, the number of layers is doubled,
-    otherwise halved; it is reset to zero after an expansion. The step is accepted only
-    if the cost decreases by at least `gain_of_projection`; otherwise a gradient
-    projection step is taken, at the cost of one more product.
+    within the set. The step is a projected Newton step if M is exact. The boundary of a
+    contact zone moves by only one component in this step, because only adjacent
+    components are released. Therefore neighbours in the graph of P, up to a distance of
+    `layers` edges, are also released; a neighbour that the step would move out of the
+    set stays at its bound. If most of the neighbours leave their bounds, the number of
+    layers is doubled, otherwise halved. The number is reset to zero after an expansion.
+    The step is accepted only if the cost decreases by at least `gain_of_projection`;
+    otherwise a gradient projection step is taken, which costs one more product.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor

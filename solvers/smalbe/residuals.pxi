@@ -1,16 +1,17 @@
-# Upper bound of the KKT residuals of the original QP, without a product with P. Scales
-# and errors are defined as in `harness.verify.kkt`, with `harness/verify/scales.h`.
+# Upper bound of the KKT residuals of the original QP, computed without a product with
+# P. Scales and errors are defined as in `harness.verify.kkt`, by
+# `harness/verify/scales.h`.
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     """Return an upper bound of the worst of `harness.kkt_residuals`, without products.
 
-    The bound uses the smallest energy scale that `kkt_residuals` may use and attributes
-    nothing to rounding, so that a small bound implies small residuals. It is inf if it
-    cannot be evaluated.
+    The bound uses the smallest energy scale that `kkt_residuals` may use, and
+    attributes no part of a residual to rounding. A small bound therefore implies small
+    residuals. The result is inf if the bound cannot be evaluated.
 
     s : a `Solution` without multipliers of inequality rows
-    diagonal : diagonal of P (n,), empty for an operator without one
+    diagonal : diagonal of P (n,), empty for an operator without a known diagonal
     G : the equality rows, an array or an operator
     over : processes that share vectors (n,)
     """
@@ -94,7 +95,7 @@ cdef void terms_of_sparse_rows(
     CompressedRows G, const double *e, const double *x, const double *own_size,
     const double *size, double *missed, double *own, double *known
 ) noexcept:
-    """Compute `terms_of_rows` for sparse rows from Gᵀ (n, m); `own`, `known` start at 0."""
+    """Compute `terms_of_rows` from sparse Gᵀ (n, m); `own` and `known` are zeros."""
     cdef Py_ssize_t i
     cdef int j
     for i in range(G.k):

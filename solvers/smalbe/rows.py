@@ -1,22 +1,23 @@
-"""Equality rows Gx = e as orthonormal rows C, dense or with a sparse Cholesky factor.
+"""Equality rows Gx = e as orthonormal rows C, dense or with a sparse factor of GGᵀ.
 
-A few rows are orthonormalised by a pivoted QR factorisation, which also reveals their
-rank (`DenseRows`). Thousands of sparse rows, such as those for the rigid modes of
-subdomains, are only divided by their norms, and the operators
+A small number of rows is orthonormalised by a pivoted QR factorisation, which also
+reveals the rank (`DenseRows`). Thousands of sparse rows, such as the rows for the rigid
+modes of subdomains, are only divided by their norms, and the operators
 
     GGᵀ = LLᵀ,   C = L⁻¹G,   𝒫 = I − CᵀC = I − Gᵀ(GGᵀ)⁻¹G
 
-are applied by products with G and solves with L (`SparseRows`). Such rows must be
+are applied by products with G and solves with L (`SparseRows`). Sparse rows must be
 independent. The model of the penalty ρCᵀC (model.pxi) requires solves with G_F G_Fᵀ +
-κGGᵀ, where F are the free components of a face. This matrix differs from (1 + κ)GGᵀ
+κGGᵀ, where F denotes the free components of a face. This matrix differs from (1 + κ)GGᵀ
 only in rows with entries in bounded components. In contact problems, only a few
-subdomains have such rows. If these rows are ordered last, each face requires only a
-factorisation of their Schur complement (`harness.distributed.sparse.BorderedFactor`).
+subdomains have rows of this type. These rows are ordered last, so that each face
+requires only a factorisation of their Schur complement
+(`harness.distributed.sparse.BorderedFactor`).
 
 On several ranks, GGᵀ is the matrix of the *coarse problem*, with a row for each rigid
-mode of every subdomain. Each rank eliminates the rows that only its components enter
-(`_OverRanks`). If many rows are shared between ranks, every rank factorises the whole
-matrix instead.
+mode of every subdomain. Each rank eliminates the rows whose entries all belong to
+components of this rank (`_OverRanks`). If many rows are shared between ranks, every
+rank factorises the whole matrix instead.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ Mask: TypeAlias = NDArray[np.bool_]
 SparseColumns: TypeAlias = Any  #: a sparse array, `LocalRows` or `DistributedColumns`
 
 CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to ‖x̃‖∞ + ‖e‖∞
-RANK = 1e-13  #: smaller squared pivots of normalised rows count as rounding
-FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
-#: limit of rows with entries in bounded components, whose block is dense
+RANK = 1e-13  #: squared pivots of normalised rows below this value count as rounding
+FREE_RANK = 1e-10  #: singular values of C on a face below this value count as zero
+#: largest number of rows with entries in bounded components, whose block is dense
 MAX_BORDER = 2000
 #: a sparse G stays sparse if m·n exceeds this value
 MAX_DENSE_ENTRIES = 2000
@@ -87,7 +88,7 @@ class Rows(ABC):
     #: smallest pivot of the normalised rows; 1 if they are orthogonal
     least_pivot: float
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
-    consistent: bool  #: True if Gx = e has a solution
+    consistent: bool  #: True if Gx = e has a solution, up to rounding
     multipliers: Callable[[Vector], Vector]  #: function a (r,) ↦ y (m,) with Gᵀy = Cᵀa
 
     def project(self, v: Vector) -> Vector:
@@ -105,12 +106,12 @@ class Rows(ABC):
 
     @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        """Return the a (r,) that minimises ‖(r + Cᵀa)_F‖ on the free components F."""
+        """Return the minimiser a (r,) of ‖(r + Cᵀa)_F‖ on the free components F."""
 
 
 @dataclass(frozen=True, eq=False)
 class DenseRows(Rows):
-    """Equality rows whose C (r, n) is an array."""
+    """Equality rows with C (r, n) stored as an array."""
 
     C: NDArray[np.float64]
     GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
@@ -183,15 +184,15 @@ class GramFactor(Protocol):
 class WholeGram:
     """Cholesky factor of GGᵀ for all rows, replicated on every rank.
 
-    Active bounds of a face change only the block of GGᵀ for the rows with entries in
-    bounded components. These rows are the border of the factor; on each face, only
-    the Schur complement of the border is factorised again.
+    Active bounds of a face affect only the block of GGᵀ for the rows with entries in
+    bounded components. These rows are the border of the factor. On each face, only the
+    Schur complement of the border is factorised again.
     """
 
     unit: LocalRows | DistributedColumns  #: normalised rows G (r, n)
     matrix: Matrix  #: GGᵀ
     factor: BorderedFactor
-    has_border: bool  #: False if more than `MAX_BORDER` rows have bounded components
+    has_border: bool  #: False if the border would have more than `MAX_BORDER` rows
     bounded: NDArray[np.int64]  #: (b,) components with a bound
     #: (r, b) columns of G for these components
     of_bounded: LocalRows | DistributedColumns
@@ -232,8 +233,8 @@ class _OverRanks:
     """Factor of GGᵀ over ranks; each rank stores the rows with entries in its columns.
 
     The factor is described in `harness.distributed.factor`. Rows with entries in
-    bounded components are called *changing*, because active bounds of a face change
-    their block of GGᵀ.
+    bounded components are called *changing*, because active bounds of a face affect the
+    block of GGᵀ for these rows.
     """
 
     matrix: csc_array  #: G_p G_pᵀ with the columns G_p of rank p
@@ -261,7 +262,7 @@ class _OverRanks:
 
     @cached_property
     def _place(self) -> NDArray[np.int32]:
-        """Positions (k,) of the local rows in the border; −1 for all others."""
+        """Positions (k,) of the local rows in the border; −1 for all other rows."""
         place = np.full(self.matrix.shape[0], -1, dtype=np.int32)
         place[self.local.border] = np.arange(self.local.border.size)
         return place
@@ -271,9 +272,9 @@ class _OverRanks:
 class LocalRows:
     """Rows with entries in the columns of this process; products are sums over ranks.
 
-    Only Gᵀ is stored, row by row. Products with G and Gᵀ both pass over its rows in
-    order and access vectors (k,) at random. These vectors are short and stay in the
-    cache.
+    Only Gᵀ is stored, row by row. Products with G and Gᵀ both read the rows of Gᵀ in
+    order and access vectors (k,) in random order. These vectors are short and remain in
+    the cache.
     """
 
     transposed: CompressedRows  #: (n_p, k)
@@ -349,11 +350,11 @@ def is_sparse(G: Matrix) -> bool:
 
 
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
-    """Orthonormalise the rows of G (m, n); with a sparse factor if G `is_sparse`.
+    """Orthonormalise the rows of G (m, n), with a sparse factor if G `is_sparse`.
 
-    If sparse rows are linearly dependent, they are converted to a dense array. If this
-    array would exceed the memory limit, or the rows are distributed over ranks, a
-    maximal independent subset replaces them.
+    Linearly dependent sparse rows are converted to a dense array. If this array would
+    exceed the memory limit, or if the rows are distributed over ranks, the rows are
+    replaced by a maximal independent subset.
 
     bounded : (n,) mask of components with a bound
     """
@@ -382,7 +383,7 @@ def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
     Raises
     ------
     ValueError
-        If the selected rows turn out to be linearly dependent up to rounding.
+        If the selected rows are linearly dependent up to rounding.
 
     """
     gram = _gram(G)
@@ -508,7 +509,7 @@ def rows_over_ranks(
 
 
 def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:
-    """Return G_F G_Fᵀ for a mask F (n,) of columns; a small result as an array."""
+    """Return G_F G_Fᵀ for a mask F (n,) of columns; a small result is dense."""
     if isinstance(G, DistributedColumns):
         return G.gram(columns)
     if isinstance(G, LocalRows):

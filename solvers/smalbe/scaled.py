@@ -1,9 +1,9 @@
-"""Scaling of the variables of a sparse QP by √diag P, and the inverse transformation.
+"""Scaling of the variables of a sparse QP by √diag P, and its inverse.
 
 With D = diag(P) and y = D¹ᐟ²x, the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ² with unit
-diagonal (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all
-diagonal scalings it has nearly the least condition number). Bounds of x become bounds
-of y. The stopping test uses KKT residuals of the original QP (`compiled.Judge`).
+diagonal. This is Jacobi scaling, whose condition number is nearly the smallest among
+all diagonal scalings (van der Sluis, Numer. Math. 14, 1969, 14-23). Bounds of x become
+bounds of y. The stopping test uses KKT residuals of the original QP (`compiled.Judge`).
 """
 
 from __future__ import annotations
@@ -18,18 +18,19 @@ from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diag
 from mortarbench.solvers.smalbe.preconditioner import MAX_UNSCALED
 from mortarbench.solvers.smalbe.projected import Spectrum
 
-#: a negative sum Σⱼ Pᵢⱼwⱼ counts as zero down to this times −Pᵢᵢwᵢ
+#: a negative sum Σⱼ Pᵢⱼwⱼ counts as zero if its absolute value is at most this factor
+#: times Pᵢᵢwᵢ
 ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A QP in scaled variables, with data for its factor and the recovery of x."""
+    """A QP in scaled variables, with data to compute a factor and to recover x."""
 
-    given: QP
-    P: Matrix  #: P of `given`, in CSR or CSC format with sorted indices
-    diagonal: Vector  #: (n,) diagonal of this P
-    qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
+    original: QP
+    P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
+    diagonal: Vector  #: (n,) diagonal of P
+    qp: QP  #: QP in y = D¹ᐟ²x; `original` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
     #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
     norm: float
@@ -39,7 +40,7 @@ class Scaled:
 
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
-        """Scale a QP with bounds alone and a sparse P with a positive diagonal."""
+        """Scale a QP with bounds only and a sparse P with a positive diagonal."""
         P = _canonical(qp.P)
         diagonal = P.diagonal()
         root, scaled, one = np.sqrt(diagonal), qp, np.ones(diagonal.size)
@@ -76,12 +77,12 @@ class Scaled:
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
 
     def recovered(self, s: Solution) -> Solution:
-        """Return the point of the original QP; x is at a bound exactly where y is."""
-        if self.qp is self.given:
+        """Return the point of the original QP; components at bounds stay at bounds."""
+        if self.qp is self.original:
             return s
-        x = np.clip(s.x / self.root, self.given.lb, self.given.ub)
-        x = np.where(s.x <= self.qp.lb, self.given.lb, x)
-        x = np.where(s.x >= self.qp.ub, self.given.ub, x)
+        x = np.clip(s.x / self.root, self.original.lb, self.original.ub)
+        x = np.where(s.x <= self.qp.lb, self.original.lb, x)
+        x = np.where(s.x >= self.qp.ub, self.original.ub, x)
         return replace(s, x=x, z_box=s.z_box * self.root)
 
 

@@ -1,22 +1,23 @@
 """SMALBE: semimonotonic augmented Lagrangians for bounds, discs and equalities.
 
-Minimises ½xᵀFx − dᵀx subject to Gx = e and l ≤ x ≤ u (Dostál 2009, the paper's
-reference [3], Chapter 6; equation (2) of the paper), and to ‖x_I‖ ≤ r on discs. With
-discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's reference [12];
-Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps
-(mprgp.pxi).
+The method minimises ½xᵀFx − dᵀx subject to Gx = e, l ≤ x ≤ u, and ‖x_I‖ ≤ r on discs
+(Dostál 2009, the paper's reference [3], Chapter 6; equation (2) of the paper, without
+discs). With discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's
+reference [12]; Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with
+spectral steps (mprgp.pxi).
 
-1. Compute orthonormal rows C with the same span as the rows of G; transform e to match.
+1. Compute orthonormal rows C with the span of the rows of G; transform e accordingly.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
-4. Run the outer loop (outer.pxi) over MPRGP (mprgp.pxi); without equality rows it
-   consists of one run of MPRGP.
+4. Run the outer loop (outer.pxi) with MPRGP (mprgp.pxi) as the inner loop. Without
+   equality rows, there is a single run of MPRGP.
 
-New in this implementation: the Lanczos process that estimates the norm also yields the
-upper Ritz pairs. These pairs and C define a model of H (model.pxi), which determines
-the steps that change the face, preconditions CG on the face, and permits a large ρ
-without loss of conditioning. The presets reproduce the methods of other codes.
+One part of this implementation is new: the Lanczos process that estimates the norm also
+yields the upper Ritz pairs. These pairs and C define a model of H (model.pxi). The
+model determines the steps that change the face, preconditions CG on the face, and
+permits a large ρ without loss of conditioning. The presets reproduce the methods of
+other codes.
 """
 
 from __future__ import annotations
@@ -33,28 +34,32 @@ from mortarbench.solvers.smalbe.preconditioner import missing_data
 
 @dataclass(frozen=True)
 class SMALBE(Options):
-    """In-house SMALBE with MPRGP for bounds and equalities; uses only products with P.
+    """In-house SMALBE with MPRGP for bounds and equality rows.
 
-    Discs are also accepted; in space, they bound friction forces.
+    SMALBE needs only products with P. It also accepts discs, which bound friction
+    forces in three dimensions.
 
-    `tol` bounds ‖g^P‖/‖b‖, with the projected gradient g^P of the projected problem,
-    and ‖Gx − e‖/‖e‖. A point is reported as solved only if the KKT residuals of the
-    original QP are also within 5·tol.
+    `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
+    problem, and ‖Gx − e‖/‖e‖. The solver claims a solution only if the KKT residuals of
+    the original QP are also at most 5·tol.
     """
 
     about: ClassVar[About] = About(
         title="SMALBE (ours)",
         licence="BSD-3-Clause",
         method="augmented Lagrangian with an inner active-set method (MPRGP)",
-        linear_solver="none (products with P, small dense systems of its model, "
+        linear_solver="none (products with P, small dense systems of the model, "
         "incomplete factors of a sparse P)",
-        phases="preparing orthonormalises rows and runs the Lanczos process",
-        sequence="point, multipliers, Ritz pairs, factor of the free block",
+        phases="orthonormalisation of rows and Lanczos process (preparing); iterations "
+        "(solving)",
+        sequence="reuses the point, multipliers, Ritz pairs and the factor of the "
+        "free block",
         limits=(
-            "inequality rows are declined; the dual forms of a problem have none",
-            "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
-            "parallel rows, tolerances down to 1e-12), one solve ended with "
-            "`iteration_limit`",
+            "QPs with inequality rows are declined; dual forms have no inequality "
+            "rows.",
+            "In a test with 2100 difficult random QPs (ill-conditioned, degenerate, "
+            "with nearly parallel rows, tolerances down to 1e-12), one solve ended "
+            "with `iteration_limit`.",
         ),
     )
 
@@ -63,7 +68,7 @@ class SMALBE(Options):
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
-            return "takes bounds and equality rows, no inequality rows"
+            return "accepts bounds and equality rows, but no inequality rows"
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -75,10 +80,10 @@ class SMALBE(Options):
         return lambda qp: prepare(qp, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        """Start a sequence in which each QP passes its results to the next.
+        """Start a sequence in which each solve reuses results of the previous one.
 
-        The results are the point, the multipliers, the Ritz pairs and the factor of the
-        free block.
+        The reused results are the point, the multipliers, the Ritz pairs and the factor
+        of the free block.
         """
         carry: Carry | None = None
 

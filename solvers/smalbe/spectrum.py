@@ -16,7 +16,7 @@ class Ritz(NamedTuple):
     """Ritz pairs, in descending order of their values."""
 
     values: Vector  #: (k,)
-    #: (k,) ‖Hv − θv‖, a bound of the distance of θ from an eigenvalue
+    #: (k,) ‖Hv − θv‖, an upper bound of the distance of θ from an eigenvalue
     residuals: Vector
     #: (k, n) orthonormal rows; (0, n) if the first pair has not converged
     vectors: NDArray[np.float64]
@@ -24,13 +24,13 @@ class Ritz(NamedTuple):
 
     @property
     def norm(self) -> float:
-        """Largest Ritz value plus its residual: an upper bound of an eigenvalue."""
+        """Largest Ritz value plus its residual, used as an estimate of ‖H‖."""
         return float(self.values.item(0) + self.residuals.item(0))
 
 
 @lru_cache(maxsize=8)
 def random_start(n: int) -> Vector:
-    """Return a random vector (n,) with a fixed seed, for reproducible results."""
+    """Return a random vector (n,) that depends only on n."""
     start = np.random.default_rng(19640229).standard_normal(n)
     start.flags.writeable = False
     return start
@@ -39,8 +39,8 @@ def random_start(n: int) -> Vector:
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:
     """Estimate ‖H‖ to 1e-4 by PERMON's power method, with at most 50 products.
 
-    The iteration starts from a vector of ones. Its Rayleigh quotient is a lower bound
-    of ‖H‖ and is used without a safety factor, as in PERMON.
+    The iteration starts from a vector of ones. The last Rayleigh quotient is a lower
+    bound of ‖H‖ and is used without a safety factor, as in PERMON.
     """
     v = np.full(n, 1 / np.sqrt(n))
     estimate = 0.0

@@ -1,9 +1,9 @@
-/* Loops over vectors for MPRGP, also written in NumPy in
-   `tests/support/textbook/kernels.py`.
+/* Loops over vectors for MPRGP. `tests/support/textbook/kernels.py` contains the same
+   loops in NumPy.
 
-   Each function is compiled twice, for processors with AVX2 and FMA and for all others;
-   the loader chooses. Selections are written as expressions, so that the compiler can
-   process four components at once. */
+   Each function is compiled twice, for processors with AVX2 and FMA and for all
+   others; the loader selects the version. Conditions are written as conditional
+   expressions, so that the compiler can process four components at the same time. */
 
 #include <limits.h>
 #include <math.h>
@@ -23,8 +23,9 @@
 typedef const double *restrict in;
 typedef double *restrict out;
 
-/* Process four components at once. This is written out, because the vectoriser of the
-   compiler produces slower code for loops that accumulate several sums in one pass. */
+/* Four components that are processed at the same time. Loops use this type
+   explicitly, because the vectoriser of the compiler produces slower code for loops
+   that accumulate several sums in one pass. */
 typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 #define FOUR(a) (*(const four *) (a))
 #define EACH(s) ((four){(s), (s), (s), (s)})
@@ -36,9 +37,9 @@ INLINE double total(four t)
 
 #define BLOCK 256 /* components that stay in the cache from one loop to the next */
 
-/* A sparse symmetric matrix F (n, n), stored by rows, or, if `count` is not zero, by its
-   upper diagonals with offsets 0, o₁, o₂, …: column i of `diagonals` (count, n)
-   contains F[i, i + o]. */
+/* A sparse symmetric matrix F (n, n). If `count` is zero, F is stored by rows,
+   otherwise by its upper diagonals with offsets 0, o₁, o₂, …: column i of
+   `diagonals` (count, n) contains F[i, i + o]. */
 typedef struct {
     Py_ssize_t n, count;
     const int *indptr, *indices;
@@ -76,8 +77,8 @@ sum_of_terms(const double *const *f, const double *const *w, Py_ssize_t terms, d
     }
 }
 
-/* y = s F v for the rows from `first` to `last` of an F stored by diagonals; y begins at
-   row `first`. */
+/* y = s F v for the rows from `first` to `last` of a matrix F stored by diagonals; y
+   begins at row `first`. */
 INLINE void
 rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v,
                   out y)
@@ -97,7 +98,7 @@ rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, 
         f[terms] = whole + first + (shift < 0 ? shift : 0);
         w[terms++] = v + first + shift;
     }
-    if (missing) { /* near the first row and the last */
+    if (missing) { /* near the first or last row */
         memset(y, 0, size * sizeof(double));
         for (Py_ssize_t t = 0; t < terms; t++)
             for (Py_ssize_t j = from[t]; j < to[t]; j++)
@@ -137,13 +138,14 @@ TWICE static void sparse_product(const sparse *F, double s, in v, out y)
         some_rows(F, i, i + BLOCK < F->n ? i + BLOCK : F->n, s, v, y + i);
 }
 
-/* Half bandwidth: the largest |i − j| with F[i, j] ≠ 0, or n if F is stored by rows. */
+/* Return the half bandwidth, which is the largest |i − j| with F[i, j] ≠ 0; n if F
+   is stored by rows. */
 INLINE Py_ssize_t reach(const sparse *F)
 {
     return F->count ? F->offset[F->count - 1] : F->n;
 }
 
-/* p = φ − γp with φ = g on free components, zero on others; returns φᵀp. */
+/* p = φ − γp, where φ = g for free components and zero for others; return φᵀp. */
 INLINE double direction_block(in g, in free, double gamma, out p, Py_ssize_t n)
 {
     double slope = 0;
@@ -178,7 +180,7 @@ TWICE static void sparse_update_free_direction(const sparse *F, double s, in g, 
 }
 
 /* Write the offsets of the nonzero diagonals of F and return their number, or 0 if
-   there are more than `most`. slot (n,) is workspace. */
+   there are more than `most` diagonals. slot (n,) is workspace. */
 static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
                                  signed char *slot)
 {
@@ -205,7 +207,7 @@ static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *o
     return count;
 }
 
-/* Fill diagonals (count, n), initially zero, with slots written by `find_diagonals`. */
+/* Fill diagonals (count, n), initially zero; `find_diagonals` has written the slots. */
 static void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
 {
     for (Py_ssize_t i = 0; i < F->n; i++)
@@ -214,8 +216,8 @@ static void fill_diagonals(const sparse *F, const signed char *slot, double *dia
                 diagonals[slot[F->indices[k] - i] * F->n + i] += F->data[k];
 }
 
-/* y = s F v for symmetric F (n, n), of which the lower triangle is read, four rows in
-   one pass over v and y. */
+/* y = s F v for a symmetric F (n, n). The lower triangle of F is read, with four
+   rows in each pass over v and y. */
 TWICE static void symmetric_product(in F, double s, in v, out y, Py_ssize_t n)
 {
     Py_ssize_t i = 0;
@@ -279,7 +281,7 @@ TWICE static void copy_scaled(double s, in a, out b, Py_ssize_t n)
         b[i] = s * a[i];
 }
 
-/* z = s z on the free components, zero on the others; returns zᵀv. */
+/* z = s z for free components, and zero for others; return zᵀv. */
 TWICE static double scale_free(double s, in free, in v, out z, Py_ssize_t n)
 {
     double along = 0;
@@ -303,8 +305,8 @@ TWICE static int same(in a, in b, Py_ssize_t n)
     return 1;
 }
 
-/* c = Uv for `rows` rows U in one pass over v. If the rows are few, each has two partial
-   sums, because additions to a single sum would wait for each other. */
+/* c = Uv for `rows` rows U in one pass over v. If there are few rows, each row has
+   two partial sums, because additions to a single sum would wait for each other. */
 INLINE void some_rows_times(in U, in v, out c, Py_ssize_t rows, Py_ssize_t n)
 {
     four t[8], s[8];
@@ -327,7 +329,7 @@ INLINE void some_rows_times(in U, in v, out c, Py_ssize_t rows, Py_ssize_t n)
     }
 }
 
-/* c = U v for U (k, n) by rows. */
+/* c = U v for U (k, n) stored by rows. */
 TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
 {
     Py_ssize_t i = 0;
@@ -345,7 +347,7 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     }
 }
 
-/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows u of U, in one pass over v, which may be y. */
+/* y = v + c₀u₀ + c₁u₁ + … for `rows` rows u of U, in one pass over v; v may be y. */
 INLINE void
 add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_ssize_t n)
 {
@@ -364,8 +366,9 @@ add_rows(in U, const double *c, const double *v, double *y, Py_ssize_t rows, Py_
     }
 }
 
-/* y = v + s Uᵀc for U (k, n) stored by rows, with one pass over v for up to eight rows; v
-   may be y. The last rows come first, because `rows_times` leaves them in the L1 cache. */
+/* y = v + s Uᵀc for U (k, n) stored by rows, with one pass over v for up to eight
+   rows; v may be y. The last rows are processed first, because they are in the L1
+   cache after `rows_times`. */
 TWICE static void combination(double s, in U, in c, const double *v, double *y,
                               Py_ssize_t k, Py_ssize_t n)
 {
@@ -397,18 +400,20 @@ add_combination(double s, in U, in c, double *y, Py_ssize_t k, Py_ssize_t n)
     combination(s, U, c, y, y, k, n);
 }
 
-typedef long long __attribute__((may_alias)) ordered; /* as doubles ≥ 0 are */
+typedef long long __attribute__((may_alias)) ordered; /* nonnegative doubles have the
+same order as these integers */
 typedef long long __attribute__((vector_size(32))) mask;
 
 #define CHOSEN(m, a, b) ((four) (((m) & (mask) (a)) | (~(m) & (mask) (b))))
 #define ABSOLUTE(a) \
     ((four) ((mask) (a) & (mask){LLONG_MAX, LLONG_MAX, LLONG_MAX, LLONG_MAX}))
 
-/* Return the α at which x - αp reaches the first bound within a block, or `least` if that
-   is smaller. Adds pᵀHp to result[3] and gᵀp to result[2] unless result is NULL.
+/* Return the α at which x - αp reaches the first bound within a block, or `least` if
+   `least` is smaller. Unless result is NULL, add pᵀHp to result[3] and gᵀp to
+   result[2].
 
-   Most blocks reach no bound before α = `least`. The test for this needs no division, so
-   divisions are left to the few blocks that pass it. */
+   Most blocks reach no bound before α = `least`. The test of this condition needs no
+   division, so divisions are necessary only in the few remaining blocks. */
 INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
                             double least, out result)
 {
@@ -472,9 +477,9 @@ update_direction_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssiz
     }
 }
 
-/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Hp = s F p is computed block by block
-   in the same pass over memory. If `is_update`, p = φ − γp is computed just before, as
-   far as the product with the block reads p. */
+/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Hp = s F p is computed block by
+   block in the same pass over memory. If `is_update`, the components of p = φ − γp
+   that the product of a block reads are computed just before this product. */
 INLINE void find_lengths(const sparse *F, double s, int is_update, double gamma, in x,
                          in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
                          out result)
@@ -512,7 +517,7 @@ INLINE double first_of_blocks(in x, in p, in lower, in upper, double least, Py_s
     return least;
 }
 
-/* Return the α at which x - αp reaches its first bound; inf if it reaches none.
+/* Return the α at which x - αp reaches its first bound, or inf if it reaches no bound.
 
    upper : NULL if no component has an upper bound */
 TWICE static double first_bound(in x, in p, in lower, in upper, Py_ssize_t n)
@@ -520,7 +525,7 @@ TWICE static double first_bound(in x, in p, in lower, in upper, Py_ssize_t n)
     return first_of_blocks(x, p, lower, upper, INFINITY, n);
 }
 
-/* result = α_cg, α_f if that is smaller than α_cg, else inf, gᵀp, pᵀHp of x - αp.
+/* result = α_cg, α_f, gᵀp, pᵀHp of x - αp; inf instead of α_f if α_f ≥ α_cg.
 
    upper : NULL if no component has an upper bound */
 TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
@@ -547,7 +552,7 @@ TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *
         find_lengths(F, s, 0, 0, x, g, p, Hp, lower, NULL, F->n, result);
 }
 
-/* p = φ − γp with the free gradient φ at x, and the `sparse_lengths` along it. */
+/* p = φ − γp with the free gradient φ at x, and the `sparse_lengths` along p. */
 TWICE static void sparse_update_direction(const sparse *F, double s, double gamma, in x, in g,
                               double *p, out Hp, in lower, in upper, out result)
 {
@@ -557,7 +562,7 @@ TWICE static void sparse_update_direction(const sparse *F, double s, double gamm
         find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, result);
 }
 
-/* Return x - step, or the bound if that is within rounding of it. */
+/* Return x - step, or a bound if x - step is within rounding of this bound. */
 INLINE double moved(double x, double step, double lower, double upper)
 {
     double to = x - step, noise = ROUNDING * (fabs(x) + fabs(step));
@@ -576,7 +581,7 @@ move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize
     }
 }
 
-/* `split` for a block; adds to result. */
+/* `split` for a block; add the sums to result. */
 INLINE void
 split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ssize_t n,
             out result)
@@ -602,10 +607,11 @@ split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ss
     result[2] += reduced;
 }
 
-/* x = x - αp and g = g - αHp; components within rounding of a bound are set to it. x₀, g₀
-   and `free` (1 on the face, else 0) receive the previous state. box_lower, box_upper:
-   receive the box for the next step, in which components at bounds are fixed unless
-   `release`. z, z_g: receive x - βp and the gradient there. */
+/* x = x - αp and g = g - αHp; components within rounding of a bound are set to this
+   bound. x₀, g₀ and `free` (1 on the face, else 0) receive the previous state.
+   box_lower and box_upper receive the box for the next step, in which components at
+   bounds are fixed unless `release` is true. z and z_g receive x - βp and the
+   gradient at this point. */
 TWICE static void leave_box(double alpha, double beta, int release, out x, out g, in p, in Hp,
                         in lower, in upper, out x0, out g0, out free, out box_lower,
                         out box_upper, out z, out z_g, Py_ssize_t n)
@@ -626,8 +632,8 @@ TWICE static void leave_box(double alpha, double beta, int release, out x, out g
     }
 }
 
-/* Compute φ and `free` (1 on free components, else 0); result = ‖φ‖², ‖β‖², φ̃ᵀφ with
-   ᾱ = 1/τ. */
+/* Compute φ and `free` (1 for free components, else 0); result = ‖φ‖², ‖β‖², φ̃ᵀφ
+   with ᾱ = 1/τ. */
 TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out free,
                         Py_ssize_t n, out result)
 {
@@ -690,8 +696,8 @@ INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upp
     }
 }
 
-/* x = x - αp and g = g - αHp, components within rounding of a bound set to it, and
-   `split`, in one pass over memory; result[3] = φᵀHp.
+/* x = x - αp and g = g - αHp, with components within rounding of a bound set to this
+   bound, then `split`, in one pass over memory; result[3] = φᵀHp.
 
    upper : NULL if no component has an upper bound
    phi, free : NULL if not needed */
@@ -724,15 +730,15 @@ INLINE double within_block(in x, in from, in g, in lower, in upper, int release,
     return slope;
 }
 
-/* s = x + s - from, with x + s set to a bound within rounding of it; zero on components
-   that the box fixes, unless `release`. Returns gᵀs. */
+/* s = x + s - from, with x + s set to a bound within rounding of it. Unless
+   `release` is true, s is zero for components that the box fixes. Return gᵀs. */
 TWICE static double within(in x, in from, in g, in lower, in upper, int release, out s,
                            Py_ssize_t n)
 {
     return within_block(x, from, g, lower, upper, release, s, n);
 }
 
-/* r = x - s - z and its product Hr = g - Hs - z_g; z = r; result = ‖r‖², rᵀHr. */
+/* z = r with r = x - s - z; result = ‖r‖², rᵀHr with Hr = g - Hs - z_g. */
 TWICE static void rest_of_step(in x, in g, in s, in Hs, in z_g, out z, Py_ssize_t n,
                                out result)
 {
@@ -747,7 +753,7 @@ TWICE static void rest_of_step(in x, in g, in s, in Hs, in z_g, out z, Py_ssize_
     result[1] = curvature;
 }
 
-/* p = z - γp; returns zᵀp. */
+/* p = z - γp; return zᵀp. */
 TWICE static double update_direction(in z, double gamma, out p, Py_ssize_t n)
 {
     double slope = 0;
@@ -775,7 +781,8 @@ TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in fre
     result[1] = phi_Hp;
 }
 
-/* columns = Uᵀ, stored with `stride` numbers per row; entries from k on are untouched. */
+/* columns = Uᵀ, stored with `stride` numbers per row; entries from k on are
+   unchanged. */
 TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
                              Py_ssize_t stride)
 {
@@ -784,13 +791,13 @@ TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
             columns[i * stride + j] = U[j * n + i];
 }
 
-/* S = S + Σ sᵢ vᵢvᵢᵀ over four rows vᵢ of V (n, k), with k a multiple of four; only the
-   upper triangle of S (k, k) is valid. */
+/* S = S + Σ sᵢ vᵢvᵢᵀ over four rows vᵢ of V (n, k), where k is a multiple of four.
+   Only the upper triangle of S (k, k) is valid. */
 TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_t k)
 {
     in v0 = V + row[0] * k, v1 = V + row[1] * k, v2 = V + row[2] * k;
     in v3 = V + row[3] * k;
-    for (Py_ssize_t i = 0; i < k; i += 2) { /* two rows of S share the vectors */
+    for (Py_ssize_t i = 0; i < k; i += 2) { /* two rows of S use the same vectors */
         four a0 = EACH(s[0] * v0[i]), a1 = EACH(s[1] * v1[i]), a2 = EACH(s[2] * v2[i]);
         four a3 = EACH(s[3] * v3[i]), b0 = EACH(s[0] * v0[i + 1]);
         four b1 = EACH(s[1] * v1[i + 1]), b2 = EACH(s[2] * v2[i + 1]);
@@ -803,14 +810,14 @@ TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_
     }
 }
 
-/* Write to `where` the components at which is_active (1 or 0) differs from piece ≠ 0, and
-   update is_active; returns their number. */
+/* Write to `where` the components for which is_active (1 or 0) differs from piece ≠
+   0, and update is_active; return the number of these components. */
 TWICE static Py_ssize_t changed(in piece, out is_active, Py_ssize_t n, int *restrict where)
 {
     Py_ssize_t count = 0;
     four zero = EACH(0);
     for (Py_ssize_t i = 0; i < n; i += 8) {
-        if (i + 8 <= n) { /* few blocks have any */
+        if (i + 8 <= n) { /* few blocks contain a difference */
             mask other = ((FOUR(piece + i) != zero) ^ (FOUR(is_active + i) != zero))
                          | ((FOUR(piece + i + 4) != zero) ^ (FOUR(is_active + i + 4) != zero));
             if (!(other[0] | other[1] | other[2] | other[3]))
@@ -826,8 +833,8 @@ TWICE static Py_ssize_t changed(in piece, out is_active, Py_ssize_t n, int *rest
     return count;
 }
 
-/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in arrays (stride, stride) with `stride` a
-   multiple of four; `root` and G have zeros from column k on. */
+/* S = τI + W¹ᐟ²GW¹ᐟ² (k, k), upper triangle, in arrays (stride, stride), where
+   `stride` is a multiple of four. From column k on, `root` and G contain zeros. */
 TWICE static void scaled(in root, in G, double tau, out S, Py_ssize_t k,
                          Py_ssize_t stride)
 {
@@ -865,8 +872,8 @@ TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t
     return 1;
 }
 
-/* y = S⁻¹y with the factors of S from `eliminated`, four components at once; y has
-   `stride` components, and those from k on become zero. */
+/* y = S⁻¹y with the factors of S from `eliminated`, four components at the same
+   time. y has `stride` components; components from k on become zero. */
 TWICE static void solve(const double *R, const double *inverse, double *y,
                         Py_ssize_t stride)
 {
@@ -916,8 +923,8 @@ INLINE void model_minimiser_block(in x, in g, double tau, in lower, in upper, ou
     }
 }
 
-/* s = argmin gᵀs + τ/2‖s‖² over the box; piece: -1 at the lower bound, 1 at the upper, 0
-   between; NULL if not needed. */
+/* s = argmin gᵀs + τ/2‖s‖² over the box. piece receives -1 for components at the
+   lower bound, 1 at the upper bound, else 0; NULL if not needed. */
 TWICE static void model_minimiser(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
@@ -927,8 +934,8 @@ TWICE static void model_minimiser(in x, in g, double tau, in lower, in upper, ou
         model_minimiser_block(x, g, tau, lower, upper, s, NULL, n);
 }
 
-/* `model_minimiser` from x, then `within`, in one pass over memory. Returns gᵀs with the
-   gradient g at `from`. */
+/* `model_minimiser` from x, then `within`, in one pass over memory. Return gᵀs with
+   the gradient g at `from`. */
 TWICE static double model_minimiser_within(in x, in x_g, double tau, in from, in g, in lower,
                                   in upper, out s, Py_ssize_t n)
 {
@@ -954,7 +961,7 @@ TWICE static void projected(in x, in g, double tau, in lower, in upper, out y,
     }
 }
 
-/* s = -s; returns 1 if s ≠ 0, else 0. */
+/* s = -s; return 1 if s ≠ 0, else 0. */
 TWICE static int negate(out s, Py_ssize_t n)
 {
     Py_ssize_t any = 0;
@@ -967,7 +974,7 @@ TWICE static int negate(out s, Py_ssize_t n)
 
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 #define SMALLER(a, b) ((a) < (b) ? (a) : (b))
-#define MOST(a, b) CHOSEN((a) > (b), a, b) /* b where a is not a number */
+#define MOST(a, b) CHOSEN((a) > (b), a, b) /* b if a is NaN */
 
 INLINE double largest_of(four t)
 {
@@ -975,9 +982,9 @@ INLINE double largest_of(four t)
     return LARGER(a, b);
 }
 
-/* x = shift + ν, clipped to [lb, ub], and equal to lb or ub where ν is at its bound: the
-   sum alone may differ from the bound in the last bit. `free` is 1 where ν is at no
-   bound. */
+/* x = shift + ν, clipped to [lb, ub]. If a component of ν is at its bound, x is set
+   to lb or ub, because the sum may differ from the bound in the last bit. `free` is
+   1 for components off the bounds, else 0. */
 TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, out x,
                            out free, Py_ssize_t n)
 {
@@ -991,7 +998,7 @@ TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, ou
     }
 }
 
-/* z = multipliers of the bounds that ν is at, from the gradient g without them. */
+/* z = multipliers of the active bounds of ν, from the gradient g without these. */
 TWICE static void bound_multipliers(in nu, in lower, in upper, in g, out z, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -1007,8 +1014,8 @@ TWICE static void masked(in free, in a, out t, Py_ssize_t n)
         t[i] = free[i] * a[i];
 }
 
-/* Return Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components along which the cost decreases within the
-   box and whose gradient exceeds `noise`. */
+/* Return Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components whose gradient exceeds `noise` and
+   for which the direction of descent is feasible. */
 TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
                                   double noise, Py_ssize_t n)
 {
@@ -1022,10 +1029,10 @@ TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, d
     return total;
 }
 
-/* Terms of the energy of a point with forces = Gᵀy + z: sums = xᵀFx, qᵀx, work of the
-   bounds; most = largest |z (x - bound)|, largest component of size; size (n,) =
-   max(|Fx|, |q|, |forces|) by components. Returns the smallest positive diagonal entry,
-   inf if there is none, -1 if x violates a bound. */
+/* Compute terms of the energy of a point, with forces = Gᵀy + z: sums = xᵀFx, qᵀx,
+   work of the bounds; most = largest |z (x - bound)|, largest component of size;
+   size (n,) = max(|Fx|, |q|, |forces|) by components. Return the smallest positive
+   diagonal entry, or inf without a positive entry, or -1 if x violates a bound. */
 TWICE static double
 terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, out size,
                 Py_ssize_t n, out sums, out most)
@@ -1076,8 +1083,8 @@ terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, o
     return outside ? -1 : least;
 }
 
-/* Return the largest error of stationarity, but at least `worst`; forces become the
-   residual Fx + q + forces. Returns inf if a residual is not finite. */
+/* Return the largest error of stationarity or `worst`, whichever is larger, or inf
+   if a residual is not finite; forces receive the residual Fx + q + forces. */
 TWICE static double
 worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, in lb,
                 in ub, in size, out forces, Py_ssize_t n, double worst)
@@ -1096,7 +1103,8 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
         all += r;
         at_most = LARGER(r, at_most);
     }
-    /* the worst error is at least at_most / largest, so few components must be examined */
+    /* the largest error is at least at_most / largest, so few components must be
+       examined */
     worst = LARGER(at_most / largest, worst);
     for (Py_ssize_t i = 0; i < n; i++) {
         double r = fabs(forces[i]), step, room;
@@ -1110,8 +1118,8 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
     return isfinite(all) ? worst : INFINITY;
 }
 
-/* size = scale of each variable from the energy, 0 if the energy defines none; own = scale
-   without the energy. */
+/* size = scale of each variable from the energy, or 0 if the energy defines no
+   scale; own = scale without the energy. */
 TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in Fx, out size,
                                      out own, Py_ssize_t n)
 {

@@ -899,8 +899,8 @@ def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypat
     )
     export(QP.from_arrays([[1.0]], [0.0], G=[[1.0]], h=[1.0]), "a.npz")
     assert declined("file:a.npz", "smalbe") == (
-        "mortarbench: smalbe declines file:a.npz: takes bounds and equality rows, no "
-        "inequality rows\n"
+        "mortarbench: smalbe declines file:a.npz: accepts bounds and equality rows, "
+        "but no inequality rows\n"
     )
     assert "dualise" not in declined(f"{case}/primal", "feti")
     sliding = "greco/n=2/dim=3"  # friction on cones, and on discs in the dual

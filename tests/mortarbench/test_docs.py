@@ -127,7 +127,10 @@ def test_the_page_of_solvers_tells_the_facts_of_each():
         for fact in (facts.licence, facts.phases, *facts.limits) if facts else ():
             assert fact in page
     assert "| `max_iter` | 250 | 250 | 250 |  |" in page
-    assert "| `backend` | 'auto' | 'dense' | 'sparse' | auto: as P is stored |" in page
+    assert (
+        "| `backend` | 'auto' | 'dense' | 'sparse' | auto: dense if P is dense |"
+        in page
+    )
 
 
 def test_every_family_and_suite_that_commands_name_exists():

@@ -1,8 +1,9 @@
-"""Extension of griffe that converts our docstrings to numpydoc for the API reference.
+"""Extension of griffe that converts docstrings to numpydoc for the API reference.
 
-Our docstrings describe an argument as ``tol : relative accuracy``, since its type is in
-the signature. In numpydoc, the type follows the colon, and the description is on the
-lines below. Attributes are described by comments ``#:`` beside or above them.
+Docstrings of this project describe an argument as ``tol : relative accuracy``, because
+its type is in the signature. In numpydoc, the type follows the colon, and the
+description is on the next lines. Comments ``#:`` beside or above attributes describe
+these attributes.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import griffe
 #: names of one or more arguments, and their description with indented further lines
 _ENTRY = r"\w+(?:, \w+)* : .*\n(?: +.*\n)*"
 _ENTRIES = re.compile(rf"(?:\A|(?<=\n\n))(?:{_ENTRY})+(?=\n|\Z)")
-#: asterisk after a letter, as in u*, which Markdown would interpret as emphasis
+#: asterisk after a letter, as in u*, which Markdown would interpret as start of
+#: emphasis
 _STAR = re.compile(r"(?<=\w)\*(?!\*)")
 _SECTION = re.compile(rf"(?<=\nParameters\n----------\n)(?:{_ENTRY})+")
 
@@ -72,7 +74,7 @@ def as_numpydoc(text: str) -> str:
 
 
 def beside(lines: list[str], first: int, last: int) -> str:
-    """Return the text of comments ``#:`` on lines, or else directly above these.
+    """Return the text of comments ``#:`` on given lines or, if empty, directly above.
 
     first, last : indices of the lines of an attribute
     """

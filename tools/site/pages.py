@@ -34,7 +34,7 @@ PAGES = {
 FORMULA = re.compile(
     r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
 )
-#: asterisk of a formula, as in u*, that Markdown has interpreted as start of emphasis
+#: asterisk of a formula, as in u*, that Markdown has interpreted as emphasis
 SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
 HELP = "<!-- help of every command -->"  #: placeholder in commands.md for help texts
 #: environment variables of notebooks and help texts: one thread, 80 columns
