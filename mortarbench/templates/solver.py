@@ -50,7 +50,7 @@ class Solver:
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP, and return a function that solves the QP. Both are timed."""
+        """Convert the QP; return a function that solves it. Both steps are timed."""
         P, A, G = (
             M if isinstance(M, np.ndarray) else M.toarray() for M in (qp.P, qp.A, qp.G)
         )

@@ -360,8 +360,8 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
     code, out, _ = cli(*asked, "--strict")
     assert code == 1
     assert out.splitlines()[-1] == (
-        "strict: 1 answer that refutes its claim (liar on well/depth=2/dual) and 1 "
-        "measurement without an answer (lost on well/depth=2/dual)"
+        "strict: 1 refuted claim (liar on well/depth=2/dual) and 1 measurement "
+        "without an answer (lost on well/depth=2/dual)"
     )
     good = (*asked, "--solver", "exact", "--solver", "picky")
     assert cli(*good, "--strict")[0] == 0  # one declined; the others are not asked for

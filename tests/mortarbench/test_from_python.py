@@ -258,7 +258,7 @@ def test_a_point_is_verified_with_and_without_its_multipliers():
     assert alone.multipliers.z == pytest.approx([0.5], abs=1e-15)
     assert found.residuals == (0, 0, 0, 0)
     assert found.objective == -0.625
-    assert repr(alone).startswith("<verified: off the proven optimum by 0")
+    assert repr(alone).startswith("<verified: error 0 relative to the proven optimum")
 
 
 def test_a_point_that_is_not_optimal_is_refuted():
@@ -486,7 +486,10 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
     ("call", "message"),
     [
         (lambda: mb.solve(None, "clarabel"), "case = None; expected the name of a cas"),
-        (lambda: mb.solve(Path("a.npz"), "clarabel"), "QP; a file is 'file:a.npz'"),
+        (
+            lambda: mb.solve(Path("a.npz"), "clarabel"),
+            "QP; write 'file:a.npz' for a file",
+        ),
         (
             lambda: mb.solve(QP, None),
             "solver = None; expected the name of a solver, or",

@@ -97,7 +97,7 @@ def test_an_answer_says_what_the_mesh_adds_to_its_error():
         for name in ("contact-patch/primal", "cantilever/ny=1/primal")
     )
 
-    assert "the mesh adds more" in repr(patch)
+    assert "the discretisation error is not included" in repr(patch)
     assert patch.mesh_error().kind == "rounding"
     assert str(patch.mesh_error()).startswith("less than ")
     assert str(beam.mesh_error()).startswith("unknown: ")

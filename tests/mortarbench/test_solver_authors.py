@@ -260,7 +260,7 @@ def test_nothing_is_written_over(starting, tmp_path, kind):
         (("solver", "a/b"), "name 'a/b'; expected letters, digits, '-' and '_'"),
         (("solver", "../b"), "name '../b'; expected letters"),
         (("solver", ""), "name ''; expected letters"),
-        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', a lett"),
+        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', start"),
         (("familie", "b"), "argument kind: invalid choice: 'familie' (choose from"),
     ],
 )
