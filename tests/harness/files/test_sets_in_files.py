@@ -157,9 +157,7 @@ def test_mat_and_parquet_with_broken_sets_are_refused(tmp_path):
 
 
 def test_qps_holds_no_sets(tmp_path):
-    with pytest.raises(
-        mb.InputError, match="QPS has no sets of the kind Discs; expect"
-    ):
+    with pytest.raises(mb.InputError, match="QPS cannot store Discs; expect"):
         mb.export(qp_over(*SETS["discs"]), tmp_path / "qp.qps")
     assert not [*tmp_path.iterdir()]
 
