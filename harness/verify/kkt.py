@@ -36,7 +36,7 @@ ROUNDING = 8 * float(np.finfo(float).eps)
 #: fraction is added twice, for the uncertainty of the optimum and for rounding. The
 #: total is below 1e-3, so that three digits of the objective are correct. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
-#: `test_what_is_left_when_terms_cancel_is_known_exactly` fails.
+#: `test_cancelling_terms_are_evaluated_exactly` fails.
 NEGLIGIBLE = 2e-4
 #: Smallest scale of energy, as a fraction of a natural energy (`_natural_energies`).
 #: If the energy of a point is smaller, for instance near x = 0, errors are divided by
@@ -544,7 +544,7 @@ def _sizes_from_rows(
 
     A row of G is active if its slack is negligible. Inactive rows are omitted, because
     the large right-hand side of a distant row would hide the violation of another row
-    (`test_a_row_that_is_far_away_excuses_no_violation`).
+    (`test_a_remote_row_hides_no_violation`).
     """
     size, has_size = np.abs(x), has_size.copy()
     rows = [

@@ -6,7 +6,7 @@ cdef enum:
     # the ends of its interval, so that 60 steps shrink it to 5 % at most. If Newton's
     # method does not end, the step is taken with the model norm·I of the largest
     # eigenvalue. Without the search
-    # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
+    # `test_friction_takes_fewer_products_than_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
 

@@ -398,7 +398,7 @@ cdef class Rows:
 
 
 # If ‖x̃‖/‖ν‖ is below this, x̃ counts as rounding of e = 0: several hundred times 2⁻⁵³.
-# Without it `test_a_right_hand_side_of_rounding_is_none` fails.
+# Without it `test_a_right_hand_side_of_rounding_size_counts_as_zero` fails.
 cdef double SHIFT_ROUNDING = 1e-13
 # Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face with free
 # components F: smaller eigenvalues of G_F G_Fᵀ relative to GGᵀ count as zero.

@@ -4,7 +4,7 @@
 # Largest penalty. At this value the rounding of ρQν, 2⁻⁵³ρ‖ν‖, reaches 1e-6·‖ν‖; with
 # larger values it would dominate the gradient. Without a limit models become indefinite
 # (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`); with 1e3
-# `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
+# `test_a_stalled_multiplier_increases_the_penalty` fails.
 cdef double MAX_RHO = 1e10
 # Limit of the total number of products, relative to their number when the gradient is
 # small enough: the reduction of the energy error may cost a quarter more
@@ -12,7 +12,7 @@ cdef double MAX_RHO = 1e10
 cdef double ENERGY_BUDGET = 1.25
 # Smallest τ of a model relative to the norm: steps are at most 1e4 times as long as
 # those of ordinary gradient projection. With zero, an F of low rank leads to τ = 0 and
-# thus to no step (`test_what_once_failed`).
+# thus to no step (`test_earlier_failures_do_not_recur`).
 cdef double MIN_TAIL = 1e-4
 # ‖g^P‖ in units of tol‖b‖: the KKT residual is first evaluated below FIRST_JUDGED;
 # below MOST_JUDGED it is no longer decisive. At a KKT residual of 1e-6, strings have

@@ -65,7 +65,7 @@ def orthonormal(G, e):
 
 
 # Pivots of normalised rows below this are rounding: several hundred times 2⁻⁵³. With
-# zero `test_a_repeated_row_must_ask_for_the_same` fails, with 1e-9
+# zero `test_repeated_rows_need_equal_right_hand_sides` fails, with 1e-9
 # `test_nearly_parallel_rows_are_independent` does.
 cdef double RANK = 1e-13
 
@@ -283,7 +283,7 @@ def lanczos(Product F, Rows C, start, int steps):
 # The first Ritz pair counts as converged if its residual, relative to its value, is at
 # most this. After twelve steps the residual is at most 1e-12 on duals of contact
 # problems, and 1e-2 on a Laplacian. With 1 or 1e-14
-# `test_compiled_and_written_steps_are_the_same` fails.
+# `test_compiled_steps_and_textbook_steps_are_the_same` fails.
 cdef double RITZ_RESIDUAL = 1e-3
 
 

@@ -15,7 +15,7 @@ UPPER = np.array([[2.0, 1.0], [0.0, 2.0]])
 
 
 @pytest.mark.parametrize("kind", [np.asarray, csc_matrix, csr_array, coo_array, list])
-def test_matrices_of_every_kind_make_the_same_qp(kind):
+def test_matrices_of_every_type_define_the_same_qp(kind):
     P, G = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 1.0], [0.0, 2.0]])
     as_kind = (lambda M: M.tolist()) if kind is list else kind
     qp = QP.from_arrays(as_kind(P), [1, 2], as_kind(G), [3, 4], as_kind(G[:1]), [5])
@@ -50,7 +50,7 @@ def test_columns_and_rows_are_vectors():
 
 
 @pytest.mark.parametrize("kind", [np.array, csc_matrix])
-def test_the_arrays_that_were_given_stay_writable_and_apart(kind):
+def test_the_passed_arrays_stay_writable_and_are_copied(kind):
     P, q = kind(I2), np.ones(2)
     qp = QP.from_arrays(P, q)
     P[0, 0], q[0] = 7, 7
@@ -59,7 +59,7 @@ def test_the_arrays_that_were_given_stay_writable_and_apart(kind):
     assert qp.q.tolist() == [1, 1]
 
 
-def test_entries_of_one_place_are_added_up():
+def test_duplicate_entries_are_summed():
     twice = coo_array(([1.0, 1.0, 1.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
 
     assert QP.from_arrays(twice, ZERO).P.toarray().tolist() == [[2, 0], [0, 1]]
@@ -114,7 +114,7 @@ WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)
         ({"sets": (1,)}, "expected a tuple of convex sets in addition to lb"),
     ],
 )
-def test_what_is_no_qp_is_refused_in_one_line(changes, message):
+def test_invalid_qp_data_are_refused_in_one_line(changes, message):
     with pytest.raises(InputError, match=message) as e:
         QP.from_arrays(**{"P": I2, "q": ZERO, **changes})
     assert "\n" not in str(e.value)

@@ -108,7 +108,7 @@ def campaign(tmp_path_factory):
     return where
 
 
-def test_of_a_suite_that_grew_only_the_missing_is_measured(campaign):
+def test_an_extended_suite_measures_only_missing_results(campaign):
     before, after = (
         next((campaign / name / "journal").glob("*.jsonl")).read_bytes()
         for name in ("before", "grown")
@@ -128,7 +128,7 @@ def test_of_a_suite_that_grew_only_the_missing_is_measured(campaign):
     assert len(again) == 36  # nothing is left
 
 
-def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(campaign):
+def test_solvers_of_different_sessions_are_compared_and_marked_as_unpaired(campaign):
     evidence = read_evidence(campaign / "grown")
     said = markdown(compose(evidence))
 
@@ -151,7 +151,7 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(camp
         ),
     ],
 )
-def test_what_would_mix_two_suites_is_refused(
+def test_a_change_that_would_mix_two_suites_is_refused(
     campaign, measure, tmp_path, change, said
 ):
     shutil.copytree(campaign / "before", tmp_path / "out")
@@ -166,7 +166,7 @@ def test_what_would_mix_two_suites_is_refused(
 # merging
 
 
-def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
+def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     measure("a", depths="1")
     measure("b", depths="2", solvers='"exact", "liar"')
     again = []
@@ -193,7 +193,7 @@ def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
     assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
 
 
-def test_the_same_of_two_machines_is_kept_apart_and_marked(
+def test_equal_measurements_of_two_machines_are_kept_and_marked(
     measure, tmp_path, environment
 ):
     measure("a")
@@ -227,7 +227,7 @@ def test_the_same_of_two_machines_is_kept_apart_and_marked(
     assert read_journal(tmp_path / "ab") == records
 
 
-def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_path):
+def test_duplicates_in_one_environment_count_once(measure, tmp_path):
     first = measure("a", depths="1")
     measure("b", depths="1, 2")
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
@@ -263,7 +263,7 @@ def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_pat
         (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),
     ],
 )
-def test_folders_that_cannot_be_one_are_refused_before_anything_is_written(
+def test_incompatible_folders_are_refused_before_anything_is_written(
     stored, tmp_path, damage, said
 ):
     a, b = stored
@@ -274,7 +274,7 @@ def test_folders_that_cannot_be_one_are_refused_before_anything_is_written(
     assert not (tmp_path / "all").exists()
 
 
-def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path):
+def test_a_run_or_a_source_folder_cannot_be_the_merge_target(stored, tmp_path):
     a, b = stored
     with pytest.raises(mb.InputError, match="is one of the folders to merge"):
         mb.merge(a, b, out=b)
@@ -289,7 +289,7 @@ def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path)
     assert (tmp_path / "mine/suite.toml").read_text() == "mine"
 
 
-def test_a_merge_that_is_killed_anywhere_loses_and_doubles_nothing(stored, tmp_path):
+def test_a_killed_merge_loses_and_duplicates_nothing(stored, tmp_path):
     """The merge is killed before and after each file that it writes."""
     a, b = stored
     whole = read_all(mb.merge(a, b, out=tmp_path / "whole"))
@@ -346,7 +346,7 @@ def cli(tmp_path, capsys, monkeypatch):
     return cli
 
 
-def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
+def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     cli, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(
@@ -377,7 +377,7 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
+def test_a_report_fails_on_the_requested_conditions_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):
     """A solver that sleeps takes ten times as long in folder b; another solver makes a
@@ -415,7 +415,9 @@ def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
     assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
 
 
-def test_what_cannot_be_judged_fails_by_its_own_line(cli, stored, measure):
+def test_conditions_that_cannot_be_judged_fail_with_a_separate_line(
+    cli, stored, measure
+):
     assert cli("report", "a", "--fail-on", "worse")[0] == 2
     code, _, err = cli("report", "a", "b", "--fail-on", "worse")
     assert code == 2
@@ -487,7 +489,7 @@ def test_a_value_of_two_dashes_is_refused_in_one_line(cli, stored, tmp_path, com
     assert sorted(tmp_path.iterdir()) == there
 
 
-def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
+def test_an_interrupted_growing_series_continues_without_duplicates(
     campaign, measure, tmp_path, monkeypatch
 ):
     """The run is interrupted before it writes its fourth line."""
@@ -506,7 +508,7 @@ def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
 
 
 @pytest.mark.slow
-def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
+def test_a_killed_growing_series_continues_without_duplicates(measure, tmp_path):
     """SIGKILL ends the run when it is about to write its fourth line."""
     measure(depths="2", repeats=1)
     grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}

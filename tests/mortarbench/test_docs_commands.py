@@ -202,7 +202,7 @@ def shown(page):
     return list(parts(page.read_text("utf-8")))
 
 
-def test_nothing_is_shortened_or_left_out_that_no_page_shows():
+def test_every_omitted_command_is_shown_on_a_page():
     commands = {what for p in PAGES for kind, what, _ in shown(p) if kind == "run"}
 
     assert set(normal(SHORTER)) | set(normal(ELSEWHERE)) <= commands

@@ -53,7 +53,7 @@ def test_a_qp_is_solved_like_a_case():
     assert "verified (claimed solved)" in repr(answer)
 
 
-def test_a_solver_object_is_measured_in_a_process_of_its_own():
+def test_a_solver_object_is_measured_in_a_separate_process():
     answer = mb.solve(QP, ActiveRow())
 
     assert answer.verdict is mb.Verdict.VERIFIED
@@ -88,7 +88,7 @@ def test_fields_of_a_solver_object_are_its_options():
         mb.solve(QP, ActiveRow(), shif=1)
 
 
-def test_an_option_that_cannot_be_written_down_is_refused(tmp_path):
+def test_an_option_that_is_not_json_is_refused(tmp_path):
     """An option whose default is None accepts every type until a worker is started."""
     file = tmp_path / "free.py"
     file.write_text(
@@ -111,7 +111,7 @@ def test_options_of_a_named_solver_may_be_keywords():
     assert mb.solve(QP, "clarabel", max_iter=7).record.options["max_iter"] == 7
 
 
-def test_a_solver_object_meets_a_case_of_a_plug_in():
+def test_a_solver_object_solves_a_case_of_a_plug_in():
     case = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
 
     assert mb.solve(case, ActiveRow()).verdict is mb.Verdict.DECLINED
@@ -172,7 +172,7 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
     )
 
 
-def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_path):
+def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
     """The script's own `solvers.py` and `msgspec.py` take precedence in the
     script only.
     """
@@ -385,7 +385,7 @@ def test_a_suite_may_be_a_dict(results):
         ),
     ],
 )
-def test_a_dict_that_is_no_suite_is_refused_in_one_line(tmp_path, suite, message):
+def test_an_invalid_suite_dict_is_refused_in_one_line(tmp_path, suite, message):
     with pytest.raises(mb.InputError, match=message) as e:
         mb.run(suite, out=tmp_path)
     assert "\n" not in str(e.value)
@@ -399,7 +399,7 @@ def test_a_figure_of_the_report_is_drawn(results, tmp_path):
     assert results.plot("scaling").axes  # the only one of its kind, scaling-1
 
 
-def test_an_unknown_figure_is_refused_with_those_that_there_are(results, tmp_path):
+def test_an_unknown_figure_is_refused_with_the_available_ones(results, tmp_path):
     with pytest.raises(mb.InputError, match=r"unknown figure 'acuracy'; did you mean "
                        r"'accuracy'\? known: accuracy, .*scaling-1"):  # fmt: skip
         results.plot("acuracy")
@@ -540,7 +540,7 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
         (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],
 )
-def test_what_is_of_the_wrong_type_is_told_what_was_expected(call, message):
+def test_an_argument_of_the_wrong_type_is_refused_with_the_expected_type(call, message):
     with pytest.raises(mb.InputError, match=message) as e:
         call()
     assert "\n" not in str(e.value)
@@ -555,7 +555,7 @@ def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
     assert isinstance(case.registries, Registries)
 
 
-def test_an_option_that_is_given_twice_is_refused():
+def test_an_option_passed_twice_is_refused():
     with pytest.raises(mb.InputError, match="max_iter is given twice"):
         mb.solve(
             "obstacle/dim=1/n=4/primal", "clarabel", options={"max_iter": 9}, max_iter=3

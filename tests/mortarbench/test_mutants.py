@@ -73,7 +73,7 @@ def test_the_copy_has_every_compiled_module(tmp_path):
         assert list((tmp_path / source).parent.glob(f"{source.stem}.*.so")), source
 
 
-def test_the_list_names_modules_tests_and_mutants_that_there_are():
+def test_the_list_names_existing_modules_tests_and_mutants():
     plan = mutants.read_plan()
     for module, tests in plan.tests.items():
         assert (ROOT / module).is_file()

@@ -88,7 +88,7 @@ def test_no_formula_of_a_page_is_plain_text(name):
 @pytest.mark.parametrize(
     "text", ["‖u*‖ and ‖v*‖", "D(λ*) = J(u*)", "max |x*| and |y*|"]
 )
-def test_a_formula_that_markdown_swallows_ends_the_build(text):
+def test_a_formula_damaged_by_markdown_ends_the_build(text):
     with pytest.raises(ValueError, match="emphasis within a word"):
         pages.typeset(rendered(text))
     assert "*" not in rendered(text)  # which a reader would not notice

@@ -174,7 +174,7 @@ def test_a_case_that_ranks_cannot_emit_fails_with_the_reason(measured, rank):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rank", ["1", "all"])
-def test_an_answer_that_ranks_cannot_judge_is_judged_by_one_process(measured, rank):
+def test_an_answer_that_ranks_cannot_verify_is_verified_by_one_process(measured, rank):
     record = measured("residuals", "raises-after", rank=rank)
 
     assert record.verdict == "verified"
@@ -184,7 +184,7 @@ def test_an_answer_that_ranks_cannot_judge_is_judged_by_one_process(measured, ra
 
 
 @pytest.mark.slow
-def test_quantities_that_fail_on_all_ranks_cost_neither_verdict_nor_bound(measured):
+def test_failing_quantities_affect_neither_verdict_nor_bound(measured):
     record = measured("quantities", "raises-after", rank="all")
 
     assert record.verdict == "verified"

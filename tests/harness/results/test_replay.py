@@ -183,7 +183,9 @@ sequence = "depth"
 
 
 @pytest.mark.parametrize("solver", ["exact (A/A)", "liar"])
-def test_a_step_of_a_sequence_is_made_again_after_those_before(cli, tmp_path, solver):
+def test_a_step_of_a_sequence_is_repeated_after_the_earlier_steps(
+    cli, tmp_path, solver
+):
     (tmp_path / "steps.toml").write_text(SEQUENCE)
     assert cli("run", "steps.toml", "--out", "done")[0] == 0
     records = [r for r in read_journal(tmp_path / "done") if r.solver == solver]
@@ -232,7 +234,7 @@ def test_an_unknown_run_id_is_one_line_with_the_nearest(cli, stored):
 
 
 @pytest.mark.parametrize("run_id", ["", "g"])
-def test_digits_that_name_none_or_many_are_refused(cli, stored, run_id):
+def test_ambiguous_or_unknown_digits_are_refused(cli, stored, run_id):
     code, _, err = cli("replay", "done", run_id)
 
     assert (code, err.count("\n")) == (2, 1)
@@ -255,7 +257,7 @@ def test_a_stored_run_that_lost_a_file_is_one_line(cli, stored, tmp_path, missin
 
 
 @pytest.mark.parametrize("lost", [{"solvers": {}}, {"families": {}}])
-def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
+def test_a_missing_plug_in_is_requested(cli, registries, tmp_path, lost):
     (tmp_path / "toy.toml").write_text(SUITE)
     (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
     little = ("--solver", "exact", "--repeats", "1")
@@ -268,7 +270,7 @@ def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
     assert "--plugin empty.py" in err
 
 
-def test_a_case_whose_file_has_changed_is_that_of_the_copy_or_refused(
+def test_a_case_with_a_changed_file_uses_the_copy_or_is_refused(
     cli, manufactured, tmp_path
 ):
     qp, _ = manufactured("box")
@@ -297,7 +299,9 @@ def test_a_case_whose_file_has_changed_is_that_of_the_copy_or_refused(
 
 
 @pytest.mark.parametrize("shape", ["box", "everything"])
-def test_equal_qps_have_one_digest_and_others_another(manufactured, tmp_path, shape):
+def test_equal_qps_have_equal_digests_and_different_qps_do_not(
+    manufactured, tmp_path, shape
+):
     qp, _ = manufactured(shape)
     file = tmp_path / "a.npz"
     digest = save_qp(file, qp, {"name": "whatever"})

@@ -150,7 +150,7 @@ def test_no_error_exceeds_its_bound(name):
 
 
 @pytest.mark.parametrize("name", MOVED_FAR)
-def test_an_answer_that_moves_far_on_a_soft_body_is_not_better_than_it_is(name):
+def test_a_large_motion_on_a_soft_body_does_not_reduce_the_bound(name):
     """The rounding of K along the rigid part of the motion affects the error."""
     found = certified(name, solved(name, ("smalbe",)))
 

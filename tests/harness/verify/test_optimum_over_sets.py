@@ -171,7 +171,7 @@ def search(seed, tries, each=40):
     return wrong, refuted, verified, proven / (tries // each)
 
 
-def test_a_short_search_over_sets_deceives_no_verdict():
+def test_no_verdict_is_wrong_in_a_short_search_over_sets():
     wrong, refuted, verified, proven = search(271828, 400)
 
     assert (wrong, refuted) == ([], [])
@@ -180,7 +180,7 @@ def test_a_short_search_over_sets_deceives_no_verdict():
 
 
 @pytest.mark.slow
-def test_a_long_search_over_sets_deceives_no_verdict():
+def test_no_verdict_is_wrong_in_a_long_search_over_sets():
     wrong, refuted, verified, proven = search(314159, 25_000)
 
     assert (wrong, refuted) == ([], [])

@@ -178,7 +178,7 @@ def test_the_exact_energy_over_the_hemisphere_is_that_of_the_exact_height():
 @pytest.mark.parametrize(
     "form", ["primal", pytest.param("dual-bounds", marks=pytest.mark.slow)]
 )
-def test_over_the_hemisphere_it_converges_with_second_order(form):
+def test_over_the_hemisphere_the_membrane_converges_with_second_order(form):
     got = []
     for n in (16, 32, 64):
         params = {"dim": 2, "n": n, "shape": "hemisphere"}
@@ -199,7 +199,7 @@ def test_over_the_hemisphere_it_converges_with_second_order(form):
         ({"shape": "hemisphere", "dim": 1}, "shape=hemisphere needs dim=2"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
+def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
     with pytest.raises(InputError, match="obstacle: ") as e:
         FAMILY.check({**FAMILY.defaults, **bad})
 

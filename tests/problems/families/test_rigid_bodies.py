@@ -221,7 +221,7 @@ def against(problem, rigid):
     return case.quantities(SOLVERS["smalbe"].prepare(case.qp, 1e-11)())
 
 
-def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
+def test_a_sphere_on_a_rigid_sphere_agrees_with_hertz():
     """The relative curvature is 1/R = 1/8 + 1/24."""
     family = PROBLEMS["hertz-sphere"]
     problem = family.contact_problem(family.complete({"n": 4}))
@@ -234,7 +234,7 @@ def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
     assert values["contact_force"] == pytest.approx([0, 0, 10], abs=1e-8)
 
 
-def test_a_cylinder_on_a_rigid_cylinder_touches_as_hertz_says():
+def test_a_cylinder_on_a_rigid_cylinder_agrees_with_hertz():
     """The relative curvature is 1/R = 1/8 + 1/24 per mm; in the plane, a cylinder is a
     disc."""
     family = PROBLEMS["hertz-plane"]

@@ -44,7 +44,7 @@ def test_cells_are_neighbours_where_they_share_an_edge():
     assert pairs == {(0, 1), (0, 2), (1, 3), (2, 3)}
 
 
-def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
+def test_a_separate_piece_joins_the_part_with_the_longest_common_boundary():
     strip = rectangle((0.0, 0.0), (6.0, 1.0), (6, 1))
     graph = neighbours(strip.points, strip.cells)
     label = partition._reconnect(graph, np.array([0, 0, 1, 1, 1, 0]))
@@ -52,7 +52,7 @@ def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
     assert label.tolist() == [0, 0, 1, 1, 1, 1]
 
 
-def test_cells_that_hang_together_in_a_node_are_no_body():
+def test_cells_connected_only_at_a_node_are_not_a_body():
     cells = np.array([[0, 1, 4, 3], [4, 5, 8, 7], [9, 10, 12, 11], [11, 12, 14, 13]])
     with pytest.raises(InputError, match="are not all connected by edges"):
         graph_partition(np.eye(15)[:, :2], cells, np.array([0, 0, 1, 1]), 2)
@@ -92,7 +92,7 @@ def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
 
 
 @pytest.mark.parametrize("parts", [2, 5, 8])
-def test_parts_of_hexahedra_hang_together_by_faces(parts):
+def test_parts_of_hexahedra_are_connected_by_faces(parts):
     mesh = bricks((6, 4, 4), (1.5, 1.0, 1.0))
     points, cells = mesh.points, mesh.cells
     label = graph_partition(points, cells, np.zeros(len(cells), dtype=np.int64), parts)

@@ -237,7 +237,7 @@ def test_a_file_that_is_not_hdf5_is_refused(tmp_path, monkeypatch):
         case_of(tmp_path / "large.hdf5")
 
 
-def test_a_loop_that_is_none_is_refused(tmp_path):
+def test_an_unknown_loop_is_refused(tmp_path):
     write_boxes(tmp_path / "boxes.hdf5")
     with pytest.raises(InputError, match="unknown loop 'newton'"):
         case_of(tmp_path / "boxes.hdf5", "loop=newton")

@@ -131,7 +131,7 @@ def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense, seeds):
     ],
     ids=["singular P", "singular P, repeated rows", "no P", "no P, repeated rows"],
 )
-def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense, seeds):
+def test_one_of_many_solutions_is_found(kind, dense, seeds):
     for seed in seeds:
         qp, x, _ = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
@@ -439,7 +439,7 @@ FOREIGN = {
 }  # fmt: skip
 
 
-def test_no_solver_under_test_and_no_foreign_one_takes_part():
+def test_the_reference_uses_no_other_solver():
     folder = sys.modules["mortarbench.solvers"].__path__[0]
     run = subprocess.run(
         [sys.executable, "-c", ALONE, folder], capture_output=True, text=True
