@@ -482,7 +482,7 @@ def test_a_labelled_adapter_of_many_backends_is_one(tmp_path):
 
 @dataclass(frozen=True)
 class Wide:
-    rho: float = 1  # an int, as people write it
+    rho: float = 1  # an int, as users may write
     steps: int = 1e4
     norm: Literal["max", 2] = "max"
     weight: float | None = 1

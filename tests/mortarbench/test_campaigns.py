@@ -1,6 +1,4 @@
-"""Growth and merging of campaigns and their use as a CI gate, by real runs of toy
-problems.
-"""
+"""Growth and merging of campaigns, and CI gates, tested by runs of toy problems."""
 
 import json
 import os
@@ -56,9 +54,7 @@ def environment(_found):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite, whose arguments are those of `suite`, into a folder with
-    its name.
-    """
+    """Run a suite that `suite` creates; the result folder has the name of the suite."""
 
     def measure(out="out", **asked):
         file = tmp_path / f"{out}.toml"
@@ -115,7 +111,7 @@ def test_an_extended_suite_measures_only_missing_results(campaign):
     )
     records = read_journal(campaign / "grown")
 
-    assert after.startswith(before)  # not a byte of it was touched
+    assert after.startswith(before)  # existing lines are unchanged
     assert len(records) == len({r.run_id for r in records}) == 3 * 3 * 2 * 2
     first, second = dict.fromkeys(r.session for r in records)
     old = {(r.solver, r.case) for r in records if r.session == first}
@@ -125,7 +121,7 @@ def test_an_extended_suite_measures_only_missing_results(campaign):
     again = mb.run(
         campaign / "grown.toml", out=campaign / "grown", plugins=[TOY_PROBLEM]
     )
-    assert len(again) == 36  # nothing is left
+    assert len(again) == 36  # no measurement is missing
 
 
 def test_solvers_of_different_sessions_are_compared_and_marked_as_unpaired(campaign):
@@ -330,12 +326,12 @@ def read_all(results):
     return [r.to_json() for r in results.records]
 
 
-# what a CI asks
+# commands of CI jobs
 
 
 @pytest.fixture
 def cli(tmp_path, capsys, monkeypatch):
-    """Run a command line in the folder of the test; returns code, stdout and stderr."""
+    """Run a command line in the folder of the test; return code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
 
     def cli(*argv):
@@ -364,7 +360,9 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
         "without an answer (lost on well/depth=2/dual)"
     )
     good = (*asked, "--solver", "exact", "--solver", "picky")
-    assert cli(*good, "--strict")[0] == 0  # one declined; the others are not asked for
+    assert (
+        cli(*good, "--strict")[0] == 0
+    )  # one declined; other solvers are not selected
     code, out, _ = cli(*asked, "--strict", "--json")
     told = json.loads(out)
     assert code == 1
@@ -411,8 +409,8 @@ def test_a_report_fails_on_the_requested_conditions_and_says_so(
     assert "| new |" in page
     points = [line for line in page.splitlines() if line.startswith("- ")]
     assert [point[:4] for point in points] == ["- b:", "- c:"]
-    assert all(point.endswith(".") for point in points)  # whole sentences
-    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
+    assert all(point.endswith(".") for point in points)  # each entry is a sentence
+    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
 
 
 def test_conditions_that_cannot_be_judged_fail_with_a_separate_line(

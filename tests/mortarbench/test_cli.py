@@ -63,7 +63,7 @@ def registries(tmp_path):
 
 @pytest.fixture
 def cli(registries, capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
 
@@ -81,7 +81,7 @@ def test_problems_are_listed_with_defaults_and_forms(cli):
     assert code == 0
     assert (
         out == "well  A parabola over a half line.  n=3 depth=1  primal | dual\n"
-    )  # one sentence of two
+    )  # the first of two sentences
 
 
 def test_solvers_are_listed_one_line_each(cli):
@@ -89,8 +89,8 @@ def test_solvers_are_listed_one_line_each(cli):
 
     assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
     first = " ".join(out.splitlines()[0].split())
-    assert first == "exact Divides by a diagonal. factor=1.0 reason=None"
-    assert "Lost(" not in out  # no sentence, only what dataclass makes up
+    assert first == "exact Solver for a diagonal P. factor=1.0 reason=None"
+    assert "Lost(" not in out  # the docstring is only the signature by dataclass
 
 
 def test_suites_are_listed_with_their_purpose(cli):
@@ -104,7 +104,7 @@ def test_suites_are_listed_with_their_purpose(cli):
                       "defaults": {"n": 3, "depth": 1},
                       "description": "A parabola over a half line."}),
         ("solvers", {"name": "exact", "options": {"factor": 1.0, "reason": None},
-                     "description": "Divides by a diagonal."}),
+                     "description": "Solver for a diagonal P."}),
     ],
 )  # fmt: skip
 def test_lists_can_be_printed_as_one_json_array(cli, what, expected):
@@ -329,7 +329,7 @@ def test_a_solver_that_ignores_interrupts_ends_with_the_command(tmp_path):
          "--plugin", TOY_PROBLEM],
         env=os.environ | {"STARTED": str(started)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # what a shell starts in the background ignores interrupts otherwise
+        # otherwise, background processes of a shell ignore interrupts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as command:  # fmt: skip
         while command.poll() is None and not (started.exists() and started.read_text()):
@@ -338,7 +338,7 @@ def test_a_solver_that_ignores_interrupts_ends_with_the_command(tmp_path):
         try:
             out, err = command.communicate(timeout=LONGEST)
         finally:
-            command.kill()  # leaving the block waits for it
+            command.kill()  # leaving the block waits for the process
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
@@ -778,7 +778,9 @@ def test_a_run_continues_if_its_output_is_closed():
     with open(writing, "w", buffering=1) as stream, display_on(stream) as progress:
         progress.start(7)
         progress.warn("who is there?")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), writing)  # let it be closed
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), writing
+        )  # so that closing it succeeds
 
 
 def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
@@ -797,7 +799,7 @@ def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
 
 @pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
 def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
-    """The bars include one of long measurements and one of a continued run."""
+    """The cases include long measurements and a continued run."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
     now = [0.0]
@@ -878,9 +880,7 @@ def test_a_quiet_run_prints_warnings_and_missing_measurements(
 
 
 def test_a_decline_names_the_dual_form_if_available(capsys, tmp_path, monkeypatch):
-    """The hint is printed for a problem, which has a dual form, but not for a QP from a
-    file.
-    """
+    """The hint is printed if the family has a dual form, but not for a QP of a file."""
     from mortarbench import QP, export
 
     monkeypatch.chdir(tmp_path)

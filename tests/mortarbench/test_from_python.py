@@ -24,9 +24,7 @@ QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
 
 @dataclass(frozen=True)
 class ActiveRow:
-    """Solves the QP above under the assumption that its row is active; `shift` perturbs
-    the answer.
-    """
+    """Solver of `QP` that assumes an active row; `shift` perturbs the answer."""
 
     shift: float = 0.0
 
@@ -151,7 +149,7 @@ print(*(result.grade for result in found.results.values()))
 
 @pytest.mark.parametrize("threads", [False, True])
 def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
-    """The class is also copied if the script has other threads, as a notebook has, and
+    """The class is also copied if the script, like a notebook, has several threads and
     must not fork.
     """
     (tmp_path / "beside.py").write_text(
@@ -203,14 +201,14 @@ def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
 
 
 class _Uncopied(ActiveRow):
-    """Contains an object that cannot be sent to another process."""
+    """Solver with an attribute that cannot be pickled."""
 
     def __reduce__(self):
         raise TypeError("cannot pickle the handle of a library")
 
 
 class _Unloaded(ActiveRow):
-    """Can be pickled but not unpickled."""
+    """Solver that can be pickled but not unpickled."""
 
     def __reduce__(self):
         return int, ("not a number",)
@@ -247,7 +245,7 @@ def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
     assert answer.save_vtu(tmp_path / "a.pvd").is_file()
 
 
-# Answers from elsewhere.
+# Verification of given points.
 
 
 def test_a_point_is_verified_with_and_without_its_multipliers():
@@ -368,7 +366,9 @@ def test_a_suite_may_be_a_dict(results):
     written = (results.folder / "suite.toml").read_text("utf-8")
     again = results.folder.parent / "again.toml"
     again.write_text(written)
-    assert len(mb.run(again, out=results.folder)) == 6  # the same suite: all is there
+    assert (
+        len(mb.run(again, out=results.folder)) == 6
+    )  # the same suite: no measurement is missing
 
 
 @pytest.mark.parametrize(
@@ -396,7 +396,7 @@ def test_a_figure_of_the_report_is_drawn(results, tmp_path):
 
     assert figure.axes
     assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
-    assert results.plot("scaling").axes  # the only one of its kind, scaling-1
+    assert results.plot("scaling").axes  # short for scaling-1, the only such figure
 
 
 def test_an_unknown_figure_is_refused_with_the_available_ones(results, tmp_path):

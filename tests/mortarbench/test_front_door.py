@@ -241,9 +241,9 @@ def test_the_catalogue_agrees_with_the_solvers():
     assert stored == json.loads(json.dumps(live)), "run `make docs`"
 
 
-def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
+def test_a_solver_of_another_registry_has_its_own_description():
     class Other:
-        """Another one."""
+        """Another solver."""
 
         def declines(self, qp):
             return "always"
@@ -252,7 +252,7 @@ def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
             raise AssertionError
 
     (row,) = mb.solvers(registries=Registries(solvers={"smalbe": Other()}))
-    assert row["description"] == "Another one."
+    assert row["description"] == "Another solver."
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_a_wheel_works_without_the_checkout(tmp_path):
 
 
 class _Display:
-    """Replaces IPython's display and stores the last object shown."""
+    """Replacement of IPython's display that stores the last displayed object."""
 
     def __init__(self):
         self.shown = ""

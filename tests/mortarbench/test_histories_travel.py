@@ -159,7 +159,7 @@ def test_a_history_is_part_of_the_digest_but_its_absence_is_not(tmp_path, point)
         save_solution(tmp_path, point(cost=np.zeros(2))),
     }
     assert len(digests) == 4
-    assert "97b50261ac02503f" in digests  # as before there were histories
+    assert "97b50261ac02503f" in digests  # as in versions without histories
 
 
 def test_points_stored_by_older_versions_have_no_history(tmp_path):

@@ -58,7 +58,7 @@ def test_records_of_another_environment_are_unchanged(old, capsys):
     assert read_journal(old) == before
 
 
-# folders of code that imported its packages by names of their own (e247e1f)
+# folders of a version whose packages were top-level packages (e247e1f)
 
 PLUGINS = ROOT / "tests/data/results-e247e1f-plugins"
 SMOKE = ROOT / "tests/data/results-e247e1f-smoke"

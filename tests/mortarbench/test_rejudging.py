@@ -87,7 +87,7 @@ def test_a_sweep_is_verified_at_its_accuracy_not_at_the_tolerances():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"verdict": Verdict.MEMORY_LIMIT},  # an answer, but beyond the limit
+        {"verdict": Verdict.MEMORY_LIMIT},  # an answer that exceeded the limit
         {"verdict": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
         {"verdict": Verdict.TIME_LIMIT, "claimed": None},
     ],

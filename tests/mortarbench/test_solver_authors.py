@@ -24,7 +24,7 @@ from tests.support import TOY_PROBLEM
 
 TOY = load_plugin(TOY_PROBLEM)
 
-#: its answer is right in the second version only; what differs is a neighbour
+#: correct only in the second version; the versions differ in a neighbouring module
 MINE = """
 from dataclasses import dataclass
 from harness import Solution, Status
@@ -53,7 +53,7 @@ SOLVERS = {"mine": Mine()}
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     registries = Registries(
         families=TOY.problems,
@@ -154,7 +154,7 @@ def test_a_single_solve_accepts_options(cli, versions):
     )
 
 
-# files to start from
+# templates
 
 
 @pytest.fixture

@@ -83,7 +83,7 @@ def conic_qp(seed):
 #: permits an angle of √tol between x and z of a disc
 ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
 OTHER_ERROR = 5e-4
-RESIDUAL = {"ecos": 3e-7}  #: more than 1e-7 for 7 of 500 QPs, which it does not claim
+RESIDUAL = {"ecos": 3e-7}  #: residuals exceed 1e-7 for 7 of 500 QPs, without a claim
 
 
 def check_solution(name, seed, tol=1e-8):

@@ -40,7 +40,7 @@ CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
     "cvxpy:OSQP": replace(SOLVERS["cvxpy:*"], backend="OSQP"),
 }
 WILDCARDS = ("qpsolvers:*", "cvxpy:*")
-#: end at a vertex of the active-set search, whatever the tolerance
+#: active-set methods, whose accuracy does not depend on the tolerance
 EXACT = ("bvls", "daqp", "highs", "quadprog", "smalbe-direct")
 SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
@@ -65,8 +65,8 @@ def solve(name, qp, tol=1e-9):
 
 @pytest.fixture
 def membrane():
-    """Discrete membrane over a flat obstacle, fixed on one side and pulled
-    on another.
+    """Discrete membrane over a flat obstacle, fixed at one side and pulled at another
+    one.
     """
     k = 45
     end = np.eye(k)[:, [0, -1]].sum(axis=1)
@@ -127,7 +127,7 @@ def test_an_iteration_limit_is_reported_as_one(manufactured, name):
     qp, _ = manufactured("everything")
     solution = replace(CONCRETE[name], max_iter=1).prepare(qp, 1e-9)()
     assert solution.status is Status.ITERATION_LIMIT
-    assert solution.iterations <= 2  # ProxQP counts inner ones too
+    assert solution.iterations <= 2  # ProxQP also counts inner iterations
 
 
 @pytest.mark.parametrize("problem", [infeasible, unbounded])
@@ -273,7 +273,7 @@ def test_a_converted_matrix_shares_nothing_with_the_problem():
 
 
 def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
-    # the second QP differs from the first in vectors only, and by little
+    # the second QP differs from the first only slightly, and only in vectors
     qp, _ = manufactured("everything", n=40)
     moved = replace(qp, q=qp.q * (1 + 1e-4))
     for name in ("osqp", "scs", "qpalm", "daqp"):
@@ -285,7 +285,9 @@ def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
 @pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse", "qtqp"])
 def test_a_rebuilt_session_starts_from_the_last_point(manufactured, name):
     qp, _ = manufactured("everything", n=40)
-    other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
+    other = replace(
+        qp, P=qp.P * (1 + 1e-9)
+    )  # nearly equal, but P requires a new session
     prepare = SOLVERS[name].chain(1e-6)
     first, again = prepare(qp)(), prepare(other)()
     assert again.iterations < first.iterations
@@ -311,7 +313,7 @@ def test_matrices_that_differ_are_not_updated(manufactured):
 def test_a_dense_solver_declines_qps_that_exceed_memory(
     manufactured, monkeypatch, name
 ):
-    qp, _ = manufactured("bounds", n=400)  # 1.2 MiB a matrix
+    qp, _ = manufactured("bounds", n=400)  # 1.2 MiB per matrix
     assert SOLVERS[name].declines(qp) is None
     monkeypatch.setenv("MORTARBENCH_MEMORY_MIB", "2")
     reason = SOLVERS[name].declines(qp)
@@ -326,7 +328,7 @@ def test_a_solver_reports_its_linear_solver(manufactured):
 
 
 def test_highs_has_no_hidden_regularisation(manufactured):
-    # 1e-7 on the Hessian's diagonal would show in the ninth digit and before
+    # 1e-7 on the Hessian's diagonal would change at least the ninth digit
     qp, _ = manufactured("singular")
     small = replace(qp, P=qp.P * 1e-4, q=qp.q * 1e-4)
     for name in ("highs", "highs-hipo"):

@@ -257,7 +257,7 @@ def test_penetration_is_measured_in_mesh_sizes_and_balance_per_body(truths):
 
 
 class Dense:
-    """Inverse of a regular K."""
+    """Inverse of a nonsingular K."""
 
     def __init__(self, K):
         self.inverse, self.kernel = np.linalg.inv(K), np.zeros((len(K), 0))

@@ -178,8 +178,8 @@ def test_the_label_of_the_suite_is_found_in_a_longer_one():
 
 @dataclass(frozen=True)
 class Sized:
-    rho: float = 1  # an int, as people write it
-    start: Any = 0  # no type: that of the default
+    rho: float = 1  # an int, as users may write
+    start: Any = 0  # not annotated: the type of the default
 
     declines, prepare = Method.declines, Method.prepare
 

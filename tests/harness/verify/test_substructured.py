@@ -1,4 +1,4 @@
-"""Certificates from subdomains: no error exceeds its bound, no whole factorisation.
+"""Certificates from subdomains: bounds hold, and no undecomposed K is factorised.
 
 Bodies are cut into boxes. Errors are relative to the reference solution of the whole
 problem, which is accurate up to rounding.

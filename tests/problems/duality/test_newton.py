@@ -150,8 +150,7 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
 
 @pytest.fixture(scope="module")
 def equilibrium():
-    """Return a path, its last configuration and the multipliers (places,) of the
-    latter."""
+    """Return a path, its last configuration and the multipliers (places,) there."""
     path = patch_path(contact="nts")
     last = path.iterations(1)[-1]
     lam = path._at_places(last)

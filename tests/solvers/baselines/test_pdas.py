@@ -36,7 +36,7 @@ def solve(qp, tol=1e-9):
     return PDAS().prepare(qp, tol)()
 
 
-#: the plain method visits three active sets in turn, for ever
+#: the plain method cycles through three active sets
 CYCLES = {
     "n = 3": ([[13, 11, -9], [11, 11, -6], [-9, -6, 10]], [4, 1, -5]),
     "n = 4": (
@@ -180,9 +180,9 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
         (dict(P=np.eye(3), q=np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
         (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
         (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, 3], ub=[2.0, 3]), [2, 3]),
-        # more active bounds than the row leaves room for, on the way
+        # an iterate has more active bounds than the row permits
         (dict(P=np.eye(2), q=[1.0, 1], A=[[1, 1]], b=[4.0], lb=0.0), [2, 2]),
-        # singular P: the row and the bound decide on x₂
+        # singular P: the row and the bound determine x₂
         (dict(P=[[1, 0], [0, 0]], q=[-1.0, 1], lb=[-np.inf, -3]), [1, -3]),
         (dict(P=np.zeros((2, 2)), q=[1.0, 2], A=[[1, 1]], b=[1.0], lb=0.0), [1, 0]),
     ],

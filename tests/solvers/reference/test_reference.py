@@ -237,7 +237,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel
         # half the work of the pressure p = 1 MPa at the displacement (1 − ν²)p/E
         ("contact-patch", {}, "primal", -0.5 * 1e6 * 1e6 * 0.91 / 10e6),
         ("contact-patch", {}, "dual", -0.5 * 1e6 * 1e6 * 0.91 / 10e6),
-        # of the interpolant of the exact height, which the string is at its nodes
+        # energy of the nodal interpolant of the exact height
         ("obstacle", dict(dim=1, n=12), "primal", 1 / 3 + 0.25**2 / 6),
         ("obstacle", dict(dim=1, n=12), "dual-bounds", 1 / 3 + 0.25**2 / 6),
     ],

@@ -358,7 +358,7 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
                 worst = kkt_residuals(qp, point).worst
                 assert bound >= worst * (1 - 1e-9), seed
-                if size >= 1e-6:  # beside which rounding is nothing
+                if size >= 1e-6:  # large compared with rounding errors
                     assert bound == pytest.approx(worst, rel=1e-6), seed
 
 

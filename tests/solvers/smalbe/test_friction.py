@@ -131,11 +131,11 @@ def test_the_history_ends_with_the_rows_that_slip():
 
 
 def fixed_point(qp, mu, solve, enough, tighten=0.0):
-    """Solve Coulomb's law on a dual with bounds only; all solutions in turn.
+    """Solve Coulomb's law on a dual with bounds only; return all solutions in order.
 
-    tighten : the part of the last residual that a solve is to reach, never looser than
-        the one before; 0: always TOL. A warm solver may leave a loosely solved problem
-        where it was: a residual below the tolerance says nothing
+    tighten : tolerance of a solve, relative to the last residual of Coulomb's law;
+        tolerances never increase. 0: always TOL. A residual below a loose tolerance
+        does not stop the iteration, because a warm solver may return its starting point
     """
     m = qp.q.size // 2
     bound, found, tol = np.zeros(m), [], 1e-2 if tighten else TOL
@@ -163,7 +163,7 @@ def test_a_warm_fixed_point_takes_less_than_half_the_products_of_a_cold_one(name
     exact = reference_solution(qp)
 
     assert left <= enough
-    assert abs(len(warm) - len(cold)) <= 1  # what is left of each differs by rounding
+    assert abs(len(warm) - len(cold)) <= 1  # residuals differ by rounding
     assert products(warm) <= 0.5 * products(cold)
     assert warm[-1].x == pytest.approx(exact.x, abs=1e-5 * abs(exact.x).max())
 

@@ -1,4 +1,4 @@
-"""Search for QPs on which SMALBE makes a false claim or gives up."""
+"""Search for QPs on which SMALBE makes a false claim or stops without a solution."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def hostile(seed):
 
 
 def ends(name, seeds):
-    """Return the number of runs that gave up, the number of all runs, and the false
+    """Return the numbers of runs without a solution and of all runs, and the false
     claims.
     """
     given_up, runs, wrong = 0, 0, []

@@ -1,4 +1,4 @@
-"""Steps of MPRGP, which tests of its solution cannot check."""
+"""Steps of MPRGP, which cannot be checked by solutions alone."""
 
 import re
 from collections import Counter
@@ -249,7 +249,7 @@ def test_the_split_gradient_adds_up_and_its_parts_are_admissible():
     face = split(at, bounds)
 
     assert face.phi.tolist() == [0, 0, 3, 0, 0, -4]
-    assert face.beta.tolist() == [0, -2, 0, 2, 0, 0]  # only what leads inside
+    assert face.beta.tolist() == [0, -2, 0, 2, 0, 0]  # only components that lead inside
     assert kernels.reduced(x, face.phi, 0.5, *bounds) == pytest.approx(
         [0, 0, 1, 0, 0, -1.4]
     )
@@ -285,7 +285,7 @@ def test_the_rules_of_permon_take_the_steps_of_permon(
 
     steps = [run.trace.count(letter) for letter in "cep"]
     assert len(run.trace) == iterations
-    assert 1 + counted == products  # one for the gradient at the start
+    assert 1 + counted == products  # one product for the gradient at the start
     assert steps == [cg, expansions, proportionings]
 
 

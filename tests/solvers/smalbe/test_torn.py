@@ -81,8 +81,8 @@ def test_the_displacement_is_that_of_the_undecomposed_body(glue):
     ],
 )
 def test_calls_of_python_take_the_same_steps(name, tol, monkeypatch):
-    """On ranks, the table of operations contains Python functions; here it does so in
-    one process.
+    """As on ranks, the table of operations contains Python functions, but in one
+    process.
     """
     qp = build(f"{name}/dual").qp
     compiled = SMALBE().prepare(qp, tol)()

@@ -75,7 +75,7 @@ def laplacian(seed):
     w = 10 ** rng.uniform(-rng.uniform(0, 3), 0, i.size)
     graph = csr_array((w, (i, j)), shape=(n, n))
     graph = graph + graph.T
-    held = 10 ** rng.uniform(-3, 0) * rng.random(n)  # to the ground
+    held = 10 ** rng.uniform(-3, 0) * rng.random(n)  # springs to the ground
     P = csr_array(diags_array(graph.sum(axis=0) + held) - graph)
     at = np.linspace(0, 1, n)
     f = np.sin(np.pi * rng.integers(1, 6) * at + rng.uniform(0, 6)) + rng.choice([0, 1])
