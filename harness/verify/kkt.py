@@ -29,7 +29,7 @@ from mortarbench.harness.verify import scales
 #: Rounding error of a sum, relative to the sum of its absolute terms. The error of a
 #: sum of k terms grows like √k·2⁻⁵³, and this value covers k = 256. With 0, a row that
 #: is satisfied exactly is reported as violated
-#: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
+#: (`test_rounding_in_products_with_an_operator_does_not_refute_an_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest error, as a fraction of its scale, that may be attributed to rounding.
 #: `MAX_CANCELLATION` allows a relative error of 5e-4 of the objective at tol 1e-8. This

@@ -249,7 +249,7 @@ def test_odd_values_of_a_suite_are_refused_briefly(tmp_path, change, expected):
     assert len(str(e.value)) < len(str(path)) + 400
 
 
-def test_a_grid_beyond_the_limit_says_how_to_raise_it_before_it_is_spanned(tmp_path):
+def test_a_grid_beyond_the_limit_is_refused_with_the_way_to_raise_the_limit(tmp_path):
     path, many = tmp_path / "s.toml", list(range(1, 951))
     grid = f"params = {{ Nr = {many}, Nh = {many}, step = 1 }}\nforms = ['dual']\n"
     path.write_text(SUITE + grid)

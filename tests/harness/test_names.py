@@ -58,7 +58,7 @@ def test_a_derived_default_follows_the_key_that_it_derives_from():
     assert (params["layers"], params["step"]) == (14, 3)
 
 
-def test_the_order_is_the_family_s_whatever_completes_the_keys():
+def test_keys_are_always_in_the_order_of_the_family():
     odd = SimpleNamespace(
         name="odd",
         defaults={"a": 1, "b": 2},
@@ -87,7 +87,7 @@ def test_the_order_is_the_family_s_whatever_completes_the_keys():
         ("plain/kind=hard/n=+9/primal", "plain/n=9/kind=hard/primal"),
     ],
 )
-def test_a_canonical_name_lists_what_is_not_implied_in_the_family_s_order(
+def test_a_canonical_name_lists_non_default_keys_in_the_order_of_the_family(
     text, expected
 ):
     name = parse(text, FAMILIES)

@@ -28,7 +28,7 @@ def test_matrices_of_every_type_define_the_same_qp(kind):
     assert (qp.h.tolist(), qp.b.tolist()) == ([3, 4], [5])
 
 
-def test_absent_parts_are_no_rows_and_infinite_bounds():
+def test_absent_arguments_yield_no_rows_and_infinite_bounds():
     qp = QP.from_arrays(I2, ZERO)
 
     assert (qp.A.shape, qp.G.shape, qp.b.size, qp.h.size) == ((0, 2), (0, 2), 0, 0)
@@ -135,7 +135,7 @@ def test_a_semidefinite_matrix_is_convex_up_to_rounding():
         "plugin", "qp", "record", "registry", "sets.box", "solution", "verify.kkt",
     ],
 )  # fmt: skip
-def test_the_examples_of_docstrings_give_what_they_show(module):
+def test_the_examples_of_docstrings_print_the_output_shown(module):
     result = doctest.testmod(
         import_module(f"mortarbench.harness.{module}"),
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,

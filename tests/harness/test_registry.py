@@ -80,7 +80,7 @@ def test_a_wildcard_entry_takes_the_text_after_the_colon_as_backend():
     assert resolve(spec("open:anything"), SOLVERS) == Open(backend="anything")
 
 
-def test_an_exact_entry_goes_before_the_wildcard():
+def test_an_exact_entry_takes_precedence_over_the_wildcard():
     assert resolve(spec("open:tuned"), SOLVERS).alpha == 9.0
 
 
@@ -460,7 +460,7 @@ def test_the_code_digest_of_a_plugin_includes_neighbour_modules(tmp_path, change
         ("=b.py", "=b.py", "", "=b.py"),
     ],
 )
-def test_a_label_stands_before_a_plugin(text, path, label, name):
+def test_a_label_precedes_the_path_of_a_plugin(text, path, label, name):
     file = PluginFile.of(text)
 
     assert (str(file.path), file.label, file.name) == (path, label, name)
@@ -536,7 +536,7 @@ def test_a_value_of_an_annotated_type_is_taken(options, value):
     assert getattr(resolve(spec("wide", **options), {"wide": Wide()}), name) == value
 
 
-def test_defaults_decide_where_annotations_cannot_be_read():
+def test_defaults_determine_types_if_annotations_cannot_be_read():
     lost = {"lost": Lost()}
 
     assert resolve(spec("lost", rho=0.5), lost).rho == 0.5

@@ -229,7 +229,7 @@ def test_blocks_are_substituted_with_their_variables():
         ),
     ],
 )
-def test_blocks_that_are_no_sets_are_refused_in_one_line(make, message):
+def test_invalid_blocks_of_sets_are_refused_in_one_line(make, message):
     with pytest.raises(InputError, match=message) as e:
         make()
     assert "\n" not in str(e.value)
@@ -459,7 +459,7 @@ class Conic(Careless):
     accepts = (Box, Balls)
 
 
-def test_a_solver_that_declares_nothing_accepts_bounds_alone():
+def test_a_solver_without_a_declaration_accepts_only_bounds():
     qp = qp_with(FREE, BALLS)
     assert (
         reason_to_decline(Careless(), qp) == "does not accept sets of the class Balls"

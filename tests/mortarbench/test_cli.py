@@ -295,7 +295,7 @@ def test_an_interrupt_exits_with_130_and_one_line(cli):
     assert (code, out, err) == (130, "", "mortarbench: interrupted\n")
 
 
-def test_an_interrupted_run_says_how_to_continue(cli, monkeypatch):
+def test_an_interrupted_run_prints_how_to_continue(cli, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 

@@ -231,7 +231,7 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
     assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
 
 
-def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
+def test_the_series_of_a_solver_object_contains_earlier_load_steps(tmp_path):
     """The series of load steps requires the solver again, either the object or the
     plug-in.
     """
@@ -309,7 +309,7 @@ def test_a_qp_is_the_same_whether_its_case_or_itself_is_solved():
     assert by_qp.solution.x.tolist() == by_name.solution.x.tolist()
 
 
-def test_an_operator_gives_its_matrix_by_a_product_with_the_identity():
+def test_the_matrix_of_an_operator_is_its_product_with_the_identity():
     qp = mb.build("membranes/S=2/n=4/dual").qp
     P = qp.P @ np.eye(qp.q.size)
 
@@ -320,7 +320,7 @@ def test_an_operator_gives_its_matrix_by_a_product_with_the_identity():
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "parquet", "qps"])
 @pytest.mark.parametrize("what", [QP, SMALL])
-def test_what_is_exported_is_the_same_qp(tmp_path, monkeypatch, what, ending):
+def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     monkeypatch.chdir(tmp_path)
     path = mb.export(what, f"qp.{ending}")
     qp = what if isinstance(what, mb.QP) else mb.build(what).qp
@@ -432,7 +432,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
     assert done.stdout == "[]\n"
 
 
-def test_a_solver_object_goes_through_the_conformance_suite():
+def test_the_conformance_suite_accepts_a_solver_object():
     """The solver handles one QP only, so every check is declined or fails."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
@@ -454,7 +454,7 @@ def test_completion_lists_public_names_only():
     assert not [name for name in dir(mb) if name.startswith("_")]
 
 
-def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
+def test_the_public_names_suffice_for_plug_ins(tmp_path):
     assert {"QP", "Solution", "Status", "Family", "Case"} <= set(dir(mb))
     assert mb.Case is plugin.Case
     case = mb.build("obstacle/dim=1/n=4/primal")

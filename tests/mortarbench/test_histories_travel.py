@@ -246,7 +246,7 @@ def test_long_tables_keep_their_first_and_last_row_and_count_every_step():
     assert sum(int(steps[1:]) for _, steps, _ in rows) == 1000
 
 
-def test_an_empty_history_is_no_table():
+def test_an_empty_history_has_no_table():
     assert convergence({}) == ""
     assert convergence({"active": np.zeros(0)}) == ""
 

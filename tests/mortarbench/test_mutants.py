@@ -40,7 +40,7 @@ def test_one_place_is_changed_at_a_time(code, expected):
     assert changes(code) == expected
 
 
-def test_texts_types_and_messages_are_left_as_they_are():
+def test_texts_types_and_messages_are_not_mutated():
     code = """
 "A docstring."
 x: Literal[1, 2]

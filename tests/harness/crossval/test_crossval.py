@@ -127,7 +127,7 @@ def disturbed(case, s, size):
 
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
-def test_a_planted_error_is_measured_and_its_solver_named_alone(
+def test_a_planted_error_is_measured_and_only_its_solver_is_named(
     form, truths, tmp_path, cli
 ):
     case, s = truths[2, form]
@@ -350,7 +350,7 @@ def test_a_row_is_closed_if_its_scaled_force_exceeds_its_scaled_gap(duplicate):
     assert found.rows == ()
 
 
-def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
+def test_two_contradictory_claims_are_reported_even_if_none_is_refuted(
     duplicate, monkeypatch
 ):
     def back(s):  # a wrong map, before any answer is certified
@@ -415,12 +415,14 @@ def test_a_qp_has_the_digest_that_a_run_writes_down(serialised, truths, tmp_path
         assert qp_digest(case.qp, serialised=serialised) == written
 
 
-def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():
+def test_the_allowed_error_follows_from_a_gap_of_ten_tolerances():
     assert energy_allowed(1e-8) == pytest.approx(np.sqrt(20e-8))
     assert energy_allowed(0.5) == pytest.approx(np.sqrt(0.2))
 
 
-def test_an_answer_within_its_claim_that_stands_out_is_a_remark(truths, tmp_path, cli):
+def test_an_unusually_inaccurate_answer_within_its_claim_causes_a_remark(
+    truths, tmp_path, cli
+):
     _, s = truths[2, "dual-bounds"]
     answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]
     answers.append(("lazy", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5))))
@@ -647,7 +649,7 @@ def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
     )
 
 
-def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
+def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     truths, tmp_path, cli, svg_only
 ):
     _, s = truths[2, "primal"]

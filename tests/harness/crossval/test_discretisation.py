@@ -473,7 +473,7 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
     ) is is_arc
 
 
-def test_hexahedra_are_interpolated_trilinearly_whatever_their_numbering():
+def test_trilinear_interpolation_of_hexahedra_does_not_depend_on_numbering():
     """x + yz − xyz is trilinear on a box; the nodes of the fine mesh are renumbered."""
 
     def grid(divisions, order=slice(None)):

@@ -92,7 +92,7 @@ def test_positive_pivots_below_their_least_value_are_raised_to_it(length):
     assert L @ L.T == pytest.approx(np.diag([1.0, share, 2 * share]) * length**2)
 
 
-def test_where_nothing_cancels_the_factor_is_that_of_cholesky():
+def test_without_cancellation_the_factor_is_that_of_cholesky():
     L_0, M = parts(0.5)
     L = factor_above(np.asfortranarray(M), 0.5, np.asfortranarray(L_0))
     assert np.tril(L) == pytest.approx(np.linalg.cholesky(M), rel=1e-13)

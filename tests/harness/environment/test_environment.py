@@ -90,7 +90,7 @@ def test_the_digest_changes_with_everything_that_affects_times(quiet, path, valu
     assert digest(changed(quiet, path, value)) != digest(quiet)
 
 
-def test_the_digest_is_12_hex_digits_whatever_the_order_of_keys(quiet):
+def test_the_digest_has_12_hex_digits_and_ignores_the_order_of_keys(quiet):
     reordered = dict(reversed(quiet.items()))
     assert digest(reordered) == digest(quiet)
     assert re.fullmatch(r"[0-9a-f]{12}", digest(quiet))
@@ -337,7 +337,7 @@ def test_the_interval_of_a_noisy_clock_contains_the_true_ratio(amplitude):
     assert noise.high - noise.low < noise.one_pair
 
 
-def test_the_comparison_leaves_the_process_where_it_ran():
+def test_the_comparison_restores_the_cpu_affinity():
     usable = os.sched_getaffinity(0)
     noise = noise_floor(0.05)
     assert os.sched_getaffinity(0) == usable

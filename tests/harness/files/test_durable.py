@@ -115,7 +115,7 @@ def test_a_block_that_raises_replaces_nothing(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
+def test_a_partially_written_line_is_removed_at_once(lines):
     with lines() as file:
         file.append("a" * 50)
         with full(80), pytest.raises(OSError, match="File too large"):
@@ -219,7 +219,7 @@ def test_the_message_on_a_full_disk_names_the_disk_and_the_remedy(tmp_path):
         raise OSError(errno.EIO, "else")
 
 
-def test_a_failure_is_the_disks_if_it_says_so_or_nothing_can_be_written(tmp_path):
+def test_a_failure_is_attributed_to_the_disk_if_it_is_full(tmp_path):
     refuse_full_disk(tmp_path, "something else")
     with pytest.raises(InputError, match="No space left on device"):
         refuse_full_disk(tmp_path, f"exit code 1: {os.strerror(errno.ENOSPC)}: 'x'")
@@ -258,7 +258,7 @@ def test_a_folder_stays_locked_if_its_lock_file_is_deleted(tmp_path):
     FolderLock(tmp_path).close()
 
 
-def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_path):
+def test_a_folder_locked_by_another_run_after_deletion_of_the_lock_is_refused(tmp_path):
     lock = FolderLock(tmp_path)
     (tmp_path / ".lock").unlink()
     other = FolderLock(tmp_path)
@@ -270,7 +270,7 @@ def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_pa
     other.close()
 
 
-def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
+def test_a_run_killed_at_its_start_leaves_a_recognised_folder(tmp_path):
     FolderLock(tmp_path).close()
     (tmp_path / "suite.toml").write_text("")  # environment.json is missing
     refuse_foreign(tmp_path)

@@ -20,7 +20,7 @@ ARRAYS = {
 }
 
 
-def test_numpy_reads_what_is_written_and_mapping_gives_the_same(tmp_path):
+def test_numpy_reads_written_files_and_mapping_yields_equal_arrays(tmp_path):
     file = tmp_path / "a.npz"
     write_mappable(file, ARRAYS)
     views = mapped(file)

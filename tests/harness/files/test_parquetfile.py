@@ -134,7 +134,7 @@ def test_a_file_without_a_problem_is_refused_in_one_line(path, changes, message)
 
 
 @pytest.mark.parametrize("rows", [0, 2])
-def test_a_set_of_several_problems_is_no_problem(path, rows):
+def test_a_set_of_several_problems_is_refused(path, rows):
     one = pa.table(columns())
     pq.write_table(pa.concat_tables([one] * rows) if rows else one.slice(0, 0), path)
     with pytest.raises(InputError, match=f"contains {rows} problems; expected one row"):

@@ -63,7 +63,7 @@ def test_dense_matrices_come_back_dense_and_sparse_ones_as_csc(tmp_path, kind, d
     assert isinstance(loaded.G, csc_array)
 
 
-def test_the_file_is_what_the_interface_promises(saved):
+def test_the_file_has_the_promised_format(saved):
     with np.load(saved(), allow_pickle=False) as stored:
         parts = {f"{M}_{part}" for M in "PGA" for part in
                  ("data", "indices", "indptr", "shape")}  # fmt: skip

@@ -115,7 +115,7 @@ def test_a_missing_or_damaged_file_is_named(tmp_path, solution):
         load_solution(tmp_path, "0000", Status.SOLVED)
 
 
-def test_a_point_is_stored_where_its_folder_was_deleted(tmp_path, solution):
+def test_a_point_is_stored_if_its_folder_was_deleted(tmp_path, solution):
     save_solution(tmp_path, solution)
     shutil.rmtree(tmp_path / "vectors")
     digest = save_solution(tmp_path, solution)

@@ -229,7 +229,7 @@ def test_a_time_is_accepted_within_the_bounds_of_the_parent(
         b"{" * 1000, b'{"event": "start"}',
     ],
 )  # fmt: skip
-def test_a_line_that_is_no_reply_to_the_request_is_refused(line):
+def test_a_line_other_than_a_reply_to_the_request_is_refused(line):
     assert event_of(b'{"event": "done"}', "done")
     with pytest.raises(ForeignReplyError) as e:
         event_of(line, "done")

@@ -138,7 +138,7 @@ def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured, stage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", MEASURING + EVALUATING)
-def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
+def test_a_hanging_rank_is_killed_in_every_stage(measured, stage):
     record = measured(stage, "hangs")
 
     assert record.verdict == "time_limit"
@@ -150,7 +150,7 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 @pytest.mark.parametrize(
     ("stage", "rank"), list(product(MEASURING + EVALUATING, ["0", "1"]))
 )
-def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage, rank):
+def test_an_exception_on_one_rank_does_not_leave_others_waiting(measured, stage, rank):
     record = measured(stage, "raises", rank=rank)
 
     if rank == "0" and stage in ("prepare", "solve"):  # the solver on rank 0

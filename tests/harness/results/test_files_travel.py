@@ -337,7 +337,7 @@ def test_fresh_deletes_copies_and_nothing_else_in_their_folder(measured, here, c
     assert (here / "run" / "files" / "of-the-user.mat").read_text() == "mine"
 
 
-def test_fresh_does_not_delete_what_it_is_to_measure(here, copy, cli):
+def test_fresh_does_not_delete_the_files_to_be_measured(here, copy, cli):
     (here / "s.toml").write_text(SUITE.format(f'"{copy.relative_to(here)}"'))
 
     code, _, said = cli("run", "s.toml", "--out", "run", "--fresh")

@@ -90,7 +90,7 @@ def one_line(err):
 # execution of code
 
 
-def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path):
+def test_no_command_runs_code_named_by_a_case_of_the_folder(sent, command, tmp_path):
     path = tmp_path / "a.npz"
     hostile(path, "subprocess:call")
     vectors = {"x": np.zeros(2), "y": np.zeros(0), "z": np.zeros(0)}

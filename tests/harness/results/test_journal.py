@@ -156,7 +156,7 @@ def test_a_line_of_the_first_schema_is_read_with_its_meaning(tmp_path):
     assert json.loads(old.to_json())["schema"] == 1
 
 
-def test_a_measurement_has_the_name_that_older_folders_give_it():
+def test_a_measurement_has_the_same_name_as_in_older_folders():
     """With another run_id, a continued run would repeat all measurements."""
     box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(

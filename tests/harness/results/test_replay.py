@@ -96,7 +96,7 @@ def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, sol
     assert told["environment"] == []
 
 
-def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
+def test_the_point_and_the_times_are_compared_with_the_stored_ones(cli, stored):
     then = [stored["half", 1, repeat] for repeat in (0, 1)]
     told = json.loads(cli("replay", "done", then[0].run_id, "--json")[1])
     ratio, least, greatest = told["ratios"]["solve_seconds"]
@@ -120,7 +120,7 @@ def test_the_ratio_of_times_names_its_times(cli, stored):
     assert float(ratio) == pytest.approx(now / np.mean(times), rel=1e-2, abs=6e-3)
 
 
-def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):
+def test_a_replay_does_not_change_the_folder(cli, stored, tmp_path):
     def content():
         files = (f for f in (tmp_path / "done").rglob("*") if f.is_file())
         return {f: f.read_bytes() for f in files}
@@ -223,7 +223,7 @@ def test_the_first_digits_of_a_run_id_suffice(cli, stored):
     assert then in cli("replay", "done", short)[1]
 
 
-def test_an_unknown_run_id_is_one_line_with_the_nearest(cli, stored):
+def test_an_unknown_run_id_is_reported_with_the_most_similar_one(cli, stored):
     then = stored["exact", 1, 0].run_id
     other = "x" + then[1:]
     code, out, err = cli("replay", "done", other)
@@ -240,7 +240,7 @@ def test_ambiguous_or_unknown_digits_are_refused(cli, stored, run_id):
     assert (code, err.count("\n")) == (2, 1)
 
 
-def test_a_folder_without_a_journal_is_one_line(cli):
+def test_a_folder_without_a_journal_is_reported_in_one_line(cli):
     code, _, err = cli("replay", "nowhere", "0123")
 
     assert (code, err.count("\n")) == (2, 1)
@@ -248,7 +248,9 @@ def test_a_folder_without_a_journal_is_one_line(cli):
 
 
 @pytest.mark.parametrize("missing", ["suite.toml", "environment.json"])
-def test_a_stored_run_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
+def test_a_missing_file_of_a_stored_run_is_reported_in_one_line(
+    cli, stored, tmp_path, missing
+):
     (tmp_path / "done" / missing).unlink()
     code, _, err = cli("replay", "done", stored["exact", 1, 0].run_id)
 

@@ -246,7 +246,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
     assert "--nthreads 1" in err.splitlines()[-1]
 
 
-def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
+def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
@@ -294,7 +294,7 @@ def test_ctrl_c_during_the_start_of_a_local_cluster_is_deferred():
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-def test_without_dask_one_line_says_what_to_install(cli, monkeypatch):
+def test_a_missing_dask_is_reported_with_the_package_to_install(cli, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", "local")
 

@@ -674,7 +674,7 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
     assert len(measure(suite("honest")).records) == 1
 
 
-def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
+def test_a_folder_that_cannot_be_created_is_refused(measure, tmp_path):
     (tmp_path / ".lock").mkdir()
 
     with pytest.raises(InputError, match="expected a folder that can be written"):
@@ -816,7 +816,7 @@ def test_a_measurement_prevented_by_a_fault_is_retried_at_once(
     assert len(watched.records) == 2
 
 
-def test_a_measurement_prevented_twice_is_left_to_the_next_run(
+def test_a_measurement_prevented_twice_is_retried_by_the_next_run(
     measure, tmp_path, faults
 ):
     whole = suite("honest", "zero", repeats=2)

@@ -342,7 +342,7 @@ def test_limits_change_the_suite_as_run_and_nothing_else_does(narrowed):
 
 
 @pytest.mark.parametrize("head", ["", "time_limit = 7\n"])
-def test_a_limit_of_the_suite_is_no_option_of_a_solver(load, head):
+def test_a_limit_of_the_suite_cannot_be_set_as_a_solver_option(load, head):
     text = head + (
         "name = 'demo'\n[[solvers]]\nname = 'osqp'\n"
         "[solvers.options]\nmax_iter = 3\ntime_limit = 9\n" + BLOCK

@@ -198,7 +198,7 @@ def forms_of(names: Sequence[str]) -> list[tuple[str, str]]:
     return [(n, form) for n in names for form in PROBLEMS[n.partition("/")[0]].forms]
 
 
-def test_bounds_of_what_solvers_return_are_sharp():
+def test_bounds_of_solver_answers_are_sharp():
     cases = forms_of((CASES[0], CASES[3], CASES[7]))
     labels = ("smalbe", "clarabel", "piqp")
     found = [e for case in cases for e in effectivities(*case, labels)]

@@ -261,7 +261,7 @@ def test_none_of_ten_thousand_errors_exceeds_its_bound():
     assert attacked(INCLINE, PERTURBATIONS // len(CASES))[0] == []
 
 
-def test_the_cases_have_rows_that_stick_and_slip_either_way_and_are_open():
+def test_the_cases_contain_sticking_slipping_and_open_rows():
     found = set()
     for name in CASES:
         problem = known(name)
@@ -290,7 +290,7 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 
 
 @pytest.mark.parametrize("name", list(CASES)[:3])
-def test_what_solvers_return_is_bounded_in_every_form(name):
+def test_errors_of_solver_answers_are_bounded_in_every_form(name):
     problem, found = known(name), []
     for form in ("primal", "dual", "dual-bounds"):
         case = build(name, form)

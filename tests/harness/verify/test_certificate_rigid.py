@@ -343,7 +343,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
         assert (np.abs(left) <= 1e-16 * terms.max()).all()
 
 
-def test_balance_is_not_sought_beyond_what_rounding_allows():
+def test_balance_is_required_only_up_to_rounding():
     """Sums with cancellation are accurate only up to the rounding of their terms."""
     G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
     lam = np.ones(2, dtype=Real)
@@ -377,7 +377,7 @@ def pair(**fields: object) -> Certificate:
     )  # fmt: skip
 
 
-def test_the_pair_near_zero_is_evaluated_where_no_other_one_proves_anything():
+def test_the_pair_near_zero_is_used_if_no_other_pair_yields_a_bound():
     def never():
         raise AssertionError("a pair near the answer is enough")
 

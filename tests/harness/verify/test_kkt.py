@@ -300,7 +300,7 @@ def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
     assert kkt_residuals(empty, point).worst < 1e-13
 
 
-def test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer():
+def test_rounding_in_products_with_an_operator_does_not_refute_an_answer():
     """min ½x₁² − x₁ at its minimum; x₂ is arbitrary."""
 
     def product(x):

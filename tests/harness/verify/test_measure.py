@@ -116,7 +116,7 @@ def test_a_failure_ends_with_the_last_place_in_the_solver_s_own_file(
     )
 
 
-def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
+def test_a_shortened_failure_message_keeps_its_location(qp, tmp_path):
     path = tmp_path / f"{'long' * 50}.py"
     code = ADMM.replace("import helper", "")
     path.write_text(code.replace("helper.fails(q)", "{}['9' * 4000]"))

@@ -169,7 +169,7 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.0, 2.5])
-def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(angle):
+def test_a_weak_oblique_direction_is_resolved_exactly_without_a_reference(angle):
     """P has curvature 1e-16 along a direction of slope 1e-8, rotated and rounded."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     P = turn @ np.diag([1, 1e-16]) @ turn.T
@@ -186,13 +186,13 @@ def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(a
     assert error > 1e-4
 
 
-def test_a_row_is_judged_by_its_own_terms_where_it_has_a_right_hand_side():
+def test_a_row_with_a_right_hand_side_is_judged_relative_to_its_terms():
     moved = replace(BETWEEN, x=BETWEEN.x + np.array([1.5, 0]))
 
     assert judge(MOVED, moved, 1e-4) is not Verdict.VERIFIED
 
 
-def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
+def test_a_refutation_by_the_reference_is_recorded():
     assert kkt_residuals(WEAK, SHORT).worst <= 10 * TOL
 
     measured = judged(new_record(), WEAK, SHORT, proves(reference_solution))
@@ -380,7 +380,7 @@ def test_a_qp_is_small_up_to_400_variables_and_rows(rows, expected):
 
 
 @pytest.mark.parametrize(("n", "expected"), [(4000, True), (4001, False)])
-def test_variables_that_are_coupled_to_none_may_be_ten_times_as_many(n, expected):
+def test_uncoupled_variables_may_be_ten_times_as_many(n, expected):
     assert is_small(replace(qp_of([1], [0]), **vectors(n), P=eye_array(n))) is expected
 
 

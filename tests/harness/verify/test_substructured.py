@@ -290,7 +290,7 @@ def test_local_problems_are_those_of_the_decomposed_bodies() -> None:
     assert_allclose(parts.squared_product(v**2), squares, rtol=1e-12)
 
 
-def test_local_solves_neither_feel_nor_cause_rigid_motions() -> None:
+def test_local_solves_ignore_and_exclude_rigid_motions() -> None:
     parts = known(CASES[0]).own.parts
     rng = np.random.default_rng(7)
     b, alpha = (rng.standard_normal(size) for size in parts.kernel.shape)

@@ -256,7 +256,7 @@ def test_ranks_return_physical_results_as_plain_numbers():
     assert found["recover_seconds"] >= 0
 
 
-def test_results_that_ranks_cannot_compute_are_none_and_a_note_of_one_line():
+def test_results_that_fail_on_ranks_are_none_with_a_one_line_note():
     found = on_one_rank(quantities=lambda: fault(None))
 
     assert found["quantities"] == {}

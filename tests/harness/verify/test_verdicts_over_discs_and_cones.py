@@ -471,7 +471,7 @@ def test_equivalent_formulations_have_the_same_residuals(trap):
         )
 
 
-def test_a_reversed_or_shifted_cone_is_no_cone():
+def test_a_reversed_or_shifted_cone_is_refused():
     qp = mb.QP.from_arrays(np.eye(3), [1, 1, 1], sets=[Cones([[0, 1, 2]], [1])])
     with pytest.raises(ValueError, match="Cones cannot be scaled unevenly or rever"):
         mirror(qp, [0])

@@ -120,7 +120,7 @@ def test_supported_bodies_need_no_contact():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_loads_are_refused_where_a_linear_program_has_a_free_motion(seed):
+def test_loads_are_refused_if_and_only_if_a_linear_program_has_a_free_motion(seed):
     """The linear program maximises fᵀr over rigid motions r with B_D r = 0 and B r ≤ 0
     whose components are at most 1 in magnitude."""
     rng = np.random.default_rng(seed)

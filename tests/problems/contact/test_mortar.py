@@ -86,7 +86,7 @@ def test_a_master_node_is_projected_along_the_normal_field():
     assert xi == pytest.approx([-0.281575016087237], abs=1e-15)
 
 
-def test_a_ray_meets_the_master_where_the_lines_cross():
+def test_a_ray_meets_the_master_at_the_intersection_of_the_lines():
     """The ray from the middle of (0, 0)-(2, 0) meets the line through (0, −1) and (2,
     −3)."""
     s, m = sides([[0, 0], [2, 0]], [[2, -3], [0, -1]])

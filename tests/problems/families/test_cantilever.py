@@ -48,7 +48,7 @@ def emitted(name):
 
 
 @pytest.mark.parametrize(("load", "ny"), [(1, 8), (10, 4)])
-def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
+def test_the_tip_of_a_slender_beam_agrees_with_the_elastica(load, ny):
     case, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
 
     assert answer.verdict == "verified"

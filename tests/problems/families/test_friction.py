@@ -227,7 +227,7 @@ def test_the_limit_of_coulombs_law_is_refused_with_the_same_message():
         block_on_incline(0.412371 + 4e-4, COULOMB)
 
 
-def test_loads_are_balanced_where_friction_may_hold_them():
+def test_friction_may_balance_loads():
     """The balance is checked as for the family `bodies`; without friction, the block
     slides."""
     bodies = incline(0.3)

@@ -157,7 +157,7 @@ def test_bodies_of_the_paper_from_a_gmsh_file_give_the_same_results(
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
+def test_triangles_of_any_orientation_are_read(tmp_path, clockwise):
     quads, curves, spots = parts()
     triangles = {
         name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
@@ -229,7 +229,7 @@ def test_settings_in_the_name_override_those_in_the_file(described):
     assert again == other
 
 
-def test_the_file_may_ask_for_finite_strain(described):
+def test_the_file_may_request_finite_strain(described):
     name = described(toml='kinematics = "finite"\nmaterial = "svk"\n' + TOML)
     params = parse(f"{name}/dual", PROBLEMS).params
 

@@ -67,7 +67,7 @@ def test_a_cylinder_on_a_rigid_plane_is_in_hertz_contact(form, plane):
     assert got["contact_force"] == pytest.approx([0, 1e7], abs=1e-2)
 
 
-def test_the_force_error_tells_by_how_much_the_forces_miss_the_load():
+def test_the_force_error_is_the_difference_of_forces_and_load():
     case, s = solved(PLANE)
     too_much = replace(s, x=1.01 * s.x)
 
@@ -92,7 +92,7 @@ def test_the_pressure_converges(family):
     assert np.divide(errors[:-1], errors[1:]).min() > 2
 
 
-def test_the_pressure_is_symmetric_and_none_pulls():
+def test_the_pressure_is_symmetric_and_nonnegative():
     _, s = solved(PLANE)
     force = s.x[2:]
 
@@ -285,7 +285,7 @@ def test_the_tangential_force_rotates_no_body():
 
 
 @pytest.mark.parametrize("keys", [dict(), dict(contact="nts"), dict(slave="lower")])
-def test_the_slip_begins_where_symmetry_puts_the_cylinders(keys):
+def test_slip_starts_from_the_symmetric_position_of_the_cylinders(keys):
     """Without friction, the cylinders could roll on each other under P."""
     keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
     case = CYLINDER.build("dual", CYLINDER.complete(keys), reference_solution)
@@ -341,7 +341,7 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message)
 
 
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
-def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(ratio):
+def test_cells_keep_their_area_if_the_contact_is_wider_than_the_cylinder(ratio):
     """If the uniform part of the arc exceeds the half disc, K is indefinite."""
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)

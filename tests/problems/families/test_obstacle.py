@@ -40,7 +40,7 @@ def rates(errors):
 
 
 @pytest.mark.parametrize("dim", [1, 2])
-def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
+def test_off_the_obstacle_the_exact_height_satisfies_the_differential_equation(dim):
     """Δu = 2 for r > 1; for r ≤ 1 the solution is zero, and its slope is continuous at
     r = 1."""
     rng = np.random.default_rng(20090)
@@ -70,7 +70,7 @@ def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
     assert density.mean() * 3**dim == pytest.approx(exact_energy(dim), rel=1e-5)
 
 
-def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
+def test_the_string_is_exact_at_the_nodes_if_contact_ends_at_a_node():
     """Linear elements are exact at nodes if the contact region ends at a node."""
     case, s = solved(SMALBE(), "primal", 1, 12)
     got = case.quantities(s)

@@ -31,7 +31,7 @@ def test_the_journal_bearing_has_its_published_optimum(points, optimum):
     assert case.quantities(s)["energy"] == pytest.approx(optimum, abs=6e-6)
 
 
-def test_the_film_is_symmetric_and_carries_where_it_narrows():
+def test_the_film_is_symmetric_and_has_pressure_where_it_narrows():
     """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −ε sin ξ is negative for ξ < π only, which
     makes v positive there."""
     n = 31

@@ -243,7 +243,7 @@ def test_neo_hooke_stress_out_of_the_plane_is_that_of_a_confined_cube():
     assert np.allclose(cauchy_stress(c, u)[:, 3], expected, rtol=1e-12)
 
 
-def test_mean_dilatation_does_not_lock_where_four_points_do():
+def test_mean_dilatation_prevents_locking_of_four_point_integration():
     """A single cell is bent, which leaves its mean dilatation unchanged."""
     mesh = rectangle((-1.0, -1.0), (2.0, 2.0), (1, 1))
     bend = (np.prod(mesh.points, axis=1)[:, None] * [0.01, 0.0]).ravel()

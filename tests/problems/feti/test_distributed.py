@@ -258,7 +258,7 @@ def test_contact_rows_are_inverted_in_distributed_or_replicated_form(
         assert "_replicated_inverse" in ways
 
 
-def test_owners_of_rows_are_those_that_touch_them_in_turn():
+def test_rows_are_owned_in_turn_by_the_ranks_that_touch_them():
     reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
     rows = np.array([4, 5, 6, 7, 9])
     assert assign_owners(rows, reach).tolist() == [0, 1, 0, 1, 2]

@@ -33,7 +33,7 @@ def test_parts_are_connected_of_one_body_and_about_equal(parts):
     assert np.array_equal(label, graph_partition(mesh.points, mesh.cells, body, parts))
 
 
-def test_cells_are_neighbours_where_they_share_an_edge():
+def test_cells_that_share_an_edge_are_neighbours():
     """The mesh is a 2 × 2 grid and a triangle that shares only a node with the grid."""
     cells = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7],
                       [8, 9, 10, 10]])  # fmt: skip
@@ -78,7 +78,7 @@ def test_parts_of_long_and_thin_cells_are_compact():
     assert np.median([max(box) / min(box) for box in boxes]) <= 4
 
 
-def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
+def test_hexahedra_that_share_a_face_of_positive_area_are_neighbours():
     """For cells of 1 × 2 × 4, the weight of a face of area A is 100 A^⅓ d^−⅔, with the
     distance d of the centres."""
     mesh = bricks((2, 2, 2), (2.0, 4.0, 8.0))

@@ -56,7 +56,7 @@ def test_equality_rows_remove_their_directions() -> None:
     assert_allclose([found.smallest, found.largest], entries[[1, 38]], rtol=1e-10)
 
 
-def test_a_preconditioner_changes_the_operator_not_where_it_acts() -> None:
+def test_a_preconditioner_changes_the_operator_but_not_its_space() -> None:
     entries = np.linspace(2.0, 50.0, 40)
     near = 1 / entries
     near[[3, 7]] *= [0.25, 4.0]

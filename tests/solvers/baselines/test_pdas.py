@@ -84,7 +84,7 @@ def test_separate_variables_settle_after_one_change_each():
     assert s.counts["factorisations"] == 2
 
 
-def test_contact_rows_join_where_they_are_violated():
+def test_violated_contact_rows_are_added():
     """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, the first iterate has no active
     row, the second one the first row.
     """
@@ -115,7 +115,7 @@ def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
     assert s.y == pytest.approx([-1e8])
 
 
-def test_a_cycle_is_left_by_single_exchanges(cycling):
+def test_single_exchanges_break_a_cycle(cycling):
     s = solve(cycling)
     exact = reference_solution(cycling)
 
@@ -267,7 +267,7 @@ def test_a_sequence_starts_from_the_last_active_set():
     assert kkt_residuals(replace(qp, q=1.0001 * qp.q), warm).worst <= 5e-9
 
 
-def test_a_sequence_goes_on_after_a_problem_of_another_size():
+def test_a_sequence_continues_after_a_problem_of_another_size():
     prepare = PDAS().chain(1e-9)
     for n in (30, 20, 30):
         assert prepare(dual(271828, n))().status is Status.SOLVED

@@ -174,7 +174,7 @@ def test_any_storage_of_P_is_accepted(dual, store):
     assert s.counts["factorised_columns"] == 12
 
 
-def test_rows_that_hardly_meet_the_free_variables_are_not_eliminated(dual):
+def test_rows_nearly_independent_of_free_variables_are_not_eliminated(dual):
     qp = dual(271828)
     A = qp.A.copy()
     A[0, :12] *= 1e-5

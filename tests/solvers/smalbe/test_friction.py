@@ -198,7 +198,7 @@ def test_an_emitted_problem_states_its_fixed_point_residual():
     assert last.unsettled == 0
 
 
-def test_an_emitted_sequence_is_cheaper_still_where_its_tolerances_tighten():
+def test_tightening_tolerances_make_an_emitted_sequence_cheaper():
     names = "greco/n=16/iterate={}/dual"
     cases = [parse(names.format(i), PROBLEMS).build(reference_solution)
              for i in range(1, 13)]  # fmt: skip
@@ -224,7 +224,7 @@ def test_warm_starts_save_products_with_equality_rows():
     assert products(warm) <= 0.5 * products(cold)
 
 
-def test_a_sequence_with_one_equation_goes_on_with_the_spectrum_of_before():
+def test_a_sequence_with_one_equation_reuses_the_previous_spectrum():
     """The arrays that are passed to the next QP have the layout that the compiled code
     requires.
     """

@@ -109,7 +109,7 @@ def test_the_factor_agrees_with_the_textbook(seed, kind):
     assert F.shift == 0
 
 
-def test_a_five_point_grid_loses_what_its_factor_drops_but_for_a_twentieth():
+def test_a_five_point_grid_compensates_a_twentieth_of_dropped_entries():
     """Row sums of M equal those of P plus the uncompensated share of each
     dropped entry.
     """
@@ -259,7 +259,7 @@ def test_sparsity_by_hand():
         ("string/n=50", False),
     ],
 )
-def test_a_factor_is_used_where_it_saves_time(case, pays):
+def test_a_factor_is_used_if_it_saves_time(case, pays):
     qp = primal(case)
     s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
 
@@ -353,7 +353,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
         ("obstacle/dim=1/n=64", 20),
     ],
 )
-def test_on_the_named_families_it_takes_few_products(case, most):
+def test_on_the_named_families_few_products_are_needed(case, most):
     """PERMON's unmerged branch takes 74 and 105 on the first two."""
     qp = primal(case)
     s = FACTORS.prepare(qp, 1e-6)()
@@ -363,7 +363,7 @@ def test_on_the_named_families_it_takes_few_products(case, most):
     assert s.counts["P_products"] <= most
 
 
-def test_half_a_string_takes_a_tenth_of_the_products_of_a_face_after_the_other():
+def test_half_a_string_takes_a_tenth_of_the_products_of_successive_faces():
     """PERMON's unmerged branch takes 224 products, about one for each
     intermediate face.
     """

@@ -74,7 +74,7 @@ def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, 
     assert errors[1] < errors[0] / 2
 
 
-def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts(outer_loop):
+def test_the_accuracy_of_an_answer_does_not_depend_on_the_starting_point(outer_loop):
     """The tolerance is relative to b and not to the initial gradient, which is already
     small here.
     """

@@ -108,7 +108,9 @@ def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
 
 
 @pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
-def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch):
+def test_a_model_of_the_penalty_is_the_same_preconditioner(
+    G, e, face, rho, monkeypatch
+):
     """For P = I, whose model has no Ritz vectors, results with a factor, with an array
     and by hand agree.
     """

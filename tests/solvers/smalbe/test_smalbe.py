@@ -441,7 +441,7 @@ def test_the_power_method_stops_at_its_tolerance():
     assert 5 <= len(products) <= 10
 
 
-def test_inequality_rows_are_declined_with_a_way_out(manufactured):
+def test_inequality_rows_are_declined_with_an_alternative(manufactured):
     qp, _ = manufactured("inequalities")
 
     assert "no inequality rows" in SMALBE().declines(qp)
@@ -522,7 +522,7 @@ def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
 
 
 @pytest.mark.slow
-def test_few_products_with_bounds_alone():
+def test_few_products_suffice_with_bounds_only():
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=30, Nh=15, step=5))
     qp = family.build("dual-bounds", params, reference_solution).qp
@@ -538,7 +538,7 @@ def test_few_products_with_bounds_alone():
     [range(2000, 2020), pytest.param(range(2020, 2060), marks=pytest.mark.slow)],
     ids=["20", "40 more"],
 )
-def test_a_claim_keeps_half_of_what_the_harness_allows(dual, tol, seeds):
+def test_a_claim_uses_at_most_half_of_the_allowed_residual(dual, tol, seeds):
     """The residuals of the original QP decide, not those of the projected problem."""
     for seed in seeds:
         qp = dual(seed)

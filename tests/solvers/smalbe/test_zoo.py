@@ -44,9 +44,7 @@ def ratio(qp, tol):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("family", "given"), CASES, ids=str)
-def test_on_the_named_families_it_needs_hardly_more_than_the_better_preset(
-    family, given
-):
+def test_on_the_named_families_products_hardly_exceed_the_better_preset(family, given):
     case = PROBLEMS[family].build(
         "primal", PROBLEMS[family].complete(given), reference_solution
     )
@@ -115,7 +113,7 @@ def boxed(P, q, lb, ub):
     "seeds", [range(15), pytest.param(range(15, 300), marks=pytest.mark.slow)], ids=str
 )
 @pytest.mark.parametrize("draw", [laplacian, dense])
-def test_a_search_finds_no_problem_on_which_it_needs_twice_as_many(draw, seeds):
+def test_a_search_finds_no_problem_with_twice_as_many_products(draw, seeds):
     for seed in seeds:
         assert ratio(draw(seed), 1e-6) <= 2, seed
 
