@@ -136,7 +136,7 @@ def solve_kkt(
 
 
 def max_step(v: Vector, dv: Vector) -> float:
-    """Return the longest step with v + step·dv ≥ 0, or 100 if that is longer."""
+    """Return the longest step, at most 100, with v + step·dv ≥ 0."""
     return float((-v[dv < 0] / dv[dv < 0]).min(initial=100.0))
 
 
