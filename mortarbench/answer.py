@@ -1,4 +1,4 @@
-"""Answers to single cases: computed and verified (`solve`), or verified (`verify`)."""
+"""Functions that solve a case and verify the answer, or verify a given point."""
 
 from __future__ import annotations
 
@@ -60,18 +60,18 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.crossval.discretisation import Discretisation
 
-#: Certified relative error in the energy norm above which a verified answer has a
-#: remark.
+#: Certified relative error in the energy norm above which `remarks` returns a remark on
+#: a verified answer.
 MAX_CERTIFIED_ERROR = 0.01
 #: Largest sum of contact forces, relative to the sum of loads, at which bodies count as
-#: not in contact. Interior-point methods leave forces of about 1e-8, far smaller than
-#: those of closed contacts.
+#: not in contact. Interior-point methods return forces of about 1e-8 at open contacts;
+#: forces at closed contacts are far larger.
 MAX_OPEN_FORCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Answer:
-    """Answer of a solver to a case, with our verdict."""
+    """Answer of a solver to a case, with the verdict of the harness."""
 
     case: Case
     record: Record  #: measurement, as in a line of a journal
@@ -115,10 +115,10 @@ class Answer:
 
     @property
     def normality(self) -> Normality | None:
-        """Further error measures over discs and cones.
+        """Additional error measures for discs and cones.
 
-        None if the QP has no such sets, the case is not built in this process, or there
-        is no point.
+        None if the QP has no such sets, the case has not been built in this process, or
+        the solver returned no point.
         """
         if "family_case" not in vars(self.case) or not self.has_point:
             return None
@@ -130,7 +130,7 @@ class Answer:
     def to_dict(self) -> dict[str, Any]:
         """Return the record, the history and the remarks as plain data.
 
-        For a QP over discs or cones, the values of `normality` are included.
+        For a QP with discs or cones, the values of `normality` are included.
         """
         history = finite(plain(self.history))
         further = self.normality
@@ -144,7 +144,7 @@ class Answer:
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
         """Estimate the discretisation error, which adds to the error of the solver.
 
-        For this purpose, the reference solver solves the case on finer meshes.
+        The reference solver solves the case on finer meshes to obtain this estimate.
 
         budget : time budget in s; meshes whose solve would exceed it are skipped
         """
@@ -180,8 +180,8 @@ class Answer:
         Parameters
         ----------
         path : file to which the picture is also written: .png, .pdf or .svg
-        scale : magnification of the displacements. If None, the factor is 1 if the
-            displacements are visible, and otherwise a round factor stated in the title
+        scale : magnification of the displacements. None: 1 if the displacements are
+            then visible, and otherwise a rounded factor, which the title states
 
         Raises
         ------
@@ -230,9 +230,7 @@ class Answer:
 
         path, fields = check_output_file(path, GRIDS), self.fields()
         if not len(fields.cells):
-            raise InputError(
-                f"{path}: {self.case.name} has no bodies that could be written"
-            )
+            raise InputError(f"{path}: {self.case.name} has no bodies to write")
         if path.suffix == ".vtu":
             write_vtu(fields, path)
             return path
@@ -248,8 +246,8 @@ class Answer:
             )
             if not earlier.has_point:
                 raise InputError(
-                    f"{path}: the solver returned no point at step "
-                    f"{step}; expected a .vtu file instead"
+                    f"{path}: the solver returned no point at step {step}; "
+                    "expected FILE.vtu, which needs only the last step"
                 )
             states.append((float(step), earlier.fields()))
         write_series([*states, (float(last), fields)], path)
@@ -274,9 +272,9 @@ class Answer:
 def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str, ...]:
     """Return reasons to doubt a verified answer, one line each.
 
-    The QP is solved, but the certified bound may be weak or the model inadequate: the
-    bodies are not in contact, only a single node is, or displacements are too large for
-    linear kinematics.
+    Although the QP is solved, the certified bound may be large or infinite, or the
+    model may be inadequate: no node or only one node is in contact, or displacements
+    are too large for linear kinematics.
     """
     if record.verdict is not Verdict.VERIFIED or solution is None:
         return ()
@@ -285,28 +283,27 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     if bound is not None and bound == np.inf:
         reasons.append(
             "the certificate does not bound the solver's error, because the "
-            "displacements may be as small as rounding, or because a load may act on "
-            "supports"
+            "displacements may be as small as rounding errors, or because a load may "
+            "act on supports"
         )
     elif bound is not None and bound > MAX_CERTIFIED_ERROR:
         reasons.append(
             f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
             "a smaller tolerance may give a smaller bound"
         )
-    # A failed remark must not make the solve fail: the recovery of displacements may be
-    # code of a plug-in, and if ranks solved the QP, this process has no built case.
+    # An exception in a remark must not make the solve fail. Displacements may be
+    # recovered by code of a plug-in, and if MPI ranks solved the QP, the case is not
+    # built in this process.
     with suppress(Exception), one_thread():
         if _is_open(case, record, solution):
             reasons.append(
-                "no node is in contact: the sides stay apart, and the answer is that "
-                "of bodies without contact; check the direction of the load and the "
-                "initial gap"
+                "no node is in contact, so the answer is the same as without contact "
+                "conditions; check the direction of the load and the initial gap"
             )
         elif record.quantities.get("active") == 1 < record.quantities["contact_rows"]:
             reasons.append(
-                "a single node is in contact: its pressure is the force over the share "
-                "of the side that belongs to the node, and grows on finer meshes; "
-                "refine the mesh near the contact"
+                "a single node is in contact, so the computed pressure depends on the "
+                "mesh width and grows on finer meshes; refine the mesh near the contact"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)
@@ -314,7 +311,7 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:
-    """Return True if the sum of contact forces is at most `MAX_OPEN_FORCE` · loads."""
+    """Return True if contact forces sum to at most `MAX_OPEN_FORCE` times the loads."""
     if not record.quantities.get("contact_rows"):
         return False
     if record.quantities.get("active") == 0:
@@ -336,7 +333,7 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
         return
     grid, u = mechanics.grid, case.family_case.recover(solution)
     if u.size != grid.points.size:
-        return  # u is scalar, such as the height of a membrane
+        return  # u is a scalar field, such as the height of a membrane
     lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
     worst, text = 1.0, ""
     for body in np.unique(grid.bodies):
@@ -418,11 +415,11 @@ def solver_session(
     forks: bool = False,
     ranks: int = 1,
 ) -> Iterator[Callable[[Case, float], Answer]]:
-    """Start a process for a solver; yield a function that solves a case to a tolerance.
+    """Start a solver process; yield a function that solves a case to a tolerance.
 
     solver, options, ranks : see `solve`
-    registries : registries that contain the solver; the process is started with them
-    forks : True if the process may be a fork of this process, provided that a fork is
+    registries : registries that contain the solver; the process loads the same plug-ins
+    forks : True to allow a fork of this process as the solver process where a fork is
         safe; see `harness.processes.forking`
 
     Raises
@@ -441,7 +438,8 @@ def solver_session(
     configured = resolve(spec, solvers)
     defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
     if options_of(configured).get("history") is False and "history" not in requested:
-        # Recording takes time, but times of single solves are not compared.
+        # Recording the history slows down the solver, but times of single solves are
+        # not used in comparisons.
         defaults = {**defaults, "history": True}
         spec = replace(spec, options={**requested, "history": True})
         configured = resolve(spec, solvers)
@@ -509,16 +507,15 @@ class Verification:
     #: multipliers passed to `verify`; those left out are computed
     multipliers: Multipliers
     objective: float  #: ½xᵀPx + qᵀx
-    #: error relative to a proven optimum, if that decided the verdict, else None
+    #: error relative to a proven optimum if this error decided the verdict, else None
     optimum_error: float | None
-    normality: (
-        Normality | None
-    )  #: further error measures over discs and cones; None if the QP has no such sets
+    #: additional error measures for discs and cones; None if the QP has no such sets
+    normality: Normality | None
     tol: float  #: tolerance; a point is verified if every residual is at most 10·tol
 
     def __repr__(self) -> str:
         if self.optimum_error is not None:
-            error = f"off the proven optimum by {self.optimum_error:.2g}"
+            error = f"error {self.optimum_error:.2g} relative to the proven optimum"
         else:
             values = self.residuals._asdict().items()
             error = ", ".join(f"{name} {value:.2g}" for name, value in values)
@@ -533,7 +530,7 @@ def verify(
     z_box: ArrayLike | None = None,
     tol: float = 1e-8,
 ) -> Verification:
-    """Verify a point by its KKT residuals, in the same way as answers of solvers.
+    """Verify a point by its KKT residuals, as the harness verifies answers of solvers.
 
     Multipliers that are left out are computed by nonnegative least squares on the
     active rows and bounds, see `harness.verify.multipliers`. If the residuals are large
@@ -551,8 +548,8 @@ def verify(
     Raises
     ------
     InputError
-        If the size of a vector does not match the QP, or the QP is too large for the
-        computation of the multipliers that were left out.
+        If the size of a vector does not match the QP, or multipliers are left out and
+        the QP is too large to compute them.
 
     Examples
     --------

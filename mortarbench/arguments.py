@@ -1,4 +1,4 @@
-"""Checks of arguments, made before slow computations and imports begin."""
+"""Checks of arguments, performed before slow computations and imports."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from mortarbench.harness.errors import InputError, shown, unknown
 EXPORTS = (".npz", ".mat", ".parquet", ".qps", ".hdf5")  #: suffixes of exported QPs
 PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
-GATES = ("worse", "slower")  #: conditions under which a comparison fails, see `report`
+GATES = ("worse", "slower")  #: values allowed in the argument `fail_on` of `report`
 MAX_SCALE = 1e9  #: largest magnification of displacements in pictures
-GRIDS = (".vtu", ".pvd")  #: suffixes for ParaView: one state, or all load steps
+GRIDS = (".vtu", ".pvd")  #: suffixes of ParaView files: one state, or all steps
 
 
 def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    """Check that `path` can name an output file, and return the path.
+    """Check that `path` is a valid name of an output file, and return the path.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def check_result_folder(folder: Path) -> Path:
 def tolerance(tol: float, where: str = "tol") -> float:
     """Check a relative tolerance, and return the tolerance as a float.
 
-    where : name of the argument, for the message
+    where : name of the argument in the error message
 
     Raises
     ------
@@ -103,7 +103,7 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
 def check_scale(scale: float, where: str = "scale") -> float:
     """Check the magnification of displacements in pictures, and return its value.
 
-    where : name of the argument, for the message
+    where : name of the argument in the error message
 
     Raises
     ------
@@ -121,7 +121,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
 def budget(seconds: float, where: str = "budget") -> float:
     """Check a time budget in seconds, and return its value.
 
-    where : name of the argument, for the message
+    where : name of the argument in the error message
 
     Raises
     ------
@@ -139,10 +139,10 @@ def budget(seconds: float, where: str = "budget") -> float:
 def check_names(
     kind: str, names: Sequence[str], allowed: Sequence[str], where: str
 ) -> None:
-    """Check that all names, such as those of formats, are allowed.
+    """Check that all names, for example names of formats, are allowed.
 
-    kind : noun for such a name, in the message
-    where : name of the argument, for the message
+    kind : noun for the names in the error message, such as ``format``
+    where : name of the argument in the error message
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Cases: QPs, named or passed as objects, with the recovery of physical results."""
+"""Cases: QPs with functions that recover physical results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Case(plugin.Case):
-    """QP of a problem with the recovery of physical results, built at first use."""
+    """QP with functions that recover physical results; the QP is built at first use."""
 
     def __init__(self, *, id: CaseId, registries: Registries) -> None:  # noqa: A002
         self.id = id  #: family, parameters and form
@@ -37,7 +37,7 @@ class Case(plugin.Case):
 
     @cached_property
     def family_case(self) -> plugin.Case:
-        """Case built by its family, at the first access.
+        """Result of `Family.build`, computed at the first access.
 
         Raises
         ------
@@ -94,12 +94,12 @@ class Case(plugin.Case):
 
     @property
     def mechanics(self) -> Mechanics | None:
-        """Mechanical problem from which error bounds are certified; None if unknown."""
+        """Mechanical problem from which error bounds are computed, or None."""
         return self.family_case.mechanics
 
     @property
     def unsettled(self) -> float:
-        """Relative residual of the QP's fixed-point iteration; 0 if there is none."""
+        """Relative residual of the fixed-point iteration, or 0 if the QP has none."""
         return self.family_case.unsettled
 
     def recover(self, solution: Solution) -> Vector:
@@ -227,18 +227,18 @@ class BareQP(plugin.Family):
 
 
 def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
-    """Return the case of a name or a QP, not built yet.
+    """Return the unbuilt case for a name or a QP.
 
-    A case is returned unchanged, unless `plugins` contains files that it has not
-    loaded.
+    If `problem` is a case, the same case is returned, unless `plugins` contains files
+    that its registries have not loaded.
 
     plugins : Python files with more families or solvers
 
     Raises
     ------
     InputError
-        If the type of `problem` is none of these, there is no such case, or a plug-in
-        cannot be loaded.
+        If `problem` has another type, there is no such case, or a plug-in cannot be
+        loaded.
 
     """
     match problem:
@@ -252,14 +252,15 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
                 extended.__dict__["family_case"] = problem.family_case
             return extended
         case QP():
-            # Our code expects sparse arrays; `*` of sparse matrices is their product.
+            # mortarbench expects sparse arrays, for which `*` is elementwise; for
+            # sparse matrices, `*` is the matrix product.
             family = BareQP(problem.with_matrices(csc_array))
             name = CaseId(family=family, name="qp", params={}, form="qp")
             return Case(id=name, registries=load_registries(plugins))
         case str():
             registries = load_registries(plugins)
             return Case(id=parse(problem, registries.families), registries=registries)
-    hint = f"; a file is 'file:{problem}'" if isinstance(problem, Path) else ""
+    hint = f"; write 'file:{problem}' for a file" if isinstance(problem, Path) else ""
     raise InputError(
         f"case = {shown(problem)}; expected the name of a case, the result of "
         f"build(), or a QP{hint}"

@@ -21,8 +21,9 @@ from mortarbench.text import first_comment, first_sentence, listing
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: Data of our solvers, so that `list solvers` need not import the solvers. `make docs`
-#: writes the file, and a test compares its content with the solvers.
+#: File with descriptions of the built-in solvers, so that `list solvers` does not
+#: import them. `make docs` writes the file, and a test compares its contents with the
+#: solvers.
 CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
@@ -38,7 +39,7 @@ class Listing(tuple[Mapping[str, Any], ...]):
 
     @property
     def df(self) -> DataFrame:
-        """The rows as a pandas table."""
+        """Rows as a pandas DataFrame."""
         from pandas import DataFrame
 
         return DataFrame(list(self))
@@ -59,7 +60,7 @@ def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> L
     """List the solvers: name, description, and options with their defaults.
 
     plugins : Python files with more solvers
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -90,7 +91,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
     """List the families: name, description, keys with their defaults, and forms.
 
     plugins : Python files with more families
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -119,7 +120,7 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
 def suites(*, registries: Registries | None = None) -> Listing:
     """List the suites of the package: name, description and path.
 
-    registries : replaces our registries
+    registries : used instead of the built-in registries
 
     Examples
     --------
@@ -150,7 +151,7 @@ def describe(solver: Solver) -> dict[str, Any]:
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the row of a solver in the list.
+    """Return the row of a `Listing` that describes a solver.
 
     The description contains a remark if the library of the solver is missing.
 
@@ -166,7 +167,7 @@ def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def catalogue() -> dict[str, Any]:
-    """Read the catalogue of our own solvers, without importing them."""
+    """Read the catalogue of the built-in solvers, without importing the solvers."""
     entries: dict[str, Any] = json.loads(CATALOGUE.read_text("utf-8"))
     return entries
 

@@ -1,4 +1,4 @@
-"""Main functions of the processes of a run: workers, ranks and the case worker."""
+"""Main functions of the processes of a run: workers, MPI ranks and the case worker."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from mortarbench.registries import Registries
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run a worker, started by the command of `Registries.worker_command`.
+    """Run a worker; called by the command that `Registries.worker_command` returns.
 
-    arguments : JSON object, and file descriptors of requests and replies
+    arguments : a JSON object, and the file descriptors for requests and replies
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
@@ -58,7 +58,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
 
 
 def ranks(registries: Registries, arguments: Sequence[str]) -> int:
-    """Start a worker on several ranks, by the command of `Registries.worker_command`.
+    """Start a worker on several MPI ranks; called by the command of `worker_command`.
 
     arguments : see `worker`
     """
@@ -67,9 +67,9 @@ def ranks(registries: Registries, arguments: Sequence[str]) -> int:
 
 
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run the case worker, started by the command of `Registries.commands`.
+    """Run the case worker; called by the command that `Registries.commands` returns.
 
-    arguments : JSON object, and file descriptors of requests and replies
+    arguments : a JSON object, and the file descriptors for requests and replies
     """
     text, request_fd, reply_fd = arguments
     request = json.loads(text)

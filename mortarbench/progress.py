@@ -1,8 +1,8 @@
 """Displays of the progress of a run.
 
 A run reports its progress to a `Progress` (see `harness.running.progress`). The classes
-of this module show a bar on a terminal or in a notebook, print one line per measurement
-elsewhere, or call a function of the user.
+of this module implement `Progress`: they show a bar on a terminal or in a notebook,
+print one line per measurement elsewhere, or call a function of the user.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from mortarbench.harness.errors import shown as repeated
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
-_REASON_LENGTH = 120  #: length to which the reason for declining a QP is shortened
+_REASON_LENGTH = 120  #: maximum displayed length of the reason for declining a QP
 _BAR_WIDTH = 60  #: smallest width of a terminal, in columns, at which a bar is shown
 _UPDATE_SECONDS = 0.2  #: shortest time between two updates of a bar in a notebook
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """State of a run at one moment, passed to the function `progress` of `run`."""
+    """State of a run, passed to the function `progress` of `mortarbench.run`."""
 
-    done: int  #: number of measurements so far, including those of earlier runs
+    done: int  #: number of completed measurements, including those of earlier runs
     total: int  #: number of measurements of the run
     now: str = ""  #: current activity
-    warning: str = ""  #: warning that caused this event, else empty
+    warning: str = ""  #: warning that caused this event; empty if there is no warning
     record: Record | None = None  #: measurement that was just completed, or None
 
 
@@ -40,7 +40,7 @@ Callback = Callable[[Event], object]
 
 
 class _Display:
-    """Counters of a run; subclasses display them."""
+    """Counters of completed measurements, which subclasses display."""
 
     def __init__(self) -> None:
         self.done = self.total = 0
@@ -64,7 +64,7 @@ class _Display:
         self.changed()
 
     def count(self, record: Record | None) -> None:
-        """Count a cell as done, and as measured if there is a record."""
+        """Count a measurement as done and, with a record, as measured by this run."""
         self.done += 1
         self.measured += record is not None
 
@@ -82,7 +82,7 @@ class _Silent(_Display):
 
 
 class _EventDisplay(_Display):
-    """Display that calls a function at every change."""
+    """Display that calls a function of the user at every change."""
 
     def __init__(self, callback: Callback) -> None:
         super().__init__()
@@ -112,7 +112,7 @@ class _Warnings(_Display):
         self._stream = stream
 
     def warn(self, text: str) -> None:
-        # The run must continue after the reader of its output has closed the pipe.
+        # The run must continue if the program that reads its output closes the pipe.
         with suppress(BrokenPipeError):
             print(text, file=self._stream, flush=True)
 
@@ -145,7 +145,7 @@ def is_notable(record: Record) -> bool:
 
 
 class _Bar(_Display):
-    """Progress bar of `rich`; answers that are not verified are printed above it."""
+    """Progress bar of `rich`, with answers that are not verified printed above."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class _Bar(_Display):
 
 
 class _Notebook(_Display):
-    """Progress bar in a notebook, below a line for each answer that is not verified."""
+    """Progress bar in a notebook, with answers that are not verified listed above."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -255,8 +255,8 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
     class TimeLeft(ProgressColumn):
         """Remaining time, estimated from all measurements of the run.
 
-        The corresponding column of rich uses only the last half minute, in which there
-        may be no measurement.
+        The corresponding column of rich uses only the last 30 s, in which possibly no
+        measurement has been completed.
         """
 
         def render(self, task: Task) -> Text:

@@ -37,11 +37,12 @@ if TYPE_CHECKING:
     from mortarbench.harness.solution import Solution
 
 #: Lock that lets only one thread at a time load plug-ins, build, solve or validate.
-#: For the whole process, these actions set the number of threads, redirect standard
-#: output and register modules.
+#: These actions change global state of the process: the number of threads, standard
+#: output and the registered modules.
 TURN = ForkSafeLock()
 
-#: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
+#: Python files that define SOLVERS or PROBLEMS; a string may have the form
+#: LABEL=FILE.py
 Plugins = Sequence[str | Path | PluginFile]
 
 
@@ -65,7 +66,7 @@ class Reporter(Protocol):
 
 
 def _plugin_files(files: Plugins) -> list[PluginFile]:
-    """Check that `files` is a list of Python files, and return the list of plug-ins."""
+    """Check that `files` is a list of Python files; return the plug-in files."""
     if isinstance(files, str | Path) or not isinstance(files, Iterable):
         raise InputError(
             f"plugins = {shown(files)}; expected a list of Python files, such as "
@@ -79,7 +80,7 @@ def _plugin_files(files: Plugins) -> list[PluginFile]:
 
 
 def suites_folder() -> Path:
-    """Return the folder of the suites: in the package, or beside it in a checkout."""
+    """Return the folder of the suites: in the package, or in a checkout beside it."""
     inside = Path(__file__).parent / "suites"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "suites"
 
@@ -120,7 +121,7 @@ def defer_parts_of_numpy() -> None:
 
 
 def reference(qp: QP) -> Solution:
-    """Solve a QP almost to rounding accuracy, by a solver that is not under test."""
+    """Solve a QP almost to rounding accuracy with a solver that is not under test."""
     from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)
@@ -133,7 +134,7 @@ def report_folder(
     factor: float | None = None,
     pool_forms: bool = False,
 ) -> list[Path]:
-    """Write our report on a result folder, and return the files; see `Reporter`."""
+    """Write the built-in report on a result folder and return the files."""
     from mortarbench.harness.record import VERIFIED_FACTOR
     from mortarbench.reports import write_report
 
@@ -155,7 +156,7 @@ def _validation_page(
 
 
 class _FamiliesWithCopies(Mapping[str, Family]):
-    """Families that read missing files from the copies in a result folder."""
+    """Families that read missing input files from the copies in a result folder."""
 
     def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
         self._families = families
@@ -186,15 +187,15 @@ class Registries:
     validation_page: ValidationPage = _validation_page
     #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
-    #: operators that are not from plug-in files
+    #: operators that do not come from plug-in files
     own_operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     suites: Path = field(default_factory=suites_folder)  #: folder of the suites
-    #: plug-in files, which the processes of a run load as well
+    #: plug-in files, which are also loaded by the processes of a run
     files: tuple[PluginFile, ...] = ()
-    #: origin of each family that is from a plug-in, by name of the family
+    #: origin (file or package) of each family that comes from a plug-in, by family name
     origins: Mapping[str, str] = field(default_factory=dict)
-    #: Start of the command lines of processes. Because of -P, Python does not import
-    #: files in the working directory in place of libraries.
+    #: First arguments of the command line of each process. The option -P prevents
+    #: Python from importing files in the working directory instead of libraries.
     start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
 
     def extended(self, plugin: Plugin) -> Registries:
@@ -258,7 +259,7 @@ class Registries:
     def worker_command(self, spec: SolverSpec, copy: Path | None = None) -> list[str]:
         """Return the command that starts the worker of a solver.
 
-        The file descriptors of the worker's two pipes must be appended.
+        The caller appends the file descriptors of the worker's two pipes.
 
         copy : file that contains the configured solver if it was passed as an object,
             see `harness.processes.solver_file`; else None
@@ -300,7 +301,7 @@ class Registries:
     ) -> Commands:
         """Return the commands that start the processes of a run.
 
-        folder : result folder, with copies of files from which cases may be built
+        folder : result folder with copies of input files, from which cases may be built
         """
         from mortarbench.harness.results.work_unit import Commands
 
@@ -316,9 +317,9 @@ class Registries:
     def environment(self) -> dict[str, Any]:
         """Return the environment of the processes of a run; see `capture`.
 
-        If this process is limited to one thread, as those of a run are, it captures its
-        own environment. Otherwise, for example in a notebook with other libraries, a
-        new process captures the environment.
+        If this process is limited to one thread, like the processes of a run, it
+        captures its own environment. Otherwise, for example in a notebook with other
+        libraries, a new process captures the environment.
         """
         from mortarbench.harness.environment.environment import capture, capture_in
         from mortarbench.solvers.common.libraries import PACKAGES
@@ -327,14 +328,14 @@ class Registries:
             here = capture(self.files, PACKAGES)
             if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
                 return here
-            # otherwise the limits were set after the libraries had been loaded
+            # if not, the limits were set after the libraries had been loaded
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
         return [str(file.resolved()) for file in self.files]
 
     def suite_path(self, text: str | Path) -> Path:
-        """Return the path of a suite that is given by a path or a name in `suites`.
+        """Return the path of a suite, specified by its path or by its name in `suites`.
 
         Raises
         ------
@@ -371,10 +372,10 @@ def installed(registries: Registries) -> Registries:
 def load_registries(
     plugins: Plugins = (), registries: Registries | None = None
 ) -> Registries:
-    """Return our registries extended by installed plug-ins and by plug-in files.
+    """Return the built-in registries extended by installed plug-ins and plug-in files.
 
     plugins : plug-in files
-    registries : if not None, this value is returned instead
+    registries : if not None, these registries are returned unchanged
 
     Raises
     ------

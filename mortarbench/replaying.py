@@ -37,7 +37,7 @@ from mortarbench.text import align
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
-_VALUE_LENGTH = 48  #: length to which a value of the environment is shortened
+_VALUE_LENGTH = 48  #: maximum displayed length of a value of the environment
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -53,8 +53,9 @@ class Replay:
     #: ‖x_now − x_then‖∞ / ‖x_then‖∞ of the two points x; None if a point is missing
     distance: float | None
     ratios: Mapping[str, tuple[float, float, float] | None]
-    """Ratios of the new time, and of the smallest and the largest time of the stored
-    repeats, to the median of the stored repeats. None if a time was not measured."""
+    """New time, smallest stored time and largest stored time, each divided by the
+    median of the stored repeats. None if a time was not measured.
+    """
     stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, in s
     #: differences of the environments: dotted key, old value, new value
     environment: list[tuple[str, Any, Any]]
@@ -98,7 +99,7 @@ def replay(
     folder : result folder, as `run` writes it
     run_id : `run_id` in a line of the journal, or its first digits
     plugins : Python files with more solvers or families
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -146,7 +147,7 @@ def compare(
     result: Result,
     environment: Mapping[str, Any],
 ) -> Replay:
-    """Compare a new measurement and its point with those stored in `folder`.
+    """Compare a new measurement and its solution with the ones stored in `folder`.
 
     run : stored measurement, with the other repeats of the same measurement
     environment : environment of the new measurement
@@ -263,7 +264,7 @@ def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> s
         return f"{now:.2f} of the only stored repeat"
     return (
         f"{now:.2f} of {median(stored):.3g}, the median of {len(stored)} stored "
-        f"repeats ({least:.2f} … {greatest:.2f} of it)"
+        f"repeats ({least:.2f} … {greatest:.2f} of the median)"
     )
 
 
@@ -272,7 +273,7 @@ def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
         return None
     try:
         solution = load_solution(folder, then.vectors, Status.SOLVED)
-    except InputError:  # users may delete vectors; a journal is valid without them
+    except InputError:  # users may delete stored solutions; the journal remains valid
         return None
     if digest_of(point_arrays(solution)) != then.vectors:  # the file was changed
         return None
@@ -294,8 +295,8 @@ def _ratio(
 def _pools_by_library(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the environment with its list of thread pools as a mapping.
 
-    The keys are names of libraries, so that differences are reported by library rather
-    than by position in the list.
+    The keys are names of libraries, so that differences are reported by library and not
+    by position in the list.
     """
     threads = environment.get("threads")
     if not isinstance(threads, Mapping):

@@ -72,17 +72,19 @@ def report(
     Parameters
     ----------
     folder : result folder; its report is written to the subfolder ``report``
-    others : further result folders. If there are any, the changes from `folder` to each
-        of them are reported instead, in the subfolder ``report`` of the latter
+    others : further result folders. For each of them, a report on the changes from
+        `folder` to this further folder is written to its subfolder ``report``, instead
+        of the report on `folder`
     formats : any of html, md, tex, csv, parquet
     factor : a point is verified if every residual is at most factor·tol
     fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
         verdict became worse; ``slower``, the confidence interval of a ratio of times
         lies above 1, see docs/statistics-growth.md
-    pool_forms : True if means, ranks and profiles compare solvers over the cases of all
-        forms together, where a declined form counts as unsolved; False if they compare
-        solvers within each form
-    registries : replaces our registries, whose report function is used
+    pool_forms : True to compute means, ranks and profiles over the cases of all forms
+        together, where a declined form counts as unsolved; False to compute them within
+        each form
+    registries : used instead of the built-in registries, for the function that writes
+        the report
 
     Raises
     ------
@@ -114,7 +116,7 @@ def report(
         write = registries.report
         with report_full_disk(first):
             files = write(first, formats, factor=factor, pool_forms=pool_forms)
-        if write is not report_folder:  # `answer` summarises only our own report
+        if write is not report_folder:  # `answer` summarises only the built-in report
             return Report(files=tuple(files))
         from mortarbench.reports import answer
 
@@ -122,7 +124,7 @@ def report(
     if pool_forms:
         raise InputError(
             "--pool-forms applies to the report on one folder, not to a comparison of "
-            "two folders, which pairs equal cases; leave one of them out"
+            "two folders, which pairs equal cases; omit it or the second folder"
         )
     from mortarbench.reports import write_comparisons
 

@@ -56,12 +56,12 @@ class Results:
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    #: labels of the requested solvers, in the order of the suite; after `load`, those
-    #: of all records
+    #: labels of the requested solvers, in the order of the suite; after `load`, the
+    #: labels of all solvers in the records
     solvers: tuple[str, ...] = ()
     #: names of the requested cases; if empty, all cases in the records
     cases: frozenset[str] = frozenset()
-    #: requested measurements that are missing; a second call of `run` retries them
+    #: requested measurements that are missing; another call of `run` retries them
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
@@ -301,8 +301,9 @@ def run(
     suite : path of a TOML file, a name listed by `suites`, or a dict with the keys of
         such a file; relative paths in a dict refer to the working directory
     out : result folder; by default ``out/NAME`` for the suite NAME
-    solvers : names of the only solvers to measure, which need not be in the suite
-    cases : names or patterns of the only cases to measure
+    solvers : names of the solvers to measure, which need not be in the suite; empty:
+        all solvers of the suite
+    cases : names or patterns of the cases to measure; empty: all cases of the suite
     repeats, time_limit, memory_limit : override the values of the suite; the limits are
         in s and MiB
     options : options to set in every solver that has them; if the value of an option is
@@ -314,7 +315,7 @@ def run(
     progress : True for a bar, or for lines if stderr is not a terminal; a function to
         be called with every `Event`; False for no display; None for a bar in a notebook
         and no display elsewhere
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -359,7 +360,7 @@ def run(
     folder = folder or Path("out") / name_in(text)
     fresh = checked.flag("fresh", fresh)
     if folder.is_dir():
-        # Check this before copies are read: a link could lead out of the folder.
+        # Check for links before copies are read: a link could point outside the folder.
         refuse_links(folder)
     families = registries.families_with_copies(None if fresh else folder)
     known_solvers = registries.solvers

@@ -37,8 +37,8 @@ UNITS = {
     "published_error": "(relative)",
     "stress_error": "(dimensionless)",
 }
-_CONTACTS = "contacts"  #: quantity with a table for each pair of sides
-#: quantity that is shown on the line of `sliding_without_contact`
+_CONTACTS = "contacts"  #: quantity that maps each contact pair to a table of results
+#: quantity that is printed on the line of `sliding_without_contact`
 _SHARE = "shear_without_contact"
 _CONTACT_UNITS = {
     "largest_pressure": "Pa",
@@ -60,7 +60,7 @@ _LEGEND = {
     "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning, "
     "n Newton",
     "outer": "outer: number of the outer iteration",
-    "products": "products: of the QP's matrix P with a vector, so far",
+    "products": "products: number of products with the QP's matrix P so far",
     "free_gradient": "‖φ‖: free gradient, of the variables that are not at a bound",
     "chopped_gradient": "‖β‖: chopped gradient, of the variables that should leave "
     "their bounds",
@@ -71,9 +71,8 @@ _LEGEND = {
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }
-_HIDDEN = (
-    "seconds",
-)  #: columns of a history that are not shown; times of a single run are unreliable
+#: columns of a history that are not shown, because times of single runs are unreliable
+_HIDDEN = ("seconds",)
 CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED` in a record
 _MAX_ROWS = 15  #: largest number of rows in a table of iterations
 
@@ -99,9 +98,9 @@ def first_comment(path: Path) -> str:
 
 
 def listing(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return an aligned list with the name, description, keys and forms in each row.
+    """Return rows of name, description, keys and forms as aligned text.
 
-    A row without keys has the options of a solver instead.
+    In a row for a solver, its options replace the keys.
     """
     return align(
         [
@@ -181,7 +180,7 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         ("message", r.message),
         ("iterations", _text(r.iterations)),
         ("counts", _text(r.counts)),
-        ("it reports", _text(r.reported)),
+        ("solver data", _text(r.reported)),
         *(
             (f"ranks, {name}", f"{mean:.3g} s (largest {largest:.3g})")
             for name, (mean, largest) in r.rank_seconds.items()
@@ -193,7 +192,7 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
             (f"{name} residual", _text(_none_if_nan(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
-        ("off optimum", _text(_none_if_nan(r.optimum_error), digits=2)),
+        ("error to optimum", _text(_none_if_nan(r.optimum_error), digits=2)),
         ("solver error", _bound(r)),
         ("objective", _text(_none_if_nan(r.objective))),
         *(
@@ -229,7 +228,8 @@ def _quantity(r: Record, name: str, unit: str) -> str:
 def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
     """Return the rows of results for each contact pair.
 
-    pairs : results by name of the pair; there are no rows if it is not a mapping
+    pairs : results by name of the pair; no rows are returned if `pairs` is not a
+        mapping
     force : unit of forces
     """
     if not isinstance(pairs, Mapping):
@@ -256,7 +256,7 @@ def _bound(r: Record) -> str:
     beside = ", excluding rigid motions" if r.certificate.get("seminorm") else ""
     return (
         f"at most {r.energy_bound:.2g} in the energy norm (certified, relative{beside};"
-        " the mesh adds more)"
+        " the discretisation error is not included)"
     )
 
 

@@ -40,7 +40,8 @@ from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, load_registries, one_thread
 from mortarbench.text import align, printable
 
-COMPARED_WITH = "smalbe"  #: solver with whose answers all others are compared
+#: solver with which the answers of the other solvers are compared
+COMPARED_WITH = "smalbe"
 TIME_LIMIT = 60.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
 #: largest number of entries in a list on the terminal; the page lists all entries
@@ -87,7 +88,7 @@ def validate(
     budget : time in s for solves on finer meshes, which yield discretisation errors
     plugins : Python files with more solvers or families
     progress : called with messages about the progress
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------
@@ -111,7 +112,7 @@ def validate(
     data = as_data(result, path.resolve().name, ours=COMPARED_WITH)
     if not (data["counts"]["answers"] or result.false_claims or result.proven):
         reasons = [entry.text for entry in result.not_validated]
-        why = reasons[0] if reasons else "none of the answers is a claim"
+        why = reasons[0] if reasons else "no answer claims a solution"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
@@ -121,14 +122,14 @@ def validate(
     cases = []
     for r in records.values():
         if r.family in families:
-            # Cases that cannot be assembled, for example because they are from another
-            # version, are already listed as not validated by `validate_folder`.
+            # `validate_folder` has already listed cases that cannot be assembled, for
+            # example cases of another version, as not validated.
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
                     cases.append(case)
     meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
-    if meshes:  # the first version of the page was written before these slow solves
+    if meshes:  # the page was first written before these slow solves
         pages = registries.validation_page(path, data, meshes)
     return Validation(
         agreed=result.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
@@ -136,7 +137,7 @@ def validate(
 
 
 def _refines(case: CaseId) -> bool:
-    """Return True if a family has a finer mesh, or states why it has none."""
+    """Return True if a case has a finer mesh, or its family states why it has none."""
     try:
         return case.family.refined(case.params) is not None
     except InputError:  # its message is the reason; `discretisation_errors` reports it
@@ -148,7 +149,7 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
-        "Contradicting answers, with neither refuted": [
+        "Contradictory pairs of answers, neither refuted": [
             f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
             f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
             for d in data["unresolved"]
@@ -177,8 +178,8 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     parts += ["; ".join(counts) + "."] if counts else []
     if meshes:
         title = (
-            "Relative errors of the meshes in the energy norm, which add to the "
-            "certified errors; `report` compares the two"
+            "Relative discretisation errors in the energy norm, which add to the "
+            "certified errors of the solvers; `report` compares both errors"
         )
         parts.append(_list(title, [f"{d.case}: {d}" for d in meshes]))
     return "\n\n".join(parts)
@@ -208,8 +209,8 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     table = align([head, *lines], right=range(1, len(head)))
     return (
-        "Certified relative errors of the solvers in the energy norm; the mesh adds "
-        f"its own error.\n{table}"
+        "Certified relative errors of the solvers in the energy norm, without "
+        f"discretisation errors.\n{table}"
     )
 
 
@@ -323,7 +324,7 @@ def test_solver(
     solver : a name listed by `solvers`, or an object as for `mortarbench.solve`
     plugins : Python files with more solvers
     checks : names of the checks to run; None for all
-    registries : replaces our registries, installed plug-ins and `plugins`
+    registries : used instead of built-in registries, installed plug-ins and `plugins`
 
     Raises
     ------

@@ -59,7 +59,7 @@ def users():
         ("tempfile.NamedTemporaryFile", []),
     ],
 )
-def test_one_thing_is_done_in_one_place(name, homes):
+def test_definitions_are_not_duplicated(name, homes):
     assert users().get(name, []) == homes
 
 
@@ -117,7 +117,7 @@ def test_every_package_is_pinned_once():
     assert {name for name, count in names.items() if count > 1} == set()
 
 
-def test_names_are_words_of_the_field():
+def test_names_are_technical_terms():
     found = [
         f"{path}: {kind} {name}"
         for path, kind, name in names()

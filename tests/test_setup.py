@@ -82,7 +82,7 @@ def chunk(terminal):
 
 
 @pytest.mark.parametrize("answer", ["n", "", "what?"])
-def test_on_a_terminal_nothing_is_installed_without_a_yes(folder, answer):
+def test_on_a_terminal_nothing_is_installed_without_confirmation(folder, answer):
     code, said, calls = setup(folder, answer)
 
     assert code == 1

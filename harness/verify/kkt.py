@@ -30,14 +30,14 @@ from mortarbench.harness.verify import scales
 #: Rounding error of a sum, relative to the sum of its absolute terms. The error of a
 #: sum of k terms grows like √k·2⁻⁵³, and this value covers k = 256. With 0, a row that
 #: is satisfied exactly is reported as violated
-#: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
+#: (`test_rounding_in_products_with_an_operator_does_not_refute_an_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest error, as a fraction of its scale, that may be attributed to rounding.
 #: `MAX_CANCELLATION` allows a relative error of 5e-4 of the objective at tol 1e-8. This
 #: fraction is added twice, for the uncertainty of the optimum and for rounding. The
 #: total is below 1e-3, so that three digits of the objective are correct. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
-#: `test_what_is_left_when_terms_cancel_is_known_exactly` fails.
+#: `test_cancelling_terms_are_evaluated_exactly` fails.
 NEGLIGIBLE = 2e-4
 #: Smallest scale of energy, as a fraction of a natural energy (`_natural_energies`).
 #: If the energy of a point is smaller, for instance near x = 0, errors are divided by
@@ -545,7 +545,7 @@ def _sizes_from_rows(
 
     A row of G is active if its slack is negligible. Inactive rows are omitted, because
     the large right-hand side of a distant row would hide the violation of another row
-    (`test_a_row_that_is_far_away_excuses_no_violation`).
+    (`test_a_remote_row_hides_no_violation`).
     """
     size, has_size = np.abs(x), has_size.copy()
     rows = [

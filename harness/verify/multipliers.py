@@ -46,7 +46,7 @@ from mortarbench.harness.verify.optimum import EPS
 MAX_COMPLEMENTARITY_RATIO = 100.0
 #: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
 #: 8, a residual of 6e-7 remains for rows whose variables are all in balls
-#: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
+#: (`test_multipliers_over_balls_are_computed_also_with_common_rows`).
 NEWTON_STEPS = 16
 STEP = 2.0**-26  #: relative step of difference quotients of Π
 #: A column counts as linearly dependent if its norm after elimination is at most this

@@ -8,16 +8,16 @@
 enum {
     /* Largest ratio of the scale of energy to the objective: at tol 1e-8, 10·tol times the
        scale is then at most 1e-3 of the objective, which is three digits. Without it,
-       `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails. */
+       `test_a_cancelling_objective_is_accurate_relative_to_its_terms` fails. */
     MAX_CANCELLATION = 10000,
     /* Violations and errors of the objective are divided by this factor times their terms:
        since residuals of up to 10·tol are accepted, so are errors of 100·tol of the terms.
-       With 100, `test_a_narrow_box_lends_no_length_to_a_row` fails. */
+       With 100, `test_a_narrow_box_does_not_increase_the_scale_of_a_row` fails. */
     TERMS_FACTOR = 10,
     /* Largest size of a variable, in units of the length over which the energy changes
        by E.
-       `test_a_wrong_point_is_refuted_by_its_residuals` (case 15) fails with 1e5,
-       `test_a_row_between_variables_that_are_long_is_met_to_their_digits` with 10. */
+       `test_a_wrong_point_is_refuted_by_residuals` (case 15) fails with 1e5,
+       `test_a_row_of_large_variables_is_satisfied_to_their_accuracy` with 10. */
     MAX_LENGTHS = 1000
 };
 

@@ -1,1 +1,1 @@
-"""Command line: one module for each command, and `main` for all of them."""
+"""Command line: one module per command, and `main`, which parses the arguments."""

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 HEAD = """\
 # Solvers
 
-**Which solvers are available, and which one should I choose?** `make docs` writes this
-page from the adapters in `solvers/`, together with the notes on [our
-solvers](solvers-own.md) and on [libraries](solvers-libraries.md).
+**Which solvers are available, and which one should I choose?** `make docs` generates
+this page, the notes on [our solvers](solvers-own.md) and the notes on [solvers of
+libraries](solvers-libraries.md) from the docstrings in `solvers/`.
 
 Every solver is called with the same `tol`, the relative KKT accuracy of the
-non-dimensional QP. The notes explain how each adapter translates it to the stopping
-test of its solver. The claim of a solver is recorded, but verdicts do not rely on it
+non-dimensional QP. The notes explain how each adapter translates `tol` to the stopping
+test of its solver. Claims of solvers are recorded, but verdicts do not rely on claims
 ([comparison policy](fair-play.md)).
 
 | your QP | try first |
@@ -38,7 +38,7 @@ test of its solver. The claim of a solver is recorded, but verdicts do not rely 
 | bounds and equality rows, dense, at most a few hundred unknowns | `smalbe-direct` |
 | inequality rows, such as a primal form | `piqp`, `clarabel` |
 | inequality rows, small and dense | `daqp` |
-| bodies in subdomains (P is an operator) | `smalbe`; without contact `feti` |
+| decomposed bodies (P is an operator) | `smalbe`; without contact `feti` |
 | load steps and other sequences | a solver with *yes* in the column "sequences" |
 
 `mortarbench test-solver NAME` runs the conformance suite on one of these solvers, or on
@@ -46,22 +46,22 @@ your own solver with `--plugin FILE.py`. If the library of a solver is missing, 
 solver declines, and the message states the command that installs the library; `make
 setup` installs all libraries (the extra `fleet`).
 
-[weaknesses.md](weaknesses.md) shows how the answers change with the units, with the
-order of unknowns and rows, with scaled or repeated rows, and with shifted or mirrored
-unknowns.
+[weaknesses.md](weaknesses.md) shows how the answers of each solver change with the
+units, with the order of unknowns and rows, with scaled or repeated rows, and with
+shifted or mirrored unknowns.
 """
 OURS = """\
 # Our solvers
 
-`make docs` writes this page from `solvers/`; change the docstrings there, not this
-file. [Solvers](solvers.md) lists all solvers.
+`make docs` generates this page from the docstrings in `solvers/`; change the
+docstrings, not this file. [Solvers](solvers.md) lists all solvers.
 """
 LIBRARIES = """\
 # Solvers of libraries
 
-`make docs` writes this page from `solvers/adapters/`; change the docstrings there, not
-this file. [Solvers](solvers.md) lists all solvers and describes the interfaces
-`qpsolvers:NAME` and `cvxpy:NAME`.
+`make docs` generates this page from the docstrings in `solvers/adapters/`; change the
+docstrings, not this file. [Solvers](solvers.md) lists all solvers and describes the
+interfaces `qpsolvers:NAME` and `cvxpy:NAME`.
 """
 
 
@@ -70,7 +70,7 @@ def run(registries: Registries, options: Namespace) -> int:
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
-            raise InputError("--markdown is only for list solvers")
+            raise InputError("--markdown applies only to `list solvers`")
         print(solvers_page(registries.solvers), end="")
         return 0
     functions = {
@@ -91,9 +91,9 @@ def solvers_page(solvers: Mapping[str, Solver]) -> str:
 def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
     """Return the Markdown pages on the solvers of a registry, by name of the file.
 
-    The first page has the table of all solvers and the sections on solvers whose
-    backend can be chosen. The other two pages have the sections on our own solvers and
-    on the solvers of libraries.
+    The first page contains the table of all solvers and the sections on solvers with a
+    selectable backend. The other two pages contain the sections on built-in solvers and
+    on solvers of libraries.
     """
     pages: dict[str, list[str]] = {
         "solvers.md": [HEAD, *_overview(solvers)],
@@ -175,7 +175,7 @@ def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> lis
 def _own_meanings(kind: type) -> dict[str, str]:
     try:
         source = dedent(inspect.getsource(kind))
-    except (OSError, TypeError):  # not from a file
+    except (OSError, TypeError):  # the class is not defined in a file
         return {}
     lines = source.splitlines()
     (body,) = ast.parse(source).body

@@ -109,7 +109,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         }
         return starts[argv[0]](registries, argv[1:])
     for argument in takewhile(lambda text: text != "--", argv):
-        if re.fullmatch(r"--[\w-]+=--", argument):  # argparse drops this value
+        if re.fullmatch(r"--[\w-]+=--", argument):  # argparse would ignore this value
             option = argument.removesuffix("=--")
             raise InputError(f"{argument}: -- is not a value; expected {option}=VALUE")
     options, left = _parser().parse_known_args(argv)
@@ -184,7 +184,8 @@ class _Option(NamedTuple):
     """Argument of a command: an option, or positional if its name has no dashes."""
 
     names: str  #: names, separated by spaces
-    metavar: str  #: metavar; empty for a flag or an argument with `choices`
+    #: name of the value in help texts; empty for a flag or an argument with `choices`
+    metavar: str
     what: str  #: help text
     settings: Mapping[str, Any] = {}  #: further settings of argparse
 
@@ -240,7 +241,7 @@ _CASE = _Option(
     "FAMILY/key=value/…/FORM, for example beam-ring/Nr=4/Nh=3/dual; see docs/cases.md",
 )
 _RESULTS = _Option("folder", "DIR", "result folder of `run`")
-_INSTEAD = "limit of each measurement; overrides that of the suite"
+_INSTEAD = "limit for each measurement; overrides the limit in the suite"
 
 
 def _option(what: str) -> _Option:
@@ -297,23 +298,24 @@ _COMMANDS = {
                 _SEVERAL,
             ),
             _option(
-                "set an option of every solver that has it; of several values, as in "
-                "max_iter=50,100, each is measured"
+                "set an option of every solver that has it; with several values, as in "
+                "max_iter=50,100, every value is measured"
             ),
             _PLUGIN,
-            _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
+            _Option(
+                "--repeats", "N", "number of repeats; overrides the number in the suite"
+            ),
             _Option("--time-limit", "SECONDS", _INSTEAD),
             _Option("--memory-limit", "MIB", _INSTEAD),
-            _Option("--fresh", "", "delete the contents of the folder first"),
+            _Option("--fresh", "", "delete the contents of the result folder first"),
             _Option(
                 "--dask",
                 "ADDRESS|local",
-                "measure on the workers of a Dask "
-                "scheduler, or on several processes of this machine; see "
-                "docs/cluster.md",
+                "measure on the workers of the Dask scheduler at ADDRESS, or (local) "
+                "in several processes on this machine; see docs/cluster.md",
             ),
             _Option(
-                "--strict", "", "exit with 1 if a claim is refuted or a solver failed"
+                "--strict", "", "exit with 1 if a claim is refuted or a solver fails"
             ),
             _Option("--quiet", "", "print only warnings and missing measurements"),
             _JSON,
@@ -339,8 +341,8 @@ _COMMANDS = {
             _Option(
                 "--mpi --ranks",
                 "N",
-                "solve on N MPI processes, for cases of form "
-                "dual with feti; default: 1",
+                "solve on N MPI processes; only for cases of form dual with feti; "
+                "default: 1",
                 {"default": 1},
             ),
             _Option(
@@ -352,28 +354,26 @@ _COMMANDS = {
             _Option(
                 "--scale",
                 "S",
-                "factor of the displacements in the picture; "
-                "default: 1 if they are visible, else a round "
-                "factor that the picture states; above 1, bodies "
-                "in contact may appear to overlap",
+                "magnification of the displacements in the picture; default: 1 if the "
+                "displacements are then visible, else a rounded value, which the "
+                "picture states; magnified bodies in contact may appear to overlap",
             ),
             _Option(
                 "--vtu",
                 "FILE.vtu",
-                "write the deformed bodies for ParaView, and "
-                "a CSV file along each contact; FILE.pvd: all load steps up to "
-                "this one",
+                "write the deformed bodies for ParaView, and a CSV file for each "
+                "contact; FILE.pvd: write all load steps up to this one",
             ),
             _Option(
                 "--mesh-error",
                 "",
-                "also estimate the discretisation error, from "
-                "finer meshes (at most a minute)",
+                "also estimate the discretisation error by solves on finer meshes (at "
+                "most a minute)",
             ),
             _PLUGIN,
             _JSON,
         ],
-        "Exit code 1: the answer was not verified.",
+        "Exit code 1: the answer is not verified.",
     ),
     "export": _Command(
         "export",
@@ -383,8 +383,8 @@ _COMMANDS = {
             _Option(
                 "file",
                 "FILE.npz|mat|parquet|qps|hdf5",
-                "for NumPy, for MATLAB "
-                "and Octave, for qpbenchmark, or for programs that read QPS",
+                "file to write; the suffix selects the format: npz (NumPy), mat "
+                "(MATLAB, Octave), parquet (qpbenchmark), qps, or hdf5 (FCLIB)",
             ),
             _PLUGIN,
         ],
@@ -397,19 +397,18 @@ _COMMANDS = {
             _Option(
                 "--budget",
                 "SECONDS",
-                "time for finer meshes, which are used to "
-                "estimate discretisation errors; default: "
-                "300",
+                "time for solves on finer meshes, which yield discretisation errors; "
+                "default: 300",
                 {"default": 300.0},
             ),
             _PLUGIN,
             _JSON,
         ],
-        "Exit code 1: a claim was refuted, or answers contradict each other.",
+        "Exit code 1: a claim is refuted, or answers contradict each other.",
     ),
     "report": _Command(
         "report",
-        "write the report on a result folder, or on the changes between several",
+        "write the report on a result folder, or on changes between result folders",
         [
             _RESULTS,
             _Option(
@@ -434,8 +433,8 @@ _COMMANDS = {
             _Option(
                 "--pool-forms",
                 "",
-                "compare solvers over the cases of all forms "
-                "together (means, ranks and profiles), not within each form",
+                "compute means, ranks and profiles over the cases of all forms "
+                "together, not within each form",
             ),
             _Option(
                 "--fail-on",
@@ -447,7 +446,7 @@ _COMMANDS = {
             _Option(
                 "--verbose",
                 "",
-                "print the paths of all files written, not only that of the page",
+                "print the paths of all written files, not only the path of the page",
             ),
             _JSON,
         ],
@@ -460,9 +459,8 @@ _COMMANDS = {
             _Option(
                 "run_id",
                 "RUN_ID",
-                "run_id of a line of the journal, or its "
-                "first digits; a report shows it when you "
-                "point at a number",
+                "run_id of a line of the journal, or its first digits; an HTML report "
+                "shows the run_id when the mouse points at a number",
             ),
             _PLUGIN,
             _JSON,
@@ -478,7 +476,7 @@ _COMMANDS = {
             _Option(
                 "--out",
                 "DIR",
-                "a new folder, or one of an earlier merge, to which results are added",
+                "a new folder, or the result of an earlier merge, which is extended",
                 {"type": _folder, "required": True},
             ),
         ],
@@ -497,8 +495,8 @@ _COMMANDS = {
             _Option(
                 _MARKDOWN,
                 "",
-                "print only the effects of equivalent formulations, "
-                "as in docs/weaknesses.md",
+                "print only how answers change under equivalent formulations, as in "
+                "docs/weaknesses.md",
             ),
             _JSON,
         ],
@@ -513,7 +511,7 @@ _COMMANDS = {
                 "folder for the results; default: out/paper",
                 {"default": Path("out/paper")},
             ),
-            _Option("--quick", "", "fewer sizes and repeats, about a minute"),
+            _Option("--quick", "", "use fewer sizes and repeats; takes about a minute"),
         ],
     ),
     "doctor": _Command(

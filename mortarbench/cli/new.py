@@ -25,7 +25,8 @@ def run(registries: Registries, options: Namespace) -> int:
     kind, name = options.kind, options.name
     if not _NAME.fullmatch(name):
         raise InputError(
-            f"name {shown(name)}; expected letters, digits, '-' and '_', a letter first"
+            f"name {shown(name)}; expected letters, digits, '-' and '_', "
+            "starting with a letter"
         )
     taken: Mapping[str, object] = {
         "solver": registries.solvers,

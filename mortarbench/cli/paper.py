@@ -14,7 +14,7 @@ from mortarbench.registries import Registries
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Reference
 
-#: Suites that go beyond the paper, each with the arguments of `run` that reduce it for
+#: Suites beyond the paper, each with arguments of `run` that reduce the suite for
 #: --quick.
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
@@ -31,7 +31,7 @@ BEYOND: Mapping[str, Mapping[str, Any]] = {
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure and write the figures and tables of the paper."""
+    """Perform the measurements, and write the figures and tables of the paper."""
     try:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -47,7 +47,7 @@ def run(registries: Registries, options: Namespace) -> int:
 def measure_and_write(
     registries: Registries, out: Path, quick: bool, say: Callable[[str], None]
 ) -> list[Path]:
-    """Measure and write the figures and tables of the paper; return the files.
+    """Perform the measurements, write figures and tables, and return the files.
 
     quick : True for fewer sizes and repeats
     say : called with messages about the progress

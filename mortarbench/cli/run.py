@@ -70,11 +70,7 @@ def run(registries: Registries, options: Namespace) -> int:
 def _strict_failure(results: Results) -> str:
     """Return the reason why a strict run fails, in one line."""
     counts = (
-        (
-            results.refuted,
-            "answer that refutes its claim",
-            "answers that refute their claims",
-        ),
+        (results.refuted, "refuted claim", "refuted claims"),
         (
             results.failed,
             "measurement without an answer",

@@ -50,7 +50,7 @@ class Solver:
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP, and return a function that solves the QP. Both are timed."""
+        """Convert the QP; return a function that solves it. Both steps are timed."""
         P, A, G = (
             M if isinstance(M, np.ndarray) else M.toarray() for M in (qp.P, qp.A, qp.G)
         )
@@ -136,7 +136,7 @@ def solve_kkt(
 
 
 def max_step(v: Vector, dv: Vector) -> float:
-    """Return the longest step with v + step·dv ≥ 0, or 100 if that is longer."""
+    """Return the longest step, at most 100, with v + step·dv ≥ 0."""
     return float((-v[dv < 0] / dv[dv < 0]).min(initial=100.0))
 
 

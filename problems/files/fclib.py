@@ -1,4 +1,4 @@
-"""FCLIB files: problems of contact with Coulomb friction in HDF5.
+"""FCLIB files: contact problems with Coulomb friction, stored in HDF5.
 
 The unknowns of a local problem are the contact forces r, in blocks of one normal and
 one or two tangential components, and multipliers l of equality constraints; u are the
@@ -14,9 +14,9 @@ K, and r is orthogonal to û.
 A matrix is a group with the members nzmax, m, n, nz, p, i and x. The matrix is stored
 by columns if nz = −1, by rows if nz = −2, and as nz triplets otherwise. According to
 the documentation of FCLIB, p contains the row indices of triplets, but files written by
-Siconos follow CSparse, where p contains the column indices. Both conventions are read.
-If the indices fit the shape of the matrix under both conventions, the second one is
-used.
+Siconos follow CSparse, where p contains the column indices. Both conventions are
+supported. If the indices fit the shape of the matrix under both conventions, the
+convention of CSparse is used.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.
@@ -52,7 +52,7 @@ Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """A contact problem, with the solution that its file contains."""
+    """Contact problem, with the solution if the file contains one."""
 
     contact: FrictionalContact
     is_local: bool
@@ -132,7 +132,7 @@ def to_contact(arrays: Datasets) -> FclibFile:
     Raises
     ------
     InputError
-        If an array is missing or inconsistent with other arrays, or if the kind of
+        If an array is missing or inconsistent with other arrays, or if the type of
         problem is not supported.
 
     """
@@ -141,7 +141,7 @@ def to_contact(arrays: Datasets) -> FclibFile:
     ]
     if any("rolling" in name or name.endswith("/mu_r") for name in arrays):
         raise InputError(
-            "rolling friction is not built; expected fclib_local or fclib_global "
+            "rolling friction is not supported; expected fclib_local or fclib_global "
             "without mu_r"
         )
     if len(kinds) != 1:
@@ -153,7 +153,7 @@ def to_contact(arrays: Datasets) -> FclibFile:
     if dim not in (2, 3):
         raise InputError(f"spacedim is {dim}; expected 2 or 3")
     if (mu < 0).any():
-        raise InputError(f"vectors/mu holds {mu.min():g}; expected no negative numbers")
+        raise InputError(f"vectors/mu contains {mu.min():g}; expected only numbers ≥ 0")
     is_local = kinds[0] == "fclib_local"
     contact = (_local if is_local else _global)(part, dim * mu.size, mu)
     solution = _Group("solution", arrays)
@@ -197,7 +197,7 @@ def _factor(name: str, K: Any) -> Any:
     try:
         return splu(csc_array(K))
     except RuntimeError:
-        raise InputError(f"{name} is singular; expected a regular matrix") from None
+        raise InputError(f"{name} is singular; expected a nonsingular matrix") from None
 
 
 class _Group:
@@ -214,7 +214,7 @@ class _Group:
             raise InputError(f"{self.name}/{name} is missing; expected an FCLIB file")
         array = self._arrays[f"{self.name}/{name}"]
         if array.dtype.kind not in "iuf":
-            raise InputError(f"{self.name}/{name} holds no numbers")
+            raise InputError(f"{self.name}/{name} is not numeric")
         return array.ravel()
 
     def integer(self, name: str) -> int:
@@ -230,7 +230,7 @@ class _Group:
                 f"{self.name}/{name} has {vector.size} entries; expected {size}"
             )
         if not np.isfinite(vector).all():
-            raise InputError(f"{self.name}/{name} holds NaN or inf")
+            raise InputError(f"{self.name}/{name} contains NaN or inf")
         return vector
 
     def matrix(self, name: str, m: int, n: int) -> csc_array:
@@ -290,7 +290,7 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
     Raises
     ------
     InputError
-        If a variable is not in a cone, the cones differ in dimension, the QP has
+        If a variable belongs to no cone, the cones differ in dimension, the QP has
         inequality rows or sets other than cones, or P is an operator.
 
     """

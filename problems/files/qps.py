@@ -1,7 +1,7 @@
 """QPS: the MPS format of linear programs with a section for the quadratic term.
 
-Fields are separated by white space, which names therefore cannot contain. Files in
-fixed columns can be read if their names contain no spaces. Sections follow Maros and
+Fields are separated by white space. Therefore names cannot contain white space. Files
+in fixed columns can be read if their names contain no spaces. Sections follow Maros and
 Mészáros (1999), "A repository of convex quadratic programming problems", Optim. Methods
 Softw. 11/12:
 
@@ -11,15 +11,16 @@ Softw. 11/12:
   to [b, b + R] or, if R < 0, to [b + R, b].
 * BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in
   commercial readers.
-* QUADOBJ and QSECTION contain one triangle of P, and QMATRIX contains both. The
-  objective is ½xᵀPx + qᵀx; the diagonal entries are those of P, not half of them.
+* QUADOBJ and QSECTION contain one triangle of P, and QMATRIX contains both triangles.
+The
+  objective is ½xᵀPx + qᵀx; the diagonal entries are stored as in P, not halved.
 
-Undefined names and malformed numbers raise an error that states their line. (The reader
-of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
+Undefined names and malformed numbers raise an error that states the line number. (The
+reader of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
 
 Writing and reading a QP reproduces every number to the last digit. If P is symmetric
-only up to rounding, its symmetric part is written: the objective depends on this part
-alone, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
+only up to rounding, its symmetric part is written. The objective depends only on this
+part, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ _NUMBER = re.compile(
 
 @dataclass(eq=False)
 class _QPSModel:
-    """Content of the sections that have been read, by names of rows and columns."""
+    """Contents of the sections that have been read, by names of rows and columns."""
 
     rows: dict[str, str] = field(default_factory=dict)  #: type N, L, G or E by name
     columns: dict[str, int] = field(default_factory=dict)
@@ -66,8 +67,8 @@ class _QPSModel:
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
     """Parse a QPS text; return the problem and the sign of its objective.
 
-    If the objective is to be maximised, the sign is −1, and the problem returned is the
-    minimisation of the negative objective (with its constant).
+    If the objective is to be maximised, the sign is −1, and the returned problem is to
+    minimise the negative objective, including its constant.
 
     Raises
     ------
@@ -113,7 +114,7 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     """
     if len(qp.sets) > 1:
         raise InputError(
-            f"{path}: QPS has no sets of the kind {type(qp.sets[1]).__name__}; "
+            f"{path}: QPS cannot store {type(qp.sets[1]).__name__}; "
             "expected .npz or .mat"
         )
     for name in ("b", "h", "lb", "ub"):
@@ -121,7 +122,7 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         large = np.isfinite(values) & (np.abs(values) >= MIN_INFINITE)
         if large.any():
             raise InputError(
-                f"{path}: {name} holds {values[large.argmax()]:g}, but QPS treats "
+                f"{path}: {name} contains {values[large.argmax()]:g}, but QPS treats "
                 f"{MIN_INFINITE:g} or more as infinite; expected .npz or .mat"
             )
     try:
@@ -231,7 +232,7 @@ def _row(model: _QPSModel, words: list[str]) -> None:
 
 def _column(model: _QPSModel, words: list[str]) -> None:
     if len(words) > 1 and words[1].strip("'") == "MARKER":
-        raise InputError("integer variables; expected continuous ones")
+        raise InputError("integer variables; expected continuous variables")
     _expect(len(words) in (3, 5), "a column and one or two pairs of row and number")
     name = words[0]
     model.columns.setdefault(name, len(model.columns))

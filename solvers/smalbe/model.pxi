@@ -6,7 +6,7 @@ cdef enum:
     # 5 % from the ends of its interval, so that 60 steps reduce the interval to at most
     # 5 %. If Newton's method does not end, the step is computed with the model norm·I,
     # where norm is the largest eigenvalue. Without the line search,
-    # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
+    # `test_friction_takes_fewer_products_than_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
 

@@ -4,7 +4,7 @@
 
 # Rounding of a cost, relative to the sum of its absolute terms. The error of a sum of k
 # terms grows like √k·2⁻⁵³, so this value suffices for 8·10⁵ terms. With zero,
-# `test_a_solve_that_rounding_stops_ends` takes 4000 products instead of 1000.
+# `test_a_solve_stalled_by_rounding_ends` takes 4000 products instead of 1000.
 cdef double NOISE = 1e-13
 
 # Smallest accepted ratio of gᵀp to φᵀz, where the CG direction p is the component of
@@ -12,7 +12,7 @@ cdef double NOISE = 1e-13
 # arithmetic, both products are equal, because g is orthogonal to all earlier
 # directions. A smaller ratio shows that rounding has reintroduced components of g along
 # these directions. Without this limit,
-# `test_rounding_along_directions_that_were_taken_is_taken_out` fails.
+# `test_rounding_along_previous_directions_is_removed` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
 
 cdef enum:
@@ -23,11 +23,11 @@ cdef enum:
     MAX_DIRECTIONS = 200
     # Number of consecutive proportioning steps by the model that may fail to halve ‖β‖²
     # before a step along −β is taken. Without this limit,
-    # `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
+    # `test_a_poor_model_is_replaced` fails.
     MAX_IDLE = 2
     # Number of steps before the first check for stagnation, ten times the number of
     # steps for a preconditioned dual. Without the check,
-    # `test_a_solve_that_rounding_stops_ends` fails.
+    # `test_a_solve_stalled_by_rounding_ends` fails.
     FIRST_CHECK = 500
     # Number of CG steps on a face before a factor of a larger free set is replaced by a
     # factor of this face. A factor costs as much as two or three steps. With 2, and

@@ -4,7 +4,7 @@
 # Largest penalty. At this value, the rounding error 2⁻⁵³ρ‖ν‖ of ρQν reaches 1e-6·‖ν‖;
 # with larger values, it would dominate the gradient. Without a limit, models become
 # indefinite (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With
-# 1e3, `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
+# 1e3, `test_a_stalled_multiplier_increases_the_penalty` fails.
 cdef double MAX_RHO = 1e10
 # Limit of the total number of products, relative to the number of products at which the
 # gradient is small enough. The reduction of the energy error may therefore take a
@@ -13,7 +13,7 @@ cdef double MAX_RHO = 1e10
 cdef double ENERGY_BUDGET = 1.25
 # Smallest τ of a model, relative to the norm. Steps are therefore at most 1e4 times as
 # long as the steps of ordinary gradient projection. With zero, an F of low rank leads
-# to τ = 0, so that no step is possible (`test_what_once_failed`).
+# to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
 cdef double MIN_TAIL = 1e-4
 # Values of ‖g^P‖ in units of tol‖b‖. The KKT residual is first evaluated below
 # FIRST_JUDGED. Below MOST_JUDGED, the inner run ends even if the KKT residual exceeds

@@ -65,7 +65,7 @@ def orthonormal(G, e):
 
 
 # Pivots of normalised rows below this value, which is several hundred times 2⁻⁵³, count
-# as rounding errors. With zero, `test_a_repeated_row_must_ask_for_the_same` fails; with
+# as rounding errors. With zero, `test_repeated_rows_need_equal_right_hand_sides` fails; with
 # 1e-9, `test_nearly_parallel_rows_are_independent` fails.
 cdef double RANK = 1e-13
 
@@ -284,7 +284,7 @@ def lanczos(Product F, Rows C, start, int steps):
 # Largest ratio of the residual of the first Ritz pair to its value at which the pair
 # counts as converged. After twelve steps, the relative residual is at most 1e-12 on
 # duals of contact problems, and 1e-2 on a Laplacian. With 1 or 1e-14,
-# `test_compiled_and_written_steps_are_the_same` fails.
+# `test_compiled_steps_and_textbook_steps_are_the_same` fails.
 cdef double RITZ_RESIDUAL = 1e-3
 
 

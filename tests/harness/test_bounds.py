@@ -106,14 +106,14 @@ def test_a_journal_line_with_an_impossible_value_is_named(journal, changed, expe
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "1e400", "9" * 5000, "[" * 9000])
-def test_what_is_no_number_to_json_or_no_reader_can_hold_is_refused(journal, value):
+def test_numbers_outside_json_or_the_range_of_readers_are_refused(journal, value):
     line = record().to_json().replace('"gap": null', f'"gap": {value}')
 
     with pytest.raises(InputError, match="line 1: "):
         read_journal(journal(line))
 
 
-def test_numbers_that_no_reader_can_hold_are_not_written():
+def test_numbers_outside_the_range_of_readers_are_not_written():
     row = json.loads(record(counts={"n": 2**63}, gap=float("inf")).to_json())
 
     assert row["counts"] == {"n": None}
@@ -131,7 +131,7 @@ def test_extreme_values_that_are_possible_are_read_as_they_are(journal):
     assert r.counts == {"": None, "n": 2**63 - 1}
 
 
-def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
+def test_a_repeated_line_counts_once_and_is_reported(journal):
     folder, told = journal(record("a"), record("b"), record("a"), record("a")), []
 
     assert [r.run_id for r in read_journal(folder, told.append)] == ["a", "b"]
@@ -140,7 +140,7 @@ def test_a_line_that_is_there_twice_counts_once_and_is_told(journal):
     assert "here.jsonl, line 3" in line
 
 
-def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(journal):
+def test_two_contradictory_lines_on_one_measurement_are_refused(journal):
     folder = journal(record("b"), record("a"), record("a", verdict=Verdict.WRONG))
 
     with pytest.raises(InputError) as e:
@@ -151,7 +151,7 @@ def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(jou
     assert "here.jsonl, line 2; expected one line per run_id" in str(e.value)
 
 
-def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
+def test_a_report_mentions_repeated_lines_and_refuses_contradictory_ones(
     journal, refused, capsys
 ):
     folder = journal(record("a"), record("a"))
@@ -164,7 +164,7 @@ def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(
     assert "differs from the record at" in refused("replay", folder, "a")
 
 
-def test_equal_tables_of_a_journal_are_one_in_memory_but_1_is_not_true(journal):
+def test_equal_tables_of_a_journal_are_shared_but_1_and_true_differ(journal):
     a, b, c = read_journal(
         journal(
             record("a", options={"n": 1}),
@@ -190,7 +190,7 @@ def test_equal_tables_of_a_journal_are_one_in_memory_but_1_is_not_true(journal):
         ("a = 1e", "line 1, column"),
     ],
 )
-def test_toml_that_would_never_end_is_refused(text, expected):
+def test_deeply_nested_toml_is_refused(text, expected):
     with pytest.raises(InputError, match=expected):
         toml(text)
 
@@ -219,7 +219,7 @@ def test_text_files_are_regular_utf_8_and_not_too_large(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "text", ["[" * 9000, "[" * 99 + "]" * 99, '{"a": NaN}', "{", ""]
 )
-def test_json_that_is_none_is_refused_with_its_file(tmp_path, text):
+def test_invalid_json_is_refused_with_the_name_of_the_file(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
 
     with pytest.raises(InputError, match=r"a\.json: .*expected"):
@@ -249,7 +249,7 @@ def test_odd_values_of_a_suite_are_refused_briefly(tmp_path, change, expected):
     assert len(str(e.value)) < len(str(path)) + 400
 
 
-def test_a_grid_beyond_the_limit_says_how_to_raise_it_before_it_is_spanned(tmp_path):
+def test_a_grid_beyond_the_limit_is_refused_with_the_way_to_raise_the_limit(tmp_path):
     path, many = tmp_path / "s.toml", list(range(1, 951))
     grid = f"params = {{ Nr = {many}, Nh = {many}, step = 1 }}\nforms = ['dual']\n"
     path.write_text(SUITE + grid)
@@ -292,7 +292,7 @@ def test_minus_zero_is_zero():
     assert "-" not in str(parse("hertz-plane/n=+7/dual", PROBLEMS))[11:]
 
 
-def test_how_much_memory_a_case_may_take_can_be_raised(monkeypatch):
+def test_the_memory_limit_for_cases_can_be_raised(monkeypatch):
     monkeypatch.setenv(CASE_VARIABLE, "0.5")
     with pytest.raises(
         InputError, match="or MORTARBENCH_CASE_MIB set to the memory available"
@@ -305,7 +305,7 @@ def test_how_much_memory_a_case_may_take_can_be_raised(monkeypatch):
         parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
 
 
-def test_a_message_repeats_little_of_a_long_input_but_paths_that_exist(tmp_path):
+def test_a_message_shortens_long_input_except_existing_paths(tmp_path):
     deep = tmp_path / ("d" * 200) / ("e" * 200)
     deep.mkdir(parents=True)
 

@@ -15,7 +15,7 @@ def test_a_digest_is_the_beginning_of_sha_256():
     assert hex_digest([b"a", b"", b"bc"], 16) == "ba7816bf8f01cfea"
 
 
-def test_a_file_has_the_digest_of_its_bytes_in_whatever_pieces_they_come():
+def test_the_digest_of_a_file_does_not_depend_on_chunk_sizes():
     content = bytes(range(256)) * 10_000  # 2.56 MB: several pieces
 
     assert hex_digest(pieces(BytesIO(content)), 64) == hex_digest([content], 64)

@@ -35,7 +35,7 @@ class Doubled(Family):
         return {"n": 2 * params["n"]}
 
 
-def test_what_a_family_does_not_say_has_a_default():
+def test_missing_attributes_of_a_family_have_defaults():
     family = as_family(Bare())
 
     assert family.complete({"n": 3}) == {"n": 3}
@@ -45,7 +45,7 @@ def test_what_a_family_does_not_say_has_a_default():
     assert family.check({"n": -1}) is None
 
 
-def test_what_it_says_is_kept_under_its_name_and_with_its_words():
+def test_attributes_of_a_family_and_its_docstring_are_kept():
     family = as_family(Well())
 
     assert isinstance(family, Family)
@@ -56,14 +56,14 @@ def test_what_it_says_is_kept_under_its_name_and_with_its_words():
         assemble(family, {"n": 0}, family.forms[0])
 
 
-def test_one_that_inherits_is_not_wrapped():
+def test_a_family_that_inherits_is_not_wrapped():
     family = Doubled()
 
     assert as_family(family) is family
     assert as_family(as_family(Bare())).name == "bare"
 
 
-def test_a_case_prints_itself_and_knows_its_family():
+def test_the_repr_of_a_case_contains_its_family():
     family = Doubled()
     case = parse("doubled/n=3/only", {"doubled": family})
     finer = assemble(family, family.refined(case.params), case.form)
@@ -74,7 +74,7 @@ def test_a_case_prints_itself_and_knows_its_family():
     assert str(finer) == "doubled/n=6/only"
 
 
-def test_what_is_built_must_be_a_case():
+def test_a_family_must_build_a_case():
     case = parse("bare/only", {"bare": as_family(Bare())})
 
     with pytest.raises(TypeError, match="build returned str, expected Case"):

@@ -19,7 +19,7 @@ PRESETS = [
 
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("shape", ["box", "some bounds"])
-def test_a_history_tells_what_happened(manufactured, name, shape):
+def test_a_history_records_every_iteration(manufactured, name, shape):
     qp, _ = manufactured(shape, seed=271828)
     solver = replace(SOLVERS[name], history=True)
     s = solver.prepare(qp, 1e-8)()

@@ -58,7 +58,7 @@ def test_a_derived_default_follows_the_key_that_it_derives_from():
     assert (params["layers"], params["step"]) == (14, 3)
 
 
-def test_the_order_is_the_family_s_whatever_completes_the_keys():
+def test_keys_are_always_in_the_order_of_the_family():
     odd = SimpleNamespace(
         name="odd",
         defaults={"a": 1, "b": 2},
@@ -87,7 +87,7 @@ def test_the_order_is_the_family_s_whatever_completes_the_keys():
         ("plain/kind=hard/n=+9/primal", "plain/n=9/kind=hard/primal"),
     ],
 )
-def test_a_canonical_name_lists_what_is_not_implied_in_the_family_s_order(
+def test_a_canonical_name_lists_non_default_keys_in_the_order_of_the_family(
     text, expected
 ):
     name = parse(text, FAMILIES)
@@ -151,7 +151,7 @@ def test_a_canonical_name_parses_to_the_case_that_it_names(form, **params):
         ("", "unknown family ''"),
     ],
 )
-def test_what_is_wrong_with_a_name_is_said_in_one_line(text, message):
+def test_an_invalid_name_is_reported_in_one_line(text, message):
     with pytest.raises(InputError) as e:
         parse(text, FAMILIES)
 
@@ -167,7 +167,7 @@ def test_a_typed_value_of_another_type_is_refused(key, value):
         assemble(RING, {key: value}, "dual")
 
 
-def test_an_integer_will_do_where_the_default_is_a_float():
+def test_an_integer_is_accepted_if_the_default_is_a_float():
     size = assemble(RING, {"size": 2}, "dual").params["size"]
 
     assert (size, type(size)) == (2.0, float)
@@ -202,7 +202,9 @@ def stored(name, suffix):
         ("two/bodies.toml/n=3/dual", "meshed:two/bodies.toml/n=3/dual"),
     ],
 )
-def test_a_bare_path_is_told_how_its_case_is_called(tmp_path, monkeypatch, text, named):
+def test_the_error_for_a_path_names_the_case_of_the_file(
+    tmp_path, monkeypatch, text, named
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").write_text("")
     families = {"file": stored("file", ""), "meshed": stored("meshed", ".toml")}
@@ -214,7 +216,7 @@ def test_a_bare_path_is_told_how_its_case_is_called(tmp_path, monkeypatch, text,
 
 
 @pytest.mark.parametrize("text", ["missing", "ring/n=0.5e3/dual", "a.5/dual"])
-def test_what_looks_like_no_path_is_an_unknown_family(text):
+def test_a_name_that_is_not_a_path_is_an_unknown_family(text):
     with pytest.raises(InputError, match="; known: file"):
         parse(text, {"file": stored("file", "")})
 

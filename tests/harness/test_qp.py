@@ -15,7 +15,7 @@ UPPER = np.array([[2.0, 1.0], [0.0, 2.0]])
 
 
 @pytest.mark.parametrize("kind", [np.asarray, csc_matrix, csr_array, coo_array, list])
-def test_matrices_of_every_kind_make_the_same_qp(kind):
+def test_matrices_of_every_type_define_the_same_qp(kind):
     P, G = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 1.0], [0.0, 2.0]])
     as_kind = (lambda M: M.tolist()) if kind is list else kind
     qp = QP.from_arrays(as_kind(P), [1, 2], as_kind(G), [3, 4], as_kind(G[:1]), [5])
@@ -28,7 +28,7 @@ def test_matrices_of_every_kind_make_the_same_qp(kind):
     assert (qp.h.tolist(), qp.b.tolist()) == ([3, 4], [5])
 
 
-def test_absent_parts_are_no_rows_and_infinite_bounds():
+def test_absent_arguments_yield_no_rows_and_infinite_bounds():
     qp = QP.from_arrays(I2, ZERO)
 
     assert (qp.A.shape, qp.G.shape, qp.b.size, qp.h.size) == ((0, 2), (0, 2), 0, 0)
@@ -50,7 +50,7 @@ def test_columns_and_rows_are_vectors():
 
 
 @pytest.mark.parametrize("kind", [np.array, csc_matrix])
-def test_the_arrays_that_were_given_stay_writable_and_apart(kind):
+def test_the_passed_arrays_stay_writable_and_are_copied(kind):
     P, q = kind(I2), np.ones(2)
     qp = QP.from_arrays(P, q)
     P[0, 0], q[0] = 7, 7
@@ -59,7 +59,7 @@ def test_the_arrays_that_were_given_stay_writable_and_apart(kind):
     assert qp.q.tolist() == [1, 1]
 
 
-def test_entries_of_one_place_are_added_up():
+def test_duplicate_entries_are_summed():
     twice = coo_array(([1.0, 1.0, 1.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
 
     assert QP.from_arrays(twice, ZERO).P.toarray().tolist() == [[2, 0], [0, 1]]
@@ -114,7 +114,7 @@ WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)
         ({"sets": (1,)}, "expected a tuple of convex sets in addition to lb"),
     ],
 )
-def test_what_is_no_qp_is_refused_in_one_line(changes, message):
+def test_invalid_qp_data_are_refused_in_one_line(changes, message):
     with pytest.raises(InputError, match=message) as e:
         QP.from_arrays(**{"P": I2, "q": ZERO, **changes})
     assert "\n" not in str(e.value)
@@ -135,7 +135,7 @@ def test_a_semidefinite_matrix_is_convex_up_to_rounding():
         "plugin", "qp", "record", "registry", "sets.box", "solution", "verify.kkt",
     ],
 )  # fmt: skip
-def test_the_examples_of_docstrings_give_what_they_show(module):
+def test_the_examples_of_docstrings_print_the_output_shown(module):
     result = doctest.testmod(
         import_module(f"mortarbench.harness.{module}"),
         optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE,

@@ -67,7 +67,7 @@ def spec(name, **options):
     return SolverSpec(name=name, label=name, options=options)
 
 
-def test_an_exact_name_gives_that_entry_with_its_options_replaced():
+def test_an_exact_name_returns_the_entry_with_replaced_options():
     assert resolve(spec("method-slow"), SOLVERS) is SOLVERS["method-slow"]
     assert resolve(spec("method-slow", alpha=2), SOLVERS) == Method(9, 2.0)
     assert SOLVERS["method-slow"] == Method(9)
@@ -80,7 +80,7 @@ def test_a_wildcard_entry_takes_the_text_after_the_colon_as_backend():
     assert resolve(spec("open:anything"), SOLVERS) == Open(backend="anything")
 
 
-def test_an_exact_entry_goes_before_the_wildcard():
+def test_an_exact_entry_takes_precedence_over_the_wildcard():
     assert resolve(spec("open:tuned"), SOLVERS).alpha == 9.0
 
 
@@ -131,7 +131,7 @@ def test_a_field_that_is_none_accepts_anything():
         (spec("method", max_iter=0), "method: max_iter must be positive, got less"),
     ],
 )
-def test_what_is_wrong_with_a_solver_is_said_in_one_line(asked, message):
+def test_an_invalid_solver_is_reported_in_one_line(asked, message):
     with pytest.raises(InputError) as e:
         resolve(asked, SOLVERS)
 
@@ -139,7 +139,7 @@ def test_what_is_wrong_with_a_solver_is_said_in_one_line(asked, message):
     assert "\n" not in str(e.value)
 
 
-def test_where_a_solver_is_unknown_plugins_are_mentioned():
+def test_the_error_for_an_unknown_solver_mentions_plugins():
     with pytest.raises(InputError, match=r"known: .*; others come with --plugin FILE"):
         resolve(spec("mine"), SOLVERS)
 
@@ -226,7 +226,7 @@ FAMILY = (
         (FAMILY.format("{}", "(1,)"), "PROBLEMS['a']: forms = (1,); expected a tuple"),
     ],
 )
-def test_what_is_wrong_with_a_plugin_is_said_in_one_line(tmp_path, text, message):
+def test_an_invalid_plugin_is_reported_in_one_line(tmp_path, text, message):
     file = tmp_path / "plug.py"
     file.write_text(text)
 
@@ -237,7 +237,7 @@ def test_what_is_wrong_with_a_plugin_is_said_in_one_line(tmp_path, text, message
     assert "\n" not in str(e.value)
 
 
-def test_a_plugin_that_fails_to_import_leaves_no_half_module(tmp_path):
+def test_a_plugin_that_fails_to_import_leaves_no_module(tmp_path):
     file = tmp_path / "half.py"
     file.write_text("raise RuntimeError")
 
@@ -346,7 +346,7 @@ def version(folder, number):
     return folder / "mine.py"
 
 
-def test_two_versions_of_a_plugin_keep_their_neighbours_apart(tmp_path):
+def test_two_versions_of_a_plugin_import_separate_neighbour_modules(tmp_path):
     """Import statements may run at the start or in a call."""
     files = {n: version(tmp_path / f"v{n}", n) for n in (1, 2)}
     solvers = {}
@@ -360,7 +360,7 @@ def test_two_versions_of_a_plugin_keep_their_neighbours_apart(tmp_path):
     assert not {"helper", "constants", "late", "tools.speed"} & set(sys.modules)
 
 
-def test_a_neighbour_that_changed_is_imported_anew(tmp_path):
+def test_a_changed_neighbour_module_is_imported_again(tmp_path):
     file = version(tmp_path / "v", 1)
     load_plugin(file).solvers["mine"].declines(None)
     (tmp_path / "v" / "constants.py").write_text("VERSION = 345")
@@ -368,7 +368,7 @@ def test_a_neighbour_that_changed_is_imported_anew(tmp_path):
     assert load_plugin(file).solvers["mine"].declines(None).startswith("late 345 345")
 
 
-def test_what_lies_beside_a_plugin_takes_the_place_of_neither_us_nor_python(tmp_path):
+def test_modules_beside_a_plugin_replace_no_mortarbench_or_python_module(tmp_path):
     for name in ("harness", "json", "mortarbench"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('mine')")
     file = tmp_path / "plug.py"
@@ -395,7 +395,7 @@ SOLVERS = {"mine": Mine()}
 """
 
 
-def test_the_names_that_packages_of_ours_had_go_on_working_in_plugins(tmp_path):
+def test_former_package_names_remain_valid_in_plugins(tmp_path):
     """Test also imports in calls; a neighbour with the same name has precedence."""
     (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
     (tmp_path / "plug.py").write_text(OF_OLD)
@@ -422,7 +422,7 @@ def test_a_traceback_of_a_plugin_names_its_lines(tmp_path):
     assert places[-1] == ("late.py", 3)
 
 
-def test_entry_points_import_harness_by_the_name_that_it_had(install):
+def test_entry_points_can_import_harness_by_its_former_name(install):
     folder = install(
         "its-1.0.dist-info", "[mortarbench.solvers]\nmine = its_own:MINE\n"
     )
@@ -437,7 +437,7 @@ def test_entry_points_import_harness_by_the_name_that_it_had(install):
 @pytest.mark.parametrize(
     "changed", ["mine.py", "helper.py", "constants.py", "late.py", "tools/speed.py"]
 )
-def test_the_code_of_a_plugin_is_that_of_its_neighbours_too(tmp_path, changed):
+def test_the_code_digest_of_a_plugin_includes_neighbour_modules(tmp_path, changed):
     file = version(tmp_path / "v", 1)
     (tmp_path / "v" / "unused.py").write_text("a = 1")
     before = b"".join(PluginFile(file).content())
@@ -460,7 +460,7 @@ def test_the_code_of_a_plugin_is_that_of_its_neighbours_too(tmp_path, changed):
         ("=b.py", "=b.py", "", "=b.py"),
     ],
 )
-def test_a_label_stands_before_a_plugin(text, path, label, name):
+def test_a_label_precedes_the_path_of_a_plugin(text, path, label, name):
     file = PluginFile.of(text)
 
     assert (str(file.path), file.label, file.name) == (path, label, name)
@@ -482,7 +482,7 @@ def test_a_labelled_adapter_of_many_backends_is_one(tmp_path):
 
 @dataclass(frozen=True)
 class Wide:
-    rho: float = 1  # an int, as people write it
+    rho: float = 1  # an int, as users may write
     steps: int = 1e4
     norm: Literal["max", 2] = "max"
     weight: float | None = 1
@@ -536,7 +536,7 @@ def test_a_value_of_an_annotated_type_is_taken(options, value):
     assert getattr(resolve(spec("wide", **options), {"wide": Wide()}), name) == value
 
 
-def test_defaults_decide_where_annotations_cannot_be_read():
+def test_defaults_determine_types_if_annotations_cannot_be_read():
     lost = {"lost": Lost()}
 
     assert resolve(spec("lost", rho=0.5), lost).rho == 0.5

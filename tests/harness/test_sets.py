@@ -59,7 +59,7 @@ def test_the_projection_is_the_nearest_point(one):
 
 
 @names
-def test_what_projection_removes_is_normal(one):
+def test_the_removed_part_of_a_projection_is_normal(one):
     """By Moreau, z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
     for v in points(100):
         x = one.project(v)
@@ -87,7 +87,7 @@ def test_the_support_function_bounds_the_work_on_every_member(one):
 
 
 @names
-def test_what_is_not_admissible_has_no_bounded_work(one):
+def test_inadmissible_vectors_have_unbounded_work(one):
     """σ(e) = ∞ for each unit vector e of a component that is not admissible."""
     e = np.eye(N)
     for z in (*e, *-e):
@@ -229,7 +229,7 @@ def test_blocks_are_substituted_with_their_variables():
         ),
     ],
 )
-def test_blocks_that_are_no_sets_are_refused_in_one_line(make, message):
+def test_invalid_blocks_of_sets_are_refused_in_one_line(make, message):
     with pytest.raises(InputError, match=message) as e:
         make()
     assert "\n" not in str(e.value)
@@ -349,7 +349,7 @@ def with_solution(seed, radius=None):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_planted_solution_has_no_residual_and_others_have(seed):
+def test_only_the_planted_solution_has_zero_residuals(seed):
     qp, s = with_solution(seed)
     index, radius = qp.sets[1].index, qp.sets[1].radius
 
@@ -459,7 +459,7 @@ class Conic(Careless):
     accepts = (Box, Balls)
 
 
-def test_a_solver_that_declares_nothing_accepts_bounds_alone():
+def test_a_solver_without_a_declaration_accepts_only_bounds():
     qp = qp_with(FREE, BALLS)
     assert (
         reason_to_decline(Careless(), qp) == "does not accept sets of the class Balls"
@@ -469,13 +469,13 @@ def test_a_solver_that_declares_nothing_accepts_bounds_alone():
 
 
 @pytest.mark.parametrize("accepts", [Box, ["Box"], (Box, "Balls")])
-def test_a_declaration_that_is_no_tuple_of_classes_is_named(accepts):
+def test_a_declaration_other_than_a_tuple_of_classes_is_named(accepts):
     solver = type("Odd", (Careless,), {"accepts": accepts})()
     with pytest.raises(ReasonError, match="expected a tuple of classes, such as"):
         reason_to_decline(solver, qp_with(BOX))
 
 
-def test_files_refuse_sets_that_they_cannot_hold(tmp_path):
+def test_files_refuse_sets_that_they_cannot_store(tmp_path):
     with pytest.raises(InputError, match="cannot be stored in files; expected bounds"):
         save_qp(tmp_path / "a.npz", qp_with(FREE, BALLS))
     assert not list(tmp_path.iterdir())

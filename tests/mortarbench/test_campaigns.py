@@ -1,6 +1,4 @@
-"""Growth and merging of campaigns and their use as a CI gate, by real runs of toy
-problems.
-"""
+"""Growth and merging of campaigns, and CI gates, tested by runs of toy problems."""
 
 import json
 import os
@@ -56,9 +54,7 @@ def environment(_found):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite, whose arguments are those of `suite`, into a folder with
-    its name.
-    """
+    """Run a suite that `suite` creates; the result folder has the name of the suite."""
 
     def measure(out="out", **asked):
         file = tmp_path / f"{out}.toml"
@@ -108,14 +104,14 @@ def campaign(tmp_path_factory):
     return where
 
 
-def test_of_a_suite_that_grew_only_the_missing_is_measured(campaign):
+def test_an_extended_suite_measures_only_missing_results(campaign):
     before, after = (
         next((campaign / name / "journal").glob("*.jsonl")).read_bytes()
         for name in ("before", "grown")
     )
     records = read_journal(campaign / "grown")
 
-    assert after.startswith(before)  # not a byte of it was touched
+    assert after.startswith(before)  # existing lines are unchanged
     assert len(records) == len({r.run_id for r in records}) == 3 * 3 * 2 * 2
     first, second = dict.fromkeys(r.session for r in records)
     old = {(r.solver, r.case) for r in records if r.session == first}
@@ -125,10 +121,10 @@ def test_of_a_suite_that_grew_only_the_missing_is_measured(campaign):
     again = mb.run(
         campaign / "grown.toml", out=campaign / "grown", plugins=[TOY_PROBLEM]
     )
-    assert len(again) == 36  # nothing is left
+    assert len(again) == 36  # no measurement is missing
 
 
-def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(campaign):
+def test_solvers_of_different_sessions_are_compared_and_marked_as_unpaired(campaign):
     evidence = read_evidence(campaign / "grown")
     said = markdown(compose(evidence))
 
@@ -151,7 +147,7 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(camp
         ),
     ],
 )
-def test_what_would_mix_two_suites_is_refused(
+def test_a_change_that_would_mix_two_suites_is_refused(
     campaign, measure, tmp_path, change, said
 ):
     shutil.copytree(campaign / "before", tmp_path / "out")
@@ -166,7 +162,7 @@ def test_what_would_mix_two_suites_is_refused(
 # merging
 
 
-def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
+def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     measure("a", depths="1")
     measure("b", depths="2", solvers='"exact", "liar"')
     again = []
@@ -193,7 +189,7 @@ def test_parts_of_a_campaign_become_one_folder(measure, tmp_path):
     assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
 
 
-def test_the_same_of_two_machines_is_kept_apart_and_marked(
+def test_equal_measurements_of_two_machines_are_kept_and_marked(
     measure, tmp_path, environment
 ):
     measure("a")
@@ -227,7 +223,7 @@ def test_the_same_of_two_machines_is_kept_apart_and_marked(
     assert read_journal(tmp_path / "ab") == records
 
 
-def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_path):
+def test_duplicates_in_one_environment_count_once(measure, tmp_path):
     first = measure("a", depths="1")
     measure("b", depths="1, 2")
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
@@ -263,7 +259,7 @@ def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_pat
         (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),
     ],
 )
-def test_folders_that_cannot_be_one_are_refused_before_anything_is_written(
+def test_incompatible_folders_are_refused_before_anything_is_written(
     stored, tmp_path, damage, said
 ):
     a, b = stored
@@ -274,7 +270,7 @@ def test_folders_that_cannot_be_one_are_refused_before_anything_is_written(
     assert not (tmp_path / "all").exists()
 
 
-def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path):
+def test_a_run_or_a_source_folder_cannot_be_the_merge_target(stored, tmp_path):
     a, b = stored
     with pytest.raises(mb.InputError, match="is one of the folders to merge"):
         mb.merge(a, b, out=b)
@@ -289,7 +285,7 @@ def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path)
     assert (tmp_path / "mine/suite.toml").read_text() == "mine"
 
 
-def test_a_merge_that_is_killed_anywhere_loses_and_doubles_nothing(stored, tmp_path):
+def test_a_killed_merge_loses_and_duplicates_nothing(stored, tmp_path):
     """The merge is killed before and after each file that it writes."""
     a, b = stored
     whole = read_all(mb.merge(a, b, out=tmp_path / "whole"))
@@ -330,12 +326,12 @@ def read_all(results):
     return [r.to_json() for r in results.records]
 
 
-# what a CI asks
+# commands of CI jobs
 
 
 @pytest.fixture
 def cli(tmp_path, capsys, monkeypatch):
-    """Run a command line in the folder of the test; returns code, stdout and stderr."""
+    """Run a command line in the folder of the test; return code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
 
     def cli(*argv):
@@ -346,7 +342,7 @@ def cli(tmp_path, capsys, monkeypatch):
     return cli
 
 
-def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
+def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     cli, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(
@@ -360,11 +356,13 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
     code, out, _ = cli(*asked, "--strict")
     assert code == 1
     assert out.splitlines()[-1] == (
-        "strict: 1 answer that refutes its claim (liar on well/depth=2/dual) and 1 "
-        "measurement without an answer (lost on well/depth=2/dual)"
+        "strict: 1 refuted claim (liar on well/depth=2/dual) and 1 measurement "
+        "without an answer (lost on well/depth=2/dual)"
     )
     good = (*asked, "--solver", "exact", "--solver", "picky")
-    assert cli(*good, "--strict")[0] == 0  # one declined; the others are not asked for
+    assert (
+        cli(*good, "--strict")[0] == 0
+    )  # one declined; other solvers are not selected
     code, out, _ = cli(*asked, "--strict", "--json")
     told = json.loads(out)
     assert code == 1
@@ -377,7 +375,7 @@ def test_a_strict_run_fails_where_a_claim_is_refuted_or_a_solver_failed(
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
+def test_a_report_fails_on_the_requested_conditions_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):
     """A solver that sleeps takes ten times as long in folder b; another solver makes a
@@ -411,11 +409,13 @@ def test_a_report_fails_on_what_it_is_asked_to_and_says_so(
     assert "| new |" in page
     points = [line for line in page.splitlines() if line.startswith("- ")]
     assert [point[:4] for point in points] == ["- b:", "- c:"]
-    assert all(point.endswith(".") for point in points)  # whole sentences
-    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # nobody asked
+    assert all(point.endswith(".") for point in points)  # each entry is a sentence
+    assert cli("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
 
 
-def test_what_cannot_be_judged_fails_by_its_own_line(cli, stored, measure):
+def test_conditions_that_cannot_be_judged_fail_with_a_separate_line(
+    cli, stored, measure
+):
     assert cli("report", "a", "--fail-on", "worse")[0] == 2
     code, _, err = cli("report", "a", "b", "--fail-on", "worse")
     assert code == 2
@@ -487,7 +487,7 @@ def test_a_value_of_two_dashes_is_refused_in_one_line(cli, stored, tmp_path, com
     assert sorted(tmp_path.iterdir()) == there
 
 
-def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
+def test_an_interrupted_growing_series_continues_without_duplicates(
     campaign, measure, tmp_path, monkeypatch
 ):
     """The run is interrupted before it writes its fourth line."""
@@ -506,7 +506,7 @@ def test_growth_that_ends_anyhow_goes_on_with_each_measurement_once(
 
 
 @pytest.mark.slow
-def test_growth_that_is_killed_goes_on_with_each_measurement_once(measure, tmp_path):
+def test_a_killed_growing_series_continues_without_duplicates(measure, tmp_path):
     """SIGKILL ends the run when it is about to write its fourth line."""
     measure(depths="2", repeats=1)
     grown = {"solvers": '"exact", "lax", "near"', "depths": "2, 3", "repeats": 2}

@@ -63,7 +63,7 @@ def registries(tmp_path):
 
 @pytest.fixture
 def cli(registries, capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
 
@@ -81,7 +81,7 @@ def test_problems_are_listed_with_defaults_and_forms(cli):
     assert code == 0
     assert (
         out == "well  A parabola over a half line.  n=3 depth=1  primal | dual\n"
-    )  # one sentence of two
+    )  # the first of two sentences
 
 
 def test_solvers_are_listed_one_line_each(cli):
@@ -89,8 +89,8 @@ def test_solvers_are_listed_one_line_each(cli):
 
     assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
     first = " ".join(out.splitlines()[0].split())
-    assert first == "exact Divides by a diagonal. factor=1.0 reason=None"
-    assert "Lost(" not in out  # no sentence, only what dataclass makes up
+    assert first == "exact Solver for a diagonal P. factor=1.0 reason=None"
+    assert "Lost(" not in out  # the docstring is only the signature by dataclass
 
 
 def test_suites_are_listed_with_their_purpose(cli):
@@ -104,10 +104,10 @@ def test_suites_are_listed_with_their_purpose(cli):
                       "defaults": {"n": 3, "depth": 1},
                       "description": "A parabola over a half line."}),
         ("solvers", {"name": "exact", "options": {"factor": 1.0, "reason": None},
-                     "description": "Divides by a diagonal."}),
+                     "description": "Solver for a diagonal P."}),
     ],
 )  # fmt: skip
-def test_lists_are_one_json_array_for_machines(cli, what, expected):
+def test_lists_can_be_printed_as_one_json_array(cli, what, expected):
     _, out, _ = cli("list", what, "--json")
 
     assert json.loads(out)[0] == expected
@@ -152,13 +152,13 @@ def test_a_refuted_claim_exits_with_1(cli):
     assert (code, record["claimed"], record["status"]) == (1, "solved", "wrong")
 
 
-def test_the_tolerance_asked_for_decides_the_verdict(cli):
+def test_the_requested_tolerance_determines_the_verdict(cli):
     command = ("solve", "well/primal", "--solver", "near", "--tol")
 
     assert [cli(*command, tol)[0] for tol in ("1e-6", "1e-2")] == [1, 0]
 
 
-def test_a_solver_is_told_the_tolerance(cli):
+def test_a_solver_receives_the_tolerance(cli):
     _, out, _ = cli(
         "solve", "well/n=1/primal", "--solver", "lax", "--tol", "0.1", "--json"
     )
@@ -172,7 +172,7 @@ def test_a_solver_that_declines_exits_with_1_and_its_reason_on_stderr(cli):
     )  # fmt: skip
 
 
-def test_a_picture_is_drawn_of_a_point_and_of_nothing_else(cli, tmp_path):
+def test_a_picture_is_drawn_only_if_there_is_a_point(cli, tmp_path):
     picture = tmp_path / "a.png"
     drawn = cli("solve", "well/primal", "--solver", "exact", "--plot", picture)
     lost = cli("solve", "well/primal", "--solver", "lost", "--plot", tmp_path / "b.png")
@@ -184,7 +184,7 @@ def test_a_picture_is_drawn_of_a_point_and_of_nothing_else(cli, tmp_path):
     assert not (tmp_path / "b.png").exists()
 
 
-def test_an_exported_qp_is_the_emitted_one_and_says_whose_it_is(cli, tmp_path):
+def test_an_exported_qp_is_the_emitted_qp_with_the_name_of_its_case(cli, tmp_path):
     file = tmp_path / "well.npz"
     code, out, _ = cli("export", "well/depth=4/n=2/dual", file)
 
@@ -220,7 +220,7 @@ def test_report_prints_the_main_path_only(cli, tmp_path, formats, printed):
     assert len(out.splitlines()) == 1
 
 
-def test_report_judges_at_the_factor_that_is_asked_for(cli, tmp_path):
+def test_report_applies_the_requested_factor(cli, tmp_path):
     (tmp_path / "folder").mkdir()
     assert cli("report", "folder", "--format", "md", "--factor", "2.5") == (
         0, "folder/index-2.5.md\n", "",
@@ -244,9 +244,7 @@ def compare(first, others, formats, factor):
     return [], said, [after / f"{form}.{form}" for form in formats]
 
 
-def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(
-    cli, monkeypatch, tmp_path
-):
+def test_two_folders_yield_a_summary_and_a_page_of_changes(cli, monkeypatch, tmp_path):
     monkeypatch.setattr("mortarbench.reports.write_comparisons", compare)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
@@ -280,7 +278,7 @@ def test_doctor_describes_the_machine(cli):
     assert "→" not in out or "warn" in out
 
 
-def test_doctor_tells_machines_the_same(cli):
+def test_doctor_prints_the_same_as_json(cli):
     code, out, _ = cli("doctor", "--json")
     told = json.loads(out)
 
@@ -297,7 +295,7 @@ def test_an_interrupt_exits_with_130_and_one_line(cli):
     assert (code, out, err) == (130, "", "mortarbench: interrupted\n")
 
 
-def test_an_interrupted_run_says_how_to_continue(cli, monkeypatch):
+def test_an_interrupted_run_prints_how_to_continue(cli, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
@@ -308,14 +306,14 @@ def test_an_interrupted_run_says_how_to_continue(cli, monkeypatch):
     assert err.endswith("\nmortarbench: interrupted; the same command continues\n")
 
 
-def test_a_solver_may_print_what_it_likes(cli):
+def test_output_of_a_solver_is_not_mixed_with_results(cli):
     code, out, _ = cli("solve", "well/primal", "--solver", "prints", "--json")
 
     assert (code, json.loads(out)["status"]) == (0, "verified")
     assert out.count("\n") == 1
 
 
-def test_a_solver_that_dies_is_a_record_like_any_other(cli):
+def test_a_crashed_solver_yields_a_record(cli):
     code, out, _ = cli("solve", "well/primal", "--solver", "dies", "--json")
 
     record = json.loads(out)
@@ -324,14 +322,14 @@ def test_a_solver_that_dies_is_a_record_like_any_other(cli):
     assert record["sizes"]["variables"] == 3
 
 
-def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
+def test_a_solver_that_ignores_interrupts_ends_with_the_command(tmp_path):
     started = tmp_path / "started"
     with subprocess.Popen(
         [sys.executable, "-m", "harness", "solve", "well/primal", "--solver", "hangs",
          "--plugin", TOY_PROBLEM],
         env=os.environ | {"STARTED": str(started)},
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        # what a shell starts in the background ignores interrupts otherwise
+        # otherwise, background processes of a shell ignore interrupts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     ) as command:  # fmt: skip
         while command.poll() is None and not (started.exists() and started.read_text()):
@@ -340,14 +338,14 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
         try:
             out, err = command.communicate(timeout=LONGEST)
         finally:
-            command.kill()  # leaving the block waits for it
+            command.kill()  # leaving the block waits for the process
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
     assert not is_alive(int(started.read_text()))
 
 
-def test_what_a_plugin_prints_is_no_result(cli, pit):
+def test_output_of_a_plugin_is_not_mixed_with_results(cli, pit):
     code, out, err = cli(
         "solve", "pit/primal", "--solver", "times", "--plugin", "plug.py", "--json"
     )
@@ -358,7 +356,7 @@ def test_what_a_plugin_prints_is_no_result(cli, pit):
     assert "a family says hello" in err
 
 
-def test_numbers_that_there_are_not_and_units_of_no_body_are_not_shown(cli):
+def test_missing_numbers_and_inapplicable_units_are_not_shown(cli):
     lost = cli("solve", "well/primal", "--solver", "lost")[1]
     dual = cli("solve", "well/dual", "--solver", "exact")[1]
 
@@ -368,7 +366,7 @@ def test_numbers_that_there_are_not_and_units_of_no_body_are_not_shown(cli):
     assert "J/m" not in dual
 
 
-def test_output_cut_off_by_its_reader_is_no_fault():
+def test_a_closed_output_pipe_is_no_fault():
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(
@@ -380,7 +378,7 @@ def test_output_cut_off_by_its_reader_is_no_fault():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_terminal_of_few_characters_is_enough(tmp_path):
+def test_an_ascii_terminal_is_sufficient(tmp_path):
     (tmp_path / "plug.py").write_text(
         PLUGIN.replace("class Pit:\n", 'class Pit:\n    """λ ≥ 0."""\n'), "utf-8"
     )
@@ -404,7 +402,7 @@ def test_a_file_that_cannot_be_written_is_named(registries, capsys, tmp_path):
     )
 
 
-def test_a_fault_of_ours_exits_with_3_and_a_traceback(cli):
+def test_an_internal_error_exits_with_3_and_a_traceback(cli):
     code, out, err = cli("solve", "well/depth=99/primal", "--solver", "exact")
 
     assert (code, out) == (3, "")
@@ -613,7 +611,7 @@ PROBLEMS = {{"deeper": Deeper(), "nothing": Nothing()}}
 """
 
 
-def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli, monkeypatch):
+def test_paper_prints_its_progress_and_the_path_of_the_page(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.cli.paper.measure_and_write", paper)
 
     assert cli("paper") == (
@@ -624,7 +622,7 @@ def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli, monkeypat
     assert cli("paper", "--quick", "--out", "a")[1] == "a/index-True.html\n"
 
 
-def test_help_is_no_error(cli, capsys):
+def test_help_exits_with_0(cli, capsys):
     with pytest.raises(SystemExit) as e:
         cli("run", "--help")
 
@@ -640,7 +638,7 @@ def test_the_version_is_that_of_the_package(cli, capsys):
     assert capsys.readouterr().out == f"mortarbench {version('mortarbench')}\n"
 
 
-def test_every_command_and_option_says_what_it_is_for(capsys):
+def test_every_command_and_option_has_a_help_text(capsys):
     parser = main_module._parser()
     (commands,) = parser._subparsers._group_actions
     for name, command in commands.choices.items():
@@ -717,7 +715,7 @@ def test_a_run_measures_in_workers_and_ends_in_a_summary_and_a_page(cli, pit):
     }  # fmt: skip
 
 
-def test_a_run_narrowed_is_a_part_of_the_whole_that_continues_it(cli, pit):
+def test_a_restricted_run_is_part_of_the_whole_run(cli, pit):
     narrow = ("--solver", "twice", "--case", "pit/n=2/*", "--repeats", "1")
     cli(*pit, "--out", "here", *narrow)
     first = read_journal(Path("here"))
@@ -729,7 +727,7 @@ def test_a_run_narrowed_is_a_part_of_the_whole_that_continues_it(cli, pit):
     assert both[0] == first[0]
 
 
-def test_a_fresh_run_forgets_what_the_folder_held(cli, pit):
+def test_a_fresh_run_deletes_the_contents_of_the_folder(cli, pit):
     narrow = ("--case", "pit/n=2/*", "--repeats", "1", "--out", "here")
     for solver in ("times", "twice"):
         cli(*pit, *narrow, "--solver", solver, "--fresh")
@@ -737,7 +735,7 @@ def test_a_fresh_run_forgets_what_the_folder_held(cli, pit):
     assert [r.solver for r in read_journal(Path("here"))] == ["twice"]
 
 
-def test_what_cannot_be_built_is_said_not_measured_and_tried_again(cli, pit, tmp_path):
+def test_a_case_that_cannot_be_built_is_reported_and_retried_later(cli, pit, tmp_path):
     suite = tmp_path / "pit.toml"
     suite.write_text(suite.read_text().replace("[2, 3]", "[99, 2]"))
     line = "pit/n=99/primal could not be built: ZeroDivisionError: no bottom"
@@ -766,9 +764,7 @@ def test_a_plugin_that_changed_is_another_environment(cli, pit, tmp_path):
 
 
 @pytest.mark.parametrize(("load", "lines"), [(0.4, 0), (0.6, 1)])
-def test_a_run_on_a_busy_machine_says_what_that_means(
-    cli, pit, monkeypatch, load, lines
-):
+def test_a_run_on_a_busy_machine_prints_a_warning(cli, pit, monkeypatch, load, lines):
     monkeypatch.setattr(os, "getloadavg", lambda: (load, 0.0, 0.0))
 
     err = cli(*pit, "--solver", "times", "--repeats", "1")[2]
@@ -776,16 +772,18 @@ def test_a_run_on_a_busy_machine_says_what_that_means(
     assert err.count("mortarbench: other programs keep 0.6 cores busy") == lines
 
 
-def test_a_run_that_nobody_listens_to_goes_on():
+def test_a_run_continues_if_its_output_is_closed():
     reading, writing = os.pipe()
     os.close(reading)
     with open(writing, "w", buffering=1) as stream, display_on(stream) as progress:
         progress.start(7)
         progress.warn("who is there?")
-        os.dup2(os.open(os.devnull, os.O_WRONLY), writing)  # let it be closed
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), writing
+        )  # so that closing it succeeds
 
 
-def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
+def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     terminal = io.StringIO()
     terminal.isatty = lambda: True
@@ -801,7 +799,7 @@ def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
 
 @pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
 def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
-    """The bars include one of long measurements and one of a continued run."""
+    """The cases include long measurements and a continued run."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
     now = [0.0]
@@ -858,14 +856,14 @@ def test_the_registries_are_not_changed_by_plugins(registries, tmp_path):
     assert registries == before
 
 
-def test_a_quiet_run_prints_nothing_where_all_was_measured(cli):
+def test_a_complete_quiet_run_prints_nothing(cli):
     assert cli("run", "tiny", "--quiet") == (0, "", "")
     code, out, err = cli("run", "tiny", "--quiet", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["solvers"]["exact"] == {"verified": 6}
 
 
-def test_a_quiet_run_prints_warnings_and_what_it_could_not_do(
+def test_a_quiet_run_prints_warnings_and_missing_measurements(
     cli, monkeypatch, tmp_path
 ):
     monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 99.0, 99.0))
@@ -881,10 +879,8 @@ def test_a_quiet_run_prints_warnings_and_what_it_could_not_do(
     assert "other programs keep 99.0 cores busy" in err
 
 
-def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypatch):
-    """The hint is printed for a problem, which has a dual form, but not for a QP from a
-    file.
-    """
+def test_a_decline_names_the_dual_form_if_available(capsys, tmp_path, monkeypatch):
+    """The hint is printed if the family has a dual form, but not for a QP of a file."""
     from mortarbench import QP, export
 
     monkeypatch.chdir(tmp_path)

@@ -59,7 +59,7 @@ def test_the_solver_of_the_contributing_guide_solves(tmp_path):
     )
 
 
-def test_the_elastic_family_of_the_plug_in_page_is_one(tmp_path):
+def test_the_elastic_family_of_the_plug_in_page_is_valid(tmp_path):
     """The contact force of the stamp balances its pressure, and is the same in both
     forms and for all contact methods.
     """
@@ -119,7 +119,7 @@ def test_the_pages_of_solvers_are_up_to_date():
     )
 
 
-def test_the_page_of_solvers_tells_the_facts_of_each():
+def test_the_page_of_solvers_states_the_facts_of_each():
     page = solvers_page(SOLVERS)
     for name, solver in SOLVERS.items():
         assert f"| `{name}` |" in page
@@ -154,7 +154,7 @@ def test_a_page_has_at_most_2500_words(page):
     assert len(page.read_text("utf-8").split()) <= 2500
 
 
-def test_the_start_page_leads_every_kind_of_user_to_a_page_with_commands():
+def test_the_start_page_links_every_kind_of_user_to_a_page_with_commands():
     """The first link for each kind of user leads to a page with commands or a session
     that the tests execute.
     """
@@ -208,7 +208,7 @@ def workflow():
         yield from (shlex.split(line) for line in text.splitlines())
 
 
-def test_the_workflow_for_ci_calls_commands_that_there_are():
+def test_the_workflow_for_ci_calls_existing_commands():
     commands = [words[1:] for words in workflow() if words[0] == "mortarbench"]
 
     assert [words[0] for words in commands] == ["test-solver", "run", "run", "report"]
@@ -227,7 +227,9 @@ def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, cap
 
     for first, *words in workflow():
         if first == "mortarbench":
-            by_chance = words[0] == "report"  # slower, in 1 of 20 at most
+            by_chance = (
+                words[0] == "report"
+            )  # exits with 1 by chance, at most once in 20 runs
             allowed = {0, 1} if by_chance else {0}
             assert main(Registries(), words) in allowed, (words, capsys.readouterr())
     assert (tmp_path / "out/ci/new/report/against-base/index.html").is_file()

@@ -1,9 +1,9 @@
 """Every command in the documents works, in the order of its page.
 
 The commands of a page are in blocks ```sh; those of the README are indented lines. The
-files that they need are the blocks after ``<!-- file: NAME -->``. Commands that take
-too long are run in a shorter form, and those that cannot be run here are listed with
-the reason.
+files that these commands need are the blocks after ``<!-- file: NAME -->``. Commands
+that take too long are run in a shorter form, and those that cannot be run here are
+listed with the reason.
 """
 
 import re
@@ -25,7 +25,7 @@ PAGES = [
 
 _SMALL = "--case '*Nr=4/Nh=3/step=1/*'"
 
-#: what is run instead, the same but smaller
+#: shorter commands that are run instead
 SHORTER = {
     "mortarbench run demo": f"mortarbench run demo {_SMALL} --repeats 2",
     "mortarbench run demo --out out/demo-again": (
@@ -104,10 +104,10 @@ SHORTER = {
     ),
 }
 
-#: what is not run, and why
+#: commands that are not run, with the reason
 ELSEWHERE = {
-    "make setup": "the environment is there",
-    "make demo": "the environment is there; `mortarbench run` of the demo is run",
+    "make setup": "the environment exists",
+    "make demo": "the environment exists; `mortarbench run demo` is tested",
     "make test": "it would run itself",
     ". .venv/bin/activate": "the environment is active",
     "mortarbench paper --quick": "test_paper.py, with fewer samples",
@@ -121,15 +121,15 @@ ELSEWHERE = {
     "mortarbench run fleet --out out/fleet --dask tcp://login1:PORT": "the same",
     "mortarbench solve bodies:press.toml/parts=20/glue=redundant/dual "
     "--solver smalbe": "test_subdomains.py; the file is that of own-geometry.md",
-    "gmsh -2 -order 1 press.geo": "gmsh is not here; what it makes is in tests/data",
-    "gmsh -3 -order 1 blocks.geo": "gmsh is not here; what it makes is in tests/data",
+    "gmsh -2 -order 1 press.geo": "gmsh is not installed; its output is in tests/data",
+    "gmsh -3 -order 1 blocks.geo": "gmsh is not installed; its output is in tests/data",
     ".venv/bin/python -m pip install -c constraints.txt -e '.[cluster]'": (
-        "the environment is there"
+        "the environment exists"
     ),
 }
-#: what a page needs of programs that are not here
+#: files that programs outside of the test environment would write, by page
 SUPPLIED = {"own-geometry": ("press.msh",), "solids": ("blocks.msh",)}
-#: what a page promises of the files that its commands leave
+#: files that the commands of a page must write, with a pattern of their contents
 PROMISED = {
     "tutorial": {
         "beam.png": "",
@@ -202,7 +202,7 @@ def shown(page):
     return list(parts(page.read_text("utf-8")))
 
 
-def test_nothing_is_shortened_or_left_out_that_no_page_shows():
+def test_every_omitted_command_is_shown_on_a_page():
     commands = {what for p in PAGES for kind, what, _ in shown(p) if kind == "run"}
 
     assert set(normal(SHORTER)) | set(normal(ELSEWHERE)) <= commands

@@ -8,7 +8,7 @@ import pytest
 from tests.support import ROOT
 
 sys.path.append(str(ROOT / "tools"))
-import products  # what writes the tables
+import products  # tools/products.py, which writes the tables
 
 LINES = products.PAGE.read_text("utf-8").splitlines()
 CELLS = [

@@ -24,9 +24,7 @@ QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
 
 @dataclass(frozen=True)
 class ActiveRow:
-    """Solves the QP above under the assumption that its row is active; `shift` perturbs
-    the answer.
-    """
+    """Solver of `QP` that assumes an active row; `shift` perturbs the answer."""
 
     shift: float = 0.0
 
@@ -53,7 +51,7 @@ def test_a_qp_is_solved_like_a_case():
     assert "verified (claimed solved)" in repr(answer)
 
 
-def test_a_solver_object_is_measured_in_a_process_of_its_own():
+def test_a_solver_object_is_measured_in_a_separate_process():
     answer = mb.solve(QP, ActiveRow())
 
     assert answer.verdict is mb.Verdict.VERIFIED
@@ -88,7 +86,7 @@ def test_fields_of_a_solver_object_are_its_options():
         mb.solve(QP, ActiveRow(), shif=1)
 
 
-def test_an_option_that_cannot_be_written_down_is_refused(tmp_path):
+def test_an_option_that_is_not_json_is_refused(tmp_path):
     """An option whose default is None accepts every type until a worker is started."""
     file = tmp_path / "free.py"
     file.write_text(
@@ -111,7 +109,7 @@ def test_options_of_a_named_solver_may_be_keywords():
     assert mb.solve(QP, "clarabel", max_iter=7).record.options["max_iter"] == 7
 
 
-def test_a_solver_object_meets_a_case_of_a_plug_in():
+def test_a_solver_object_solves_a_case_of_a_plug_in():
     case = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
 
     assert mb.solve(case, ActiveRow()).verdict is mb.Verdict.DECLINED
@@ -151,7 +149,7 @@ print(*(result.grade for result in found.results.values()))
 
 @pytest.mark.parametrize("threads", [False, True])
 def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
-    """The class is also copied if the script has other threads, as a notebook has, and
+    """The class is also copied if the script, like a notebook, has several threads and
     must not fork.
     """
     (tmp_path / "beside.py").write_text(
@@ -172,7 +170,7 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
     )
 
 
-def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_path):
+def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
     """The script's own `solvers.py` and `msgspec.py` take precedence in the
     script only.
     """
@@ -203,14 +201,14 @@ def test_a_module_of_that_name_that_is_installed_does_not_take_the_place(tmp_pat
 
 
 class _Uncopied(ActiveRow):
-    """Contains an object that cannot be sent to another process."""
+    """Solver with an attribute that cannot be pickled."""
 
     def __reduce__(self):
         raise TypeError("cannot pickle the handle of a library")
 
 
 class _Unloaded(ActiveRow):
-    """Can be pickled but not unpickled."""
+    """Solver that can be pickled but not unpickled."""
 
     def __reduce__(self):
         return int, ("not a number",)
@@ -233,7 +231,7 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
     assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
 
 
-def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
+def test_the_series_of_a_solver_object_contains_earlier_load_steps(tmp_path):
     """The series of load steps requires the solver again, either the object or the
     plug-in.
     """
@@ -247,7 +245,7 @@ def test_an_answer_of_a_solver_object_gives_the_load_steps_before_it(tmp_path):
     assert answer.save_vtu(tmp_path / "a.pvd").is_file()
 
 
-# Answers from elsewhere.
+# Verification of given points.
 
 
 def test_a_point_is_verified_with_and_without_its_multipliers():
@@ -258,7 +256,7 @@ def test_a_point_is_verified_with_and_without_its_multipliers():
     assert alone.multipliers.z == pytest.approx([0.5], abs=1e-15)
     assert found.residuals == (0, 0, 0, 0)
     assert found.objective == -0.625
-    assert repr(alone).startswith("<verified: off the proven optimum by 0")
+    assert repr(alone).startswith("<verified: error 0 relative to the proven optimum")
 
 
 def test_a_point_that_is_not_optimal_is_refuted():
@@ -311,7 +309,7 @@ def test_a_qp_is_the_same_whether_its_case_or_itself_is_solved():
     assert by_qp.solution.x.tolist() == by_name.solution.x.tolist()
 
 
-def test_an_operator_gives_its_matrix_by_a_product_with_the_identity():
+def test_the_matrix_of_an_operator_is_its_product_with_the_identity():
     qp = mb.build("membranes/S=2/n=4/dual").qp
     P = qp.P @ np.eye(qp.q.size)
 
@@ -322,7 +320,7 @@ def test_an_operator_gives_its_matrix_by_a_product_with_the_identity():
 
 @pytest.mark.parametrize("ending", ["npz", "mat", "parquet", "qps"])
 @pytest.mark.parametrize("what", [QP, SMALL])
-def test_what_is_exported_is_the_same_qp(tmp_path, monkeypatch, what, ending):
+def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     monkeypatch.chdir(tmp_path)
     path = mb.export(what, f"qp.{ending}")
     qp = what if isinstance(what, mb.QP) else mb.build(what).qp
@@ -368,7 +366,9 @@ def test_a_suite_may_be_a_dict(results):
     written = (results.folder / "suite.toml").read_text("utf-8")
     again = results.folder.parent / "again.toml"
     again.write_text(written)
-    assert len(mb.run(again, out=results.folder)) == 6  # the same suite: all is there
+    assert (
+        len(mb.run(again, out=results.folder)) == 6
+    )  # the same suite: no measurement is missing
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_a_suite_may_be_a_dict(results):
         ),
     ],
 )
-def test_a_dict_that_is_no_suite_is_refused_in_one_line(tmp_path, suite, message):
+def test_an_invalid_suite_dict_is_refused_in_one_line(tmp_path, suite, message):
     with pytest.raises(mb.InputError, match=message) as e:
         mb.run(suite, out=tmp_path)
     assert "\n" not in str(e.value)
@@ -396,10 +396,10 @@ def test_a_figure_of_the_report_is_drawn(results, tmp_path):
 
     assert figure.axes
     assert (tmp_path / "a.svg").read_text("utf-8").startswith("<?xml")
-    assert results.plot("scaling").axes  # the only one of its kind, scaling-1
+    assert results.plot("scaling").axes  # short for scaling-1, the only such figure
 
 
-def test_an_unknown_figure_is_refused_with_those_that_there_are(results, tmp_path):
+def test_an_unknown_figure_is_refused_with_the_available_ones(results, tmp_path):
     with pytest.raises(mb.InputError, match=r"unknown figure 'acuracy'; did you mean "
                        r"'accuracy'\? known: accuracy, .*scaling-1"):  # fmt: skip
         results.plot("acuracy")
@@ -432,7 +432,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
     assert done.stdout == "[]\n"
 
 
-def test_a_solver_object_goes_through_the_conformance_suite():
+def test_the_conformance_suite_accepts_a_solver_object():
     """The solver handles one QP only, so every check is declined or fails."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
@@ -454,7 +454,7 @@ def test_completion_lists_public_names_only():
     assert not [name for name in dir(mb) if name.startswith("_")]
 
 
-def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
+def test_the_public_names_suffice_for_plug_ins(tmp_path):
     assert {"QP", "Solution", "Status", "Family", "Case"} <= set(dir(mb))
     assert mb.Case is plugin.Case
     case = mb.build("obstacle/dim=1/n=4/primal")
@@ -486,7 +486,10 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
     ("call", "message"),
     [
         (lambda: mb.solve(None, "clarabel"), "case = None; expected the name of a cas"),
-        (lambda: mb.solve(Path("a.npz"), "clarabel"), "QP; a file is 'file:a.npz'"),
+        (
+            lambda: mb.solve(Path("a.npz"), "clarabel"),
+            "QP; write 'file:a.npz' for a file",
+        ),
         (
             lambda: mb.solve(QP, None),
             "solver = None; expected the name of a solver, or",
@@ -537,7 +540,7 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
         (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],
 )
-def test_what_is_of_the_wrong_type_is_told_what_was_expected(call, message):
+def test_an_argument_of_the_wrong_type_is_refused_with_the_expected_type(call, message):
     with pytest.raises(mb.InputError, match=message) as e:
         call()
     assert "\n" not in str(e.value)
@@ -552,7 +555,7 @@ def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
     assert isinstance(case.registries, Registries)
 
 
-def test_an_option_that_is_given_twice_is_refused():
+def test_an_option_passed_twice_is_refused():
     with pytest.raises(mb.InputError, match="max_iter is given twice"):
         mb.solve(
             "obstacle/dim=1/n=4/primal", "clarabel", options={"max_iter": 9}, max_iter=3

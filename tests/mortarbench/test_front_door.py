@@ -47,14 +47,14 @@ def smoke(tmp_path_factory):
     return mb.run("smoke", out=out, cases=["*/dual"], solvers=["smalbe", "clarabel"])
 
 
-def test_every_name_that_is_promised_is_there():
+def test_every_promised_name_is_exported():
     assert {name for name in mb.__all__ if not hasattr(mb, name)} == set()
     assert set(mb.__all__) <= set(dir(mb))
     with pytest.raises(AttributeError, match="no attribute 'solv'"):
         mb.solv  # noqa: B018
 
 
-def test_a_case_bears_its_canonical_name_and_tells_its_sizes():
+def test_a_case_has_its_canonical_name_and_sizes():
     case = mb.build("beam-ring/Nh=3/Nr=4/radial=6/steps=1/step=1/primal")
 
     assert case.name == "beam-ring/Nr=4/Nh=3/steps=1/primal"
@@ -65,7 +65,7 @@ def test_a_case_bears_its_canonical_name_and_tells_its_sizes():
     )
 
 
-def test_a_point_gives_the_physics_of_its_case():
+def test_a_point_yields_the_physical_results_of_its_case():
     case = mb.build("obstacle/dim=1/n=12/primal")  # exact at nodes: u = (|x| − 1)²
     answer = mb.solve(case, "clarabel")
 
@@ -77,7 +77,7 @@ def test_a_point_gives_the_physics_of_its_case():
         answer.plot()
 
 
-def test_an_answer_is_judged_certified_and_told(answer):
+def test_an_answer_is_verified_certified_and_printed(answer):
     assert answer.verdict is Verdict.VERIFIED
     assert max(answer.residuals) <= 1e-7
     assert 0 < answer.energy_bound < 1e-4
@@ -88,7 +88,7 @@ def test_an_answer_is_judged_certified_and_told(answer):
     assert json.loads(json.dumps(answer.to_dict()))["case"] == SMALL
 
 
-def test_an_answer_says_what_the_mesh_adds_to_its_error():
+def test_an_answer_estimates_the_discretisation_error():
     """The finite element space contains the solution of the patch test; a cantilever
     has no finer mesh.
     """
@@ -97,7 +97,7 @@ def test_an_answer_says_what_the_mesh_adds_to_its_error():
         for name in ("contact-patch/primal", "cantilever/ny=1/primal")
     )
 
-    assert "the mesh adds more" in repr(patch)
+    assert "the discretisation error is not included" in repr(patch)
     assert patch.mesh_error().kind == "rounding"
     assert str(patch.mesh_error()).startswith("less than ")
     assert str(beam.mesh_error()).startswith("unknown: ")
@@ -118,7 +118,7 @@ def test_an_answer_shows_no_options_that_are_the_defaults(answer):
     assert "solver                    smalbe\n" in repr(answer)
 
 
-def test_options_are_those_asked_for_and_history_can_be_left_out():
+def test_options_are_passed_on_and_history_can_be_switched_off():
     case = mb.build(SMALL)
     few = mb.solve(case, "smalbe", options={"max_steps": 3, "history": False})
 
@@ -130,7 +130,7 @@ def test_options_are_those_asked_for_and_history_can_be_left_out():
         mb.solve(case, "smalbe", options={"max_step": 3})
 
 
-def test_solvers_of_a_plug_in_meet_a_case_of_ours_and_the_reverse():
+def test_solvers_and_cases_of_plug_ins_and_mortarbench_can_be_combined():
     ours = mb.build("obstacle/dim=1/n=4/primal")
     its = mb.build("well/n=2/dual", plugins=[TOY_PROBLEM])
 
@@ -152,7 +152,7 @@ def test_solvers_of_a_plug_in_meet_a_case_of_ours_and_the_reverse():
         (lambda: mb.validate("nowhere", budget=-1), "expected a number of seconds"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(call, message):
+def test_errors_are_reported_in_one_line(call, message):
     with pytest.raises(mb.InputError, match=message) as e:
         call()
     assert "\n" not in str(e.value)
@@ -171,7 +171,7 @@ def test_a_run_is_a_table_of_its_journal(results, capfd):
     assert results.shortfall == []
 
 
-def test_nothing_prints_unless_asked(tmp_path, results, capfd):
+def test_functions_print_only_on_request(tmp_path, results, capfd):
     suite = results.folder.parent / "s.toml"
     mb.run(suite, out=tmp_path / "a", plugins=[TOY_PROBLEM])
     mb.load(tmp_path / "a")
@@ -183,7 +183,7 @@ def test_nothing_prints_unless_asked(tmp_path, results, capfd):
     assert "8/8 " in err
 
 
-def test_progress_is_told_to_a_function(tmp_path, results):
+def test_progress_is_passed_to_a_function(tmp_path, results):
     told = []
     mb.run(
         results.folder.parent / "s.toml",
@@ -234,16 +234,16 @@ def test_lists_are_tables():
     assert "well" in mb.problems(plugins=[TOY_PROBLEM]).names
 
 
-def test_the_catalogue_is_what_the_solvers_say_of_themselves():
+def test_the_catalogue_agrees_with_the_solvers():
     stored = json.loads(CATALOGUE.read_text())
     live = {name: describe(solver) for name, solver in SOLVERS.items()}
 
     assert stored == json.loads(json.dumps(live)), "run `make docs`"
 
 
-def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
+def test_a_solver_of_another_registry_has_its_own_description():
     class Other:
-        """Another one."""
+        """Another solver."""
 
         def declines(self, qp):
             return "always"
@@ -252,7 +252,7 @@ def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
             raise AssertionError
 
     (row,) = mb.solvers(registries=Registries(solvers={"smalbe": Other()}))
-    assert row["description"] == "Another one."
+    assert row["description"] == "Another solver."
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_a_solver_of_another_registry_is_not_taken_for_ours_of_that_name():
         ["test-solver", "smalb"],
     ],
 )
-def test_help_lists_and_refusals_wait_for_no_library(argv, tmp_path):
+def test_help_lists_and_refusals_import_no_numerical_library(argv, tmp_path):
     program = (
         "import sys, mortarbench.__main__ as m\n"
         "sys.argv[0] = 'mortarbench'\n"
@@ -293,7 +293,7 @@ def test_help_lists_and_refusals_wait_for_no_library(argv, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_wheel_does_without_the_checkout(tmp_path):
+def test_a_wheel_works_without_the_checkout(tmp_path):
     subprocess.run(
         [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT],
         check=True,
@@ -325,7 +325,7 @@ def test_a_wheel_does_without_the_checkout(tmp_path):
 
 
 class _Display:
-    """Replaces IPython's display and stores the last object shown."""
+    """Replacement of IPython's display that stores the last displayed object."""
 
     def __init__(self):
         self.shown = ""
@@ -339,9 +339,7 @@ class _Display:
         self.shown = thing._repr_html_()
 
 
-def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
-    monkeypatch, results
-):
+def test_in_a_notebook_a_run_shows_a_bar_and_unverified_answers(monkeypatch, results):
     display = _Display()
     shell = SimpleNamespace(config={"IPKernelApp": {}})
     ipython = SimpleNamespace(get_ipython=lambda: shell)
@@ -371,9 +369,7 @@ def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
         (2, 2, 7, "0:00:07 left"),
     ],
 )
-def test_what_is_left_takes_as_long_as_what_was_measured(
-    measured, to_do, seconds, said
-):
+def test_the_remaining_time_assumes_the_present_rate(measured, to_do, seconds, said):
     assert remaining(measured, to_do, seconds) == said
 
 

@@ -18,7 +18,7 @@ GALLERY = ROOT / "docs" / "gallery"
 
 
 def read(name):
-    import nbformat  # late, as below: what collects tests would wait for it
+    import nbformat  # slow; test collection does not need it
 
     notebook = nbformat.read(GALLERY / f"{name}.ipynb", as_version=4)
     nbformat.validate(notebook)

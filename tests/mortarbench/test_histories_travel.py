@@ -84,7 +84,7 @@ def strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
-def test_a_kept_history_tells_what_the_solver_did(manufactured):
+def test_a_stored_history_records_the_iterations(manufactured):
     qp, solution = manufactured("box")
     s = measure(PLUGIN.solvers["descent"].__class__(history=True), qp, 1e-8).solution
 
@@ -159,10 +159,10 @@ def test_a_history_is_part_of_the_digest_but_its_absence_is_not(tmp_path, point)
         save_solution(tmp_path, point(cost=np.zeros(2))),
     }
     assert len(digests) == 4
-    assert "97b50261ac02503f" in digests  # as before there were histories
+    assert "97b50261ac02503f" in digests  # as in versions without histories
 
 
-def test_points_stored_before_there_were_histories_have_none(tmp_path):
+def test_points_stored_by_older_versions_have_no_history(tmp_path):
     two = np.ones(2)
     old = save(tmp_path, dict(x=two, y=two, z=two, z_box=two))
 
@@ -188,7 +188,7 @@ def test_solve_turns_the_history_on_and_prints_its_columns_as_lists(cli):
     assert 0 < seconds[0] < seconds[1]
 
 
-def test_what_is_no_number_is_null_in_json(cli):
+def test_numbers_that_are_not_finite_are_null_in_json(cli):
     _, out, _ = cli("solve", "well/dual", "--solver", "notes", "--json")
 
     assert strict(out)["history"] == {
@@ -204,7 +204,7 @@ def test_solvers_without_a_history_have_an_empty_one_in_json_and_no_table(cli):
     assert "iteration " not in text
 
 
-def test_solve_shows_people_counters_and_a_table_of_convergence(cli):
+def test_solve_prints_counters_and_a_table_of_convergence(cli):
     _, out, _ = cli("solve", "well/dual", "--solver", "descent")
 
     facts, table, legend = out.split("\n\n")
@@ -246,13 +246,13 @@ def test_long_tables_keep_their_first_and_last_row_and_count_every_step():
     assert sum(int(steps[1:]) for _, steps, _ in rows) == 1000
 
 
-def test_an_empty_history_is_no_table():
+def test_an_empty_history_has_no_table():
     assert convergence({}) == ""
     assert convergence({"active": np.zeros(0)}) == ""
 
 
 @pytest.mark.parametrize("kept", [True, False])
-def test_a_run_keeps_histories_where_the_suite_says_so(cli, tmp_path, kept):
+def test_a_run_stores_histories_if_the_suite_requests_them(cli, tmp_path, kept):
     option = str(kept).lower()
     (tmp_path / "s.toml").write_text(
         "name = 's'\nrepeats = 2\n[[problems]]\nfamily = 'well'\nforms = ['dual']\n"

@@ -43,7 +43,7 @@ def write(folder, *names):
     return str(path)
 
 
-def test_solve_ends_well_and_says_so_in_words(qps, capsys):
+def test_solve_reports_verified_infeasibility(qps, capsys):
     assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp"]) == 0
     assert "verified infeasible (claimed infeasible)" in capsys.readouterr().out
     assert main(["solve", f"file:{qps}/none.npz", "--solver", "osqp", "--json"]) == 0
@@ -55,7 +55,7 @@ def test_a_claim_that_the_objective_is_unbounded_is_not_verified(qps, capsys):
     assert json.loads(capsys.readouterr().out)["status"] == "infeasible_claim"
 
 
-def test_a_run_counts_it_as_verified_and_a_strict_one_passes(qps, tmp_path, capsys):
+def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
     out = tmp_path / "out"
     path = write(qps, "none", "some")
     assert main(["run", path, "--out", str(out), "--strict"]) == 0
@@ -77,7 +77,7 @@ def test_a_run_counts_it_as_verified_and_a_strict_one_passes(qps, tmp_path, caps
     assert "Refuted claims" not in page
 
 
-def test_a_folder_of_nothing_else_is_validated_and_a_forged_proof_is_found(
+def test_a_folder_of_infeasible_cases_is_validated_and_forged_proofs_detected(
     qps, tmp_path, capsys
 ):
     out = tmp_path / "out"

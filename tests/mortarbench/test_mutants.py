@@ -40,7 +40,7 @@ def test_one_place_is_changed_at_a_time(code, expected):
     assert changes(code) == expected
 
 
-def test_texts_types_and_messages_are_left_as_they_are():
+def test_texts_types_and_messages_are_not_mutated():
     code = """
 "A docstring."
 x: Literal[1, 2]
@@ -74,7 +74,7 @@ def test_the_copy_has_every_compiled_module(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_list_names_modules_tests_and_mutants_that_there_are():
+def test_the_list_names_existing_modules_tests_and_mutants():
     plan = mutants.read_plan()
     for module, tests in plan.tests.items():
         assert (ROOT / module).is_file()

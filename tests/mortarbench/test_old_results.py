@@ -24,7 +24,7 @@ def command(*argv):
     return main(Registries(), list(map(str, argv)))
 
 
-def test_its_records_are_those_that_were_written(old):
+def test_the_records_of_an_old_folder_are_read_unchanged(old):
     records = read_journal(old)
 
     verdicts = [r.verdict for r in records if r.solver == "smalbe"]
@@ -34,23 +34,23 @@ def test_its_records_are_those_that_were_written(old):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_it_is_reported_on(old, capsys):
+def test_an_old_folder_can_be_reported(old, capsys):
     assert command("report", old, "--format", "md,csv") == 0
     assert "beam-ring/Nr=4/Nh=3/step=1/dual" in (old / "report/report.md").read_text()
 
 
-def test_its_answers_agree(old, capsys):
+def test_the_answers_of_an_old_folder_agree(old, capsys):
     assert command("validate", old, "--budget", 0) == 0
 
 
-def test_a_measurement_of_it_is_made_again(old, capsys):
+def test_a_measurement_of_an_old_folder_can_be_repeated(old, capsys):
     (record, *_) = (r for r in read_journal(old) if r.verdict is Verdict.VERIFIED)
 
     assert command("replay", old, record.run_id) == 0
     assert record.case in capsys.readouterr().out
 
 
-def test_what_another_environment_measured_is_left_alone(old, capsys):
+def test_records_of_another_environment_are_unchanged(old, capsys):
     before = read_journal(old)
 
     assert command("run", old / "suite.toml", "--out", old, "--repeats", 2) == 2
@@ -58,7 +58,7 @@ def test_what_another_environment_measured_is_left_alone(old, capsys):
     assert read_journal(old) == before
 
 
-# folders of code that imported its packages by names of their own (e247e1f)
+# folders of a version whose packages were top-level packages (e247e1f)
 
 PLUGINS = ROOT / "tests/data/results-e247e1f-plugins"
 SMOKE = ROOT / "tests/data/results-e247e1f-smoke"
@@ -82,7 +82,7 @@ def before_namespace(request, tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_a_folder_of_before_the_namespace_is_continued(before_namespace):
+def test_a_run_in_a_folder_from_before_the_namespace_continues(before_namespace):
     folder, plugins = before_namespace
     before = {r.run_id: r for r in read_journal(folder)}
     most = max(r.repeat for r in before.values()) + 1
@@ -104,7 +104,7 @@ def test_a_folder_of_before_the_namespace_is_continued(before_namespace):
     assert "smalbe" in (folder / "report/report.md").read_text()
 
 
-def test_records_of_before_the_namespace_are_made_again(before_namespace):
+def test_records_from_before_the_namespace_can_be_repeated(before_namespace):
     """A new run gives the same verdict and nearly the same number of products."""
     folder, plugins = before_namespace
     records = [r for r in read_journal(folder) if r.repeat == 0]
@@ -121,7 +121,7 @@ def test_records_of_before_the_namespace_are_made_again(before_namespace):
         )
 
 
-def test_folders_of_before_the_namespace_merge(tmp_path):
+def test_folders_from_before_the_namespace_can_be_merged(tmp_path):
     merged = mb.merge(SMOKE, PLUGINS, out=tmp_path / "both")
 
     assert len(merged) == len(read_journal(SMOKE)) + len(read_journal(PLUGINS))

@@ -61,7 +61,9 @@ def folder_of_user(tmp_path):
 
 
 @pytest.mark.parametrize("command", [["script.py"], ["-c", PROGRAM]])
-def test_a_folder_with_the_names_of_ours_is_a_place_to_work_in(folder_of_user, command):
+def test_a_working_directory_may_contain_folders_with_our_package_names(
+    folder_of_user, command
+):
     done = subprocess.run(
         [sys.executable, *command], cwd=folder_of_user, capture_output=True, text=True
     )
@@ -70,7 +72,7 @@ def test_a_folder_with_the_names_of_ours_is_a_place_to_work_in(folder_of_user, c
 
 
 @pytest.mark.parametrize("name", ["harness", "problems.fem.mesh", "solvers", "reports"])
-def test_nothing_of_ours_is_imported_under_a_name_of_its_own(name, folder_of_user):
+def test_no_package_is_imported_under_a_top_level_name(name, folder_of_user):
     program = (
         "import sys, mortarbench.cli.main, mortarbench.processes, "
         "mortarbench.reports.folder, mortarbench.solvers.smalbe.solver; "

@@ -37,7 +37,7 @@ def solved(tmp_path_factory):
     return case, s, folder
 
 
-def test_the_page_tells_what_hertz_found():
+def test_the_page_states_the_solution_of_hertz():
     assert f"{1e3 * HALF_WIDTH:.3f} mm" in PAGE
     assert f"{LARGEST / 1e9:.2f} GPa" in PAGE
 
@@ -78,7 +78,7 @@ def test_paraview_gets_triangles_pressures_and_a_table_along_each_contact(solved
         assert grid.point_data["pressure"].max() >= near.pressure_Pa.max()
 
 
-def test_what_the_page_says_of_refusals_is_what_is_said(solved):
+def test_the_refusals_quoted_on_the_page_are_the_actual_messages(solved):
     """Every message in the table of the page occurs, except for its variable parts."""
     code = "".join(
         path.read_text("utf-8")

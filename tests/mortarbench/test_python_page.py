@@ -11,7 +11,7 @@ from tests.support import ROOT
 
 
 @pytest.mark.slow
-def test_the_page_shows_what_happens(tmp_path, monkeypatch, capsys):
+def test_the_output_on_the_page_is_the_actual_output(tmp_path, monkeypatch, capsys):
     """The examples run in their order."""
     page = (ROOT / "docs" / "python.md").read_text("utf-8")
     examples = "\n".join(re.findall(r"```pycon\n(.*?)```", page, re.S))

@@ -42,7 +42,7 @@ def record(claimed, found, tol, **changes):
 
 
 @given(st.sampled_from(list(Status)), residuals, tolerances)
-def test_at_ten_every_stored_status_comes_back(claimed, found, tol):
+def test_factor_ten_reproduces_every_stored_status(claimed, found, tol):
     stored = record(claimed, found, tol)
 
     assert rejudged(stored, VERIFIED_FACTOR) is stored.verdict
@@ -76,7 +76,7 @@ def test_the_verdict_is_that_of_the_residuals_at_the_factor(worst, factor, expec
     assert rejudged(stored, factor) is expected
 
 
-def test_a_sweep_is_judged_at_its_accuracy_not_at_what_was_asked_for():
+def test_a_sweep_is_verified_at_its_accuracy_not_at_the_tolerances():
     stored = record(Status.SOLVED, Residuals(0, 5e-6, 0, 0), 1e-2, accuracy=1e-6)
 
     assert rejudged(stored, 10) is Verdict.VERIFIED
@@ -87,12 +87,12 @@ def test_a_sweep_is_judged_at_its_accuracy_not_at_what_was_asked_for():
 @pytest.mark.parametrize(
     "changes",
     [
-        {"verdict": Verdict.MEMORY_LIMIT},  # an answer, but beyond the limit
+        {"verdict": Verdict.MEMORY_LIMIT},  # an answer that exceeded the limit
         {"verdict": Verdict.CRASHED, "claimed": None, "primal": None, "dual": None},
         {"verdict": Verdict.TIME_LIMIT, "claimed": None},
     ],
 )
-def test_what_no_residual_decided_stands(changes, factor):
+def test_verdicts_that_do_not_depend_on_residuals_are_unchanged(changes, factor):
     stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).replace(**changes)
 
     assert rejudged(stored, factor) is changes["verdict"]
@@ -119,7 +119,7 @@ def folder(tmp_path):
     return tmp_path
 
 
-def test_a_verdict_that_the_residuals_beside_it_refute_is_told(tmp_path, capsys):
+def test_a_verdict_that_contradicts_its_residuals_is_reported(tmp_path, capsys):
     changed = record(Status.SOLVED, Residuals(0, 0.5, 0, 0), 1e-6)
     with Journal(tmp_path, "test") as journal:
         journal.append(changed.replace(verdict=Verdict.VERIFIED))
@@ -131,13 +131,13 @@ def test_a_verdict_that_the_residuals_beside_it_refute_is_told(tmp_path, capsys)
     assert message.count("\n") == 1
 
 
-def test_a_sound_journal_is_read_without_a_word(folder, capsys):
+def test_a_consistent_journal_is_read_without_messages(folder, capsys):
     read_evidence(folder)
 
     assert capsys.readouterr().err == ""
 
 
-def test_the_report_judges_at_the_factor_and_says_so(folder):
+def test_the_report_applies_and_states_the_factor(folder):
     page = compose(judge(folder, 1.0)[1])
     tables = [asdict(t) for s in page.sections for t in s.tables]
     text = json.dumps(tables, ensure_ascii=False)
@@ -148,7 +148,7 @@ def test_the_report_judges_at_the_factor_and_says_so(folder):
     assert "≤ 1 × tol" in " ".join(page.sections[-1].points)
 
 
-def test_a_report_as_stored_says_nothing_of_recomputing(folder):
+def test_a_report_at_the_stored_factor_does_not_mention_recomputing(folder):
     verdicts, evidence = judge(folder, VERIFIED_FACTOR)
 
     assert set(verdicts.values()) == {Verdict.VERIFIED}

@@ -21,12 +21,12 @@ SOURCES = {
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     )
 }
-#: written from docstrings, which terminals show, and what was written before
+#: pages with Unicode formulas: generated from docstrings, or the change log
 UNICODE = {
     "solvers.md", "solvers-own.md", "solvers-libraries.md", "weaknesses.md",
     "CHANGELOG.md",
 }  # fmt: skip
-#: letters of formulas that plain text has no business with
+#: characters that occur only in formulas, not in plain text
 FORMULA = re.compile(r"[ᵀ‖½√∑Σ∫∂𝒫ᵢⱼₖ⁺λΩ\u0302\u0303]")
 CODE = re.compile(r"^```.*?^```$|`[^`]*`|<!--.*?-->", re.DOTALL | re.MULTILINE)
 
@@ -88,10 +88,10 @@ def test_no_formula_of_a_page_is_plain_text(name):
 @pytest.mark.parametrize(
     "text", ["‖u*‖ and ‖v*‖", "D(λ*) = J(u*)", "max |x*| and |y*|"]
 )
-def test_a_formula_that_markdown_swallows_ends_the_build(text):
+def test_a_formula_damaged_by_markdown_ends_the_build(text):
     with pytest.raises(ValueError, match="emphasis within a word"):
         pages.typeset(rendered(text))
-    assert "*" not in rendered(text)  # which a reader would not notice
+    assert "*" not in rendered(text)  # so the damage is not visible in the text
 
 
 @pytest.mark.parametrize("tex", [r"\norm{u}", r"\frac{a", r"u^{*"])

@@ -24,7 +24,7 @@ from tests.support import TOY_PROBLEM
 
 TOY = load_plugin(TOY_PROBLEM)
 
-#: its answer is right in the second version only; what differs is a neighbour
+#: correct only in the second version; the versions differ in a neighbouring module
 MINE = """
 from dataclasses import dataclass
 from harness import Solution, Status
@@ -53,7 +53,7 @@ SOLVERS = {"mine": Mine()}
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
     registries = Registries(
         families=TOY.problems,
@@ -116,7 +116,7 @@ def test_two_versions_are_measured_in_one_run_and_block(cli, versions, tmp_path)
     assert "content of the plug-in old=mine.py: " in err
 
 
-def test_versions_without_labels_are_told_of_them(cli, versions):
+def test_the_error_for_versions_without_labels_mentions_labels(cli, versions):
     code, _, err = cli(
         "list", "solvers", "--plugin", "old/mine.py", "--plugin", "new/mine.py"
     )
@@ -143,7 +143,7 @@ def test_options_of_the_command_line_are_swept_and_measured_again(cli, versions)
     assert (code, json.loads(out)["now"]["options"]) == (0, {"factor": 2.0})
 
 
-def test_one_solve_has_options_too(cli, versions):
+def test_a_single_solve_accepts_options(cli, versions):
     solve = ("solve", "well/dual", "--solver", "new:mine", *versions)
     codes = [cli(*solve, "--option", f"factor={f}")[0] for f in (1, 2)]
 
@@ -154,7 +154,7 @@ def test_one_solve_has_options_too(cli, versions):
     )
 
 
-# files to start from
+# templates
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_a_new_solver_keeps_its_answer_in_every_equivalent_formulation(starting)
     }  # fmt: skip
 
 
-def test_a_new_problem_builds_what_its_name_says(starting):
+def test_a_new_problem_builds_the_named_case(starting):
     """−u″ = −1, and u = −depth on the contact zone; contact ends at the distance
     √(2·depth).
     """
@@ -235,7 +235,7 @@ def test_a_new_suite_runs(starting):
 
 
 @pytest.mark.parametrize("kind", ["solver", "problem", "suite"])
-def test_nothing_is_written_over(starting, tmp_path, kind):
+def test_existing_files_are_not_overwritten(starting, tmp_path, kind):
     name = "mine.toml" if kind == "suite" else "mine.py"
     (tmp_path / name).write_text("precious")
     (tmp_path / "other.py").symlink_to("gone")
@@ -260,11 +260,11 @@ def test_nothing_is_written_over(starting, tmp_path, kind):
         (("solver", "a/b"), "name 'a/b'; expected letters, digits, '-' and '_'"),
         (("solver", "../b"), "name '../b'; expected letters"),
         (("solver", ""), "name ''; expected letters"),
-        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', a lett"),
+        (("solver", "7b"), "name '7b'; expected letters, digits, '-' and '_', start"),
         (("familie", "b"), "argument kind: invalid choice: 'familie' (choose from"),
     ],
 )
-def test_a_name_that_is_none_is_refused(starting, tmp_path, words, message):
+def test_an_invalid_name_is_refused(starting, tmp_path, words, message):
     code, _, err = starting("new", *words)
 
     assert code == 2

@@ -91,7 +91,7 @@ def traffic(side, cells, grid):
 
 
 @pytest.mark.parametrize("cores", [1, 2, 4, 8])
-def test_a_core_sends_what_counting_over_all_nodes_yields(cores):
+def test_the_data_sent_by_a_core_equal_a_count_over_all_nodes(cores):
     run = Distribution(cores=cores, per_core=64 / cores, cells=2)
     assert traffic(4, 2, run.grid) == pytest.approx(run.sent)
 

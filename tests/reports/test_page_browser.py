@@ -179,9 +179,7 @@ def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
 
 
 @pytest.mark.parametrize("width", [1400, 390])
-def test_navigation_and_filters_are_folded_until_they_are_asked_for(
-    visit, folder, width
-):
+def test_navigation_and_filters_are_folded_until_opened(visit, folder, width):
     page = visit(folder, width=width, folded=True)
     link = page.get_by_role("link", name="Summary", exact=True).first
     for summary, inside in (("Contents", link), ("Filter", page.locator("#words"))):

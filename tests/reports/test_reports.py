@@ -540,7 +540,7 @@ def test_csv_contains_full_precision_and_intervals_of_times(measured, tmp_path):
 
 
 @pytest.mark.usefixtures("only_svg")
-def test_only_the_formats_asked_for_are_written(measured, tmp_path):
+def test_only_the_requested_formats_are_written(measured, tmp_path):
     write(tmp_path, [measured("a")])
     write_report(tmp_path, ["md"])
     written = {p.name for p in (tmp_path / "report").iterdir()}

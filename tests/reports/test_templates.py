@@ -46,7 +46,7 @@ def asked(source):
 
 
 @pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)
-def test_every_sentence_that_a_module_asks_for_is_in_its_template(path):
+def test_every_sentence_used_by_a_module_is_in_its_template(path):
     tree = environment().parse(path.read_text("utf-8"))
     macros = {macro.name for macro in tree.find_all(Macro)}
     names, strings = asked(path.with_suffix(".py").read_text("utf-8"))

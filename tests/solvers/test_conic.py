@@ -84,7 +84,7 @@ ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
 #: the same for other solvers: interior-point methods stop at a gap of tol, which
 #: permits an angle of √tol between x and z of a disc
 OTHER_ERROR = 5e-4
-RESIDUAL = {"ecos": 3e-7}  #: more than 1e-7 for 7 of 500 QPs, which it does not claim
+RESIDUAL = {"ecos": 3e-7}  #: residuals exceed 1e-7 for 7 of 500 QPs, without a claim
 
 
 def check_solution(name, seed, tol=1e-8):
@@ -170,7 +170,7 @@ def test_a_hundred_thousand_discs_are_converted_in_seconds():
     assert (back["z_box"] == -1).all()
 
 
-def test_what_is_degenerate_has_linear_rows():
+def test_degenerate_sets_become_linear_rows():
     """A disc of radius 0 is a point; a cone of slope 0 is x_T = 0 and x_N ≥ 0."""
     qp, _ = conic_qp(0)
     form = to_cone(qp)
@@ -204,7 +204,7 @@ DEGENERATE = {
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_the_degenerate_cone_costs_half_of_the_digits(name):
+def test_the_degenerate_cone_has_half_of_the_accurate_digits(name):
     for tol, error in zip((1e-6, 1e-8), DEGENERATE[name], strict=True):
         s = solver_of(name).prepare(degenerate(), tol)()
         assert s.status is Status.SOLVED

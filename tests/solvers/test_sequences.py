@@ -63,7 +63,7 @@ def test_half_the_products_again_and_the_support_block_factorised_once(load_step
 
 
 @pytest.mark.parametrize("name", WARM)
-def test_steps_that_share_nothing_are_solved_as_well(load_steps, manufactured, name):
+def test_steps_without_common_data_are_solved(load_steps, manufactured, name):
     """The QPs differ in size, scale and sign, and one of them is infeasible."""
     qp, other = load_steps["dual"][9], load_steps["dual"][0]
     box, _ = manufactured("box", seed=271828)
@@ -116,7 +116,7 @@ def test_every_product_of_a_sequence_is_counted(load_steps, name):
         assert s.counts["P_products"] == len(calls)
 
 
-def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
+def test_warm_multipliers_and_ritz_pairs_save_products(load_steps):
     """Without elimination, a step takes 46 products from a cold start and 31 from a
     warm one.
     """
@@ -132,7 +132,7 @@ def test_warm_multipliers_and_ritz_pairs_are_worth_products(load_steps):
 
 @pytest.mark.parametrize("name", WARM)
 @pytest.mark.parametrize("jump", [1e2, pytest.param(1e4, marks=pytest.mark.slow)])
-def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(
+def test_a_spectrum_orthogonal_to_the_last_solution_is_detected(
     manufactured, name, jump
 ):
     """P = I is followed by a far larger P that agrees with I on the first component."""
@@ -152,7 +152,7 @@ def test_a_spectrum_that_the_last_solution_does_not_see_is_noticed(
     assert s.counts["P_products"] <= 2 * cold.counts["P_products"]
 
 
-def test_a_failure_leaves_nothing_to_the_next(load_steps):
+def test_a_failure_does_not_affect_the_next_solve(load_steps):
     qp = load_steps["dual"][0]
     broken = replace(qp, A=np.vstack([qp.A, qp.A[:1]]), b=np.append(qp.b, 1e3))
     prepare = SMALBE().chain(1e-8)

@@ -40,7 +40,7 @@ CONCRETE = {name: s for name, s in SOLVERS.items() if "*" not in name} | {
     "cvxpy:OSQP": replace(SOLVERS["cvxpy:*"], backend="OSQP"),
 }
 WILDCARDS = ("qpsolvers:*", "cvxpy:*")
-#: end at a vertex of the active-set search, whatever the tolerance
+#: active-set methods, whose accuracy does not depend on the tolerance
 EXACT = ("bvls", "daqp", "highs", "quadprog", "smalbe-direct")
 SPARSE = (
     "osqp", "clarabel", "proxqp", "piqp", "highs-hipo", "scs", "qpalm", "qoco", "qtqp",
@@ -65,8 +65,8 @@ def solve(name, qp, tol=1e-9):
 
 @pytest.fixture
 def membrane():
-    """Discrete membrane over a flat obstacle, fixed on one side and pulled
-    on another.
+    """Discrete membrane over a flat obstacle, fixed at one side and pulled at another
+    one.
     """
     k = 45
     end = np.eye(k)[:, [0, -1]].sum(axis=1)
@@ -127,12 +127,12 @@ def test_an_iteration_limit_is_reported_as_one(manufactured, name):
     qp, _ = manufactured("everything")
     solution = replace(CONCRETE[name], max_iter=1).prepare(qp, 1e-9)()
     assert solution.status is Status.ITERATION_LIMIT
-    assert solution.iterations <= 2  # ProxQP counts inner ones too
+    assert solution.iterations <= 2  # ProxQP also counts inner iterations
 
 
 @pytest.mark.parametrize("problem", [infeasible, unbounded])
 @pytest.mark.parametrize("name", ["osqp", "clarabel", "qpsolvers:scs", "cvxpy:OSQP"])
-def test_a_certificate_is_not_passed_off_as_a_point(name, problem):
+def test_a_certificate_is_not_returned_as_a_point(name, problem):
     solution = solve(name, problem())
     assert solution.status is Status.INFEASIBLE
     assert np.isnan(solution.x).all()
@@ -194,7 +194,7 @@ def test_proxqp_backends_agree(manufactured):
 
 
 @pytest.mark.parametrize("wildcard", WILDCARDS)
-def test_the_backends_that_decline_are_those_not_installed(manufactured, wildcard):
+def test_only_missing_backends_decline(manufactured, wildcard):
     import cvxpy
     import qpsolvers
 
@@ -215,7 +215,7 @@ def test_the_backends_that_decline_are_those_not_installed(manufactured, wildcar
 
 
 @pytest.mark.parametrize("wildcard", WILDCARDS)
-def test_an_unknown_backend_is_declined_with_those_there_are(manufactured, wildcard):
+def test_an_unknown_backend_is_declined_with_the_available_ones(manufactured, wildcard):
     qp, _ = manufactured("box")
     solver = replace(SOLVERS[wildcard], backend="foo")
     assert "foo" not in solver.backends()
@@ -224,7 +224,7 @@ def test_an_unknown_backend_is_declined_with_those_there_are(manufactured, wildc
     assert "osqp" in reason.lower()
 
 
-def test_an_error_of_cvxpy_is_a_failure_in_its_words(manufactured, monkeypatch):
+def test_an_error_of_cvxpy_is_a_failure_with_its_message(manufactured, monkeypatch):
     import cvxpy
 
     def fail(*args):
@@ -242,9 +242,7 @@ def test_an_error_of_cvxpy_is_a_failure_in_its_words(manufactured, monkeypatch):
 
 
 @pytest.mark.parametrize("backend", ["osqp", "scs", "clarabel", "proxqp"])
-def test_qpsolvers_claims_no_success_it_was_not_given(
-    manufactured, monkeypatch, backend
-):
+def test_qpsolvers_claims_only_reported_success(manufactured, monkeypatch, backend):
     import qpsolvers
 
     honest = qpsolvers.solve_problem
@@ -275,7 +273,7 @@ def test_a_converted_matrix_shares_nothing_with_the_problem():
 
 
 def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
-    # the second QP differs from the first in vectors only, and by little
+    # the second QP differs from the first only slightly, and only in vectors
     qp, _ = manufactured("everything", n=40)
     moved = replace(qp, q=qp.q * (1 + 1e-4))
     for name in ("osqp", "scs", "qpalm", "daqp"):
@@ -285,16 +283,18 @@ def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
 
 
 @pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse", "qtqp"])
-def test_a_rebuilt_session_starts_where_the_last_one_ended(manufactured, name):
+def test_a_rebuilt_session_starts_from_the_last_point(manufactured, name):
     qp, _ = manufactured("everything", n=40)
-    other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
+    other = replace(
+        qp, P=qp.P * (1 + 1e-9)
+    )  # nearly equal, but P requires a new session
     prepare = SOLVERS[name].chain(1e-6)
     first, again = prepare(qp)(), prepare(other)()
     assert again.iterations < first.iterations
     assert kkt_residuals(other, again).worst <= 1e-5
 
 
-def test_sequences_do_not_know_each_other(manufactured):
+def test_sequences_share_no_state(manufactured):
     qp, _ = manufactured("everything")
     one, two = (SOLVERS["osqp"].chain(1e-6)(qp)().iterations for _ in range(2))
     assert one == two == SOLVERS["osqp"].prepare(qp, 1e-6)().iterations
@@ -310,8 +310,10 @@ def test_matrices_that_differ_are_not_updated(manufactured):
 
 
 @pytest.mark.parametrize("name", ["daqp", "quadprog", "piqp-dense", "proxqp-dense"])
-def test_a_dense_solver_declines_what_does_not_fit(manufactured, monkeypatch, name):
-    qp, _ = manufactured("bounds", n=400)  # 1.2 MiB a matrix
+def test_a_dense_solver_declines_qps_that_exceed_memory(
+    manufactured, monkeypatch, name
+):
+    qp, _ = manufactured("bounds", n=400)  # 1.2 MiB per matrix
     assert SOLVERS[name].declines(qp) is None
     monkeypatch.setenv("MORTARBENCH_MEMORY_MIB", "2")
     reason = SOLVERS[name].declines(qp)
@@ -319,14 +321,14 @@ def test_a_dense_solver_declines_what_does_not_fit(manufactured, monkeypatch, na
     assert reason.endswith(" MiB for dense matrices of 400 rows; the limit is 2 MiB")
 
 
-def test_a_solver_tells_its_linear_solver(manufactured):
+def test_a_solver_reports_its_linear_solver(manufactured):
     qp, _ = manufactured("box")
     for name in NATIVE:
         assert solve(name, qp, 1e-6).reported["linear_solver"]
 
 
 def test_highs_has_no_hidden_regularisation(manufactured):
-    # 1e-7 on the Hessian's diagonal would show in the ninth digit and before
+    # 1e-7 on the Hessian's diagonal would change at least the ninth digit
     qp, _ = manufactured("singular")
     small = replace(qp, P=qp.P * 1e-4, q=qp.q * 1e-4)
     for name in ("highs", "highs-hipo"):
@@ -352,7 +354,7 @@ def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(manufactured):
     assert solution.message == "P is not positive definite"
 
 
-def test_qoco_is_not_believed_where_its_iterates_diverge():
+def test_qoco_claims_are_rejected_if_its_iterates_diverge():
     solution = solve("qoco", unbounded())
     assert solution.status is Status.FAILED
     assert solution.message == "diverged"

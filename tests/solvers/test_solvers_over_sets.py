@@ -13,7 +13,7 @@ from mortarbench.harness.verify.measure import measure
 from mortarbench.solvers import SOLVERS
 
 TOL, TIGHT = 1e-9, 1e-12
-LEAST_TOL = {"ecos": 1e-8}  #: of solvers that state that they fail below
+LEAST_TOL = {"ecos": 1e-8}  #: tolerance below which a solver reports failure
 ACCEPTS = {
     name: getattr(solver, "accepts", (Box,))
     for name, solver in SOLVERS.items()

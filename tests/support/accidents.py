@@ -207,7 +207,7 @@ def spin(seconds):
 
 
 class Computes(Honest):
-    """Solver that computes for some milliseconds, like an honest solver."""
+    """Correct solver that computes for some milliseconds."""
 
     def act(self, qp):
         matrix, vector = np.ones((200, 200)), np.ones(200)

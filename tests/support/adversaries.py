@@ -1,4 +1,4 @@
-"""Plug-in with a family of tiny QPs, an honest solver, and misbehaving ones.
+"""Plug-in with a family of tiny QPs, a correct solver, and misbehaving solvers.
 
     min x₁² + ½x₂² − 4x₁ + 3x₂   s.t.   x₁ ≤ h,  x ≥ 0
 
@@ -106,7 +106,7 @@ def at_the_row(qp):
 
 @dataclass(frozen=True)
 class Honest:
-    """Solves the tiny QPs with h ≤ 2; subclasses misbehave on those only."""
+    """Correct solver of the tiny QPs with h ≤ 2; subclasses misbehave only on these."""
 
     level: int = 3
 

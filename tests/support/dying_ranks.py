@@ -3,7 +3,7 @@
 ``dying_ranks.py COUNT TRIALS SEED SECONDS`` launches COUNT ranks in each trial. One of
 them is killed, exits, or is killed after printing a line that resembles our messages.
 The other ranks either exit as soon as they notice this, or continue. In some trials,
-the parent process of the first rank is killed as well. The program prints, as JSON, the
+the parent process of the first rank is also killed. The program prints, as JSON, the
 trials in which `launch` named a wrong rank.
 
 The module has no imports at the top, so that a rank starts within milliseconds.

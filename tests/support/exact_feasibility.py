@@ -8,7 +8,7 @@ from mortarbench.harness import QP
 
 
 def is_feasible(qp, relaxed=0):
-    """Return whether the rows and bounds of a QP are feasible.
+    """Return True if the rows and bounds of a QP are feasible.
 
     Phase one of the simplex method with Bland's rule minimises the sum of artificial
     variables, with x = x⁺ − x⁻ and a slack for each inequality. All entries of the

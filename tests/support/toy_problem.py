@@ -70,7 +70,7 @@ class Well:
 
 @dataclass(frozen=True)
 class Exact:
-    """Divides by a diagonal. Only for toy problems."""
+    """Solver for a diagonal P. Only for toy problems."""
 
     factor: float = 1.0
     reason: str | None = None

@@ -411,7 +411,7 @@ def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
     assert message != "verified infeasible"
 
 
-def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
+def test_a_failure_on_an_operator_names_the_missing_line():
     """If the line quoted in the message is inserted, the check passes."""
     check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
@@ -487,7 +487,7 @@ def command(*arguments):
     return ended.value.code
 
 
-def test_the_command_says_how_every_check_ended(plugin, capsys):
+def test_the_command_prints_the_result_of_every_check(plugin, capsys):
     assert command("test-solver", "sound", "--plugin", plugin, "--json") == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["check"] for row in rows] == list(CHECKS)
@@ -523,7 +523,7 @@ def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
     assert line_of("sound", "primal", "units N, m") not in page
 
 
-def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
+def test_solvers_can_be_selected_by_patterns(plugin, capsys, monkeypatch):
     few = ("refuses a misspelt option", "keeps its answer: dual, mirrored")
     monkeypatch.setattr(conformance, "CHECKS", few)
     command("test-solver", "piqp-*", "sound", "--plugin", plugin, "--json")
@@ -538,7 +538,7 @@ def test_solvers_are_named_by_patterns_too(plugin, capsys, monkeypatch):
     assert command("test-solver", "piqp", "--json", "--markdown") == 2
 
 
-def test_a_crash_fails_its_checks_and_no_more(plugin, capsys, monkeypatch):
+def test_a_crash_fails_only_the_current_check(plugin, capsys, monkeypatch):
     few = ("gives multipliers our signs", "refuses a misspelt option")
     monkeypatch.setattr(conformance, "CHECKS", few)
     assert command("test-solver", "dies", "--plugin", plugin) == 1
@@ -581,6 +581,6 @@ def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     assert capsys.readouterr().err == ""
 
 
-def test_an_unknown_solver_is_wrong_input(capsys):
+def test_an_unknown_solver_is_invalid_input(capsys):
     assert command("test-solver", "nobody") == 2
     assert "nobody" in capsys.readouterr().err

@@ -115,7 +115,7 @@ def test_the_degenerate_cone_reports_errors_in_x():
     assert "| `projections` | error in x " in page
 
 
-def test_a_solver_of_bounds_declines_all_checks_over_sets():
+def test_a_solver_for_bounds_declines_all_checks_over_sets():
     for check in OVER_SETS:
         result = run_check(check, SOLVERS["osqp"])
         assert result.grade is Grade.DECLINE

@@ -283,7 +283,7 @@ def same(a: QP, b: QP):
     )  # fmt: skip
 
 
-def test_an_operator_is_refused_where_its_unknowns_would_change(manufactured):
+def test_an_operator_is_refused_by_changes_of_its_unknowns(manufactured):
     qp, _ = manufactured("bounds")
     with pytest.raises(ValueError, match="expected a matrix"):
         mirror(replace(qp, P=aslinearoperator(qp.P)), [0])

@@ -127,7 +127,7 @@ def disturbed(case, s, size):
 
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
-def test_a_planted_error_is_measured_and_its_solver_named_alone(
+def test_a_planted_error_is_measured_and_only_its_solver_is_named(
     form, truths, tmp_path, cli
 ):
     case, s = truths[2, form]
@@ -193,7 +193,7 @@ def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_pat
     assert f"its contact forces are those of {BEAM}/step=1" in wrong["reasons"]
 
 
-def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
+def test_correct_forces_are_not_attributed_to_another_problem(truths, tmp_path, cli):
     """If only u is wrong, the contact forces are not attributed to another step."""
     case, s = truths[2, "primal"]
     answers = [("a", f"{BEAM}/primal", s), ("a", f"{BEAM}/step=1/primal",
@@ -206,7 +206,7 @@ def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
     assert not any("contact forces are those" in r for r in wrong["reasons"])
 
 
-def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
+def test_rows_closed_in_the_reference_and_open_in_an_answer_are_listed(truths):
     case, s = truths[2, "dual-bounds"]
     back, nothing = case.mechanics.to_primal, replace(s, x=np.zeros_like(s.x))
     point = reference_point(case.mechanics, reference_solution)
@@ -221,7 +221,7 @@ def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
 
 
 @pytest.mark.parametrize("form", ["primal", "dual-bounds"])
-def test_a_multiplier_that_pulls_is_found_with_its_row(form, truths, tmp_path, cli):
+def test_a_tensile_multiplier_is_reported_with_its_row(form, truths, tmp_path, cli):
     case, s = truths[2, form]
     wrong = PLUGIN.solvers["pulls"].prepare(case.qp, 1e-8)()
     if form == "dual-bounds":
@@ -257,7 +257,7 @@ def test_penetration_is_measured_in_mesh_sizes_and_balance_per_body(truths):
 
 
 class Dense:
-    """Inverse of a regular K."""
+    """Inverse of a nonsingular K."""
 
     def __init__(self, K):
         self.inverse, self.kernel = np.linalg.inv(K), np.zeros((len(K), 0))
@@ -300,7 +300,7 @@ def pushed(z, x=(0.5, 1.0)):
     )  # fmt: skip
 
 
-def test_a_certificate_that_the_reference_contradicts_is_our_fault(
+def test_a_certificate_contradicted_by_the_reference_is_a_harness_error(
     truths, tmp_path, cli
 ):
     """The error of 2e-5 is permitted by the claim, but exceeds a certified bound of
@@ -339,7 +339,7 @@ def finds_nothing(qp):
     raise ArithmeticError("it found nothing")
 
 
-def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
+def test_a_row_is_closed_if_its_scaled_force_exceeds_its_scaled_gap(duplicate):
     """All forces and gaps are positive, as at an interior point."""
     point = reference_point(duplicate.mechanics, reference_solution)
     inside = pushed((1.5, 1e-9), (0.5 - 5e-8, 1 - 1e-7))
@@ -350,7 +350,7 @@ def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
     assert found.rows == ()
 
 
-def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
+def test_two_contradictory_claims_are_reported_even_if_none_is_refuted(
     duplicate, monkeypatch
 ):
     def back(s):  # a wrong map, before any answer is certified
@@ -379,7 +379,9 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     assert found.unresolved[0].distance > found.unresolved[0].allowed
 
 
-def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
+def test_without_a_reference_the_certificate_identifies_the_inaccurate_answer(
+    duplicate,
+):
     good, bad = pushed((1.5, 0.0)), pushed((1.5, 0.0), (0.45, 0.9))
     answers = [
         stored_answer(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))
@@ -413,12 +415,14 @@ def test_a_qp_has_the_digest_that_a_run_writes_down(serialised, truths, tmp_path
         assert qp_digest(case.qp, serialised=serialised) == written
 
 
-def test_the_allowed_error_is_what_a_gap_of_ten_tolerances_leaves():
+def test_the_allowed_error_follows_from_a_gap_of_ten_tolerances():
     assert energy_allowed(1e-8) == pytest.approx(np.sqrt(20e-8))
     assert energy_allowed(0.5) == pytest.approx(np.sqrt(0.2))
 
 
-def test_an_answer_within_its_claim_that_stands_out_is_a_remark(truths, tmp_path, cli):
+def test_an_unusually_inaccurate_answer_within_its_claim_causes_a_remark(
+    truths, tmp_path, cli
+):
     _, s = truths[2, "dual-bounds"]
     answers = [(label, f"{BEAM}/dual-bounds", s) for label in HONEST]
     answers.append(("lazy", f"{BEAM}/dual-bounds", replace(s, x=s.x * (1 + 2e-5))))
@@ -429,7 +433,7 @@ def test_an_answer_within_its_claim_that_stands_out_is_a_remark(truths, tmp_path
     assert {d["solver"] for d in verdict["remarks"]} == {"lazy"}
 
 
-def test_what_all_solvers_are_is_no_remark(truths, tmp_path, cli):
+def test_a_property_of_all_solvers_causes_no_remark(truths, tmp_path, cli):
     _, s = truths[2, "dual-bounds"]
     lazy = replace(s, x=s.x * (1 + 2e-5))
     answers = [(label, f"{BEAM}/dual-bounds", lazy) for label in HONEST]
@@ -439,7 +443,7 @@ def test_what_all_solvers_are_is_no_remark(truths, tmp_path, cli):
     assert verdict["remarks"] == []
 
 
-def test_the_table_sets_primal_against_dual_and_each_solver_against_ours(
+def test_the_table_compares_primal_with_dual_and_each_solver_with_smalbe(
     truths, tmp_path, cli
 ):
     off = disturbed(*truths[2, "dual-bounds"], 1e-3)
@@ -509,7 +513,7 @@ def test_the_candidate_that_three_usual_residuals_accept_is_refuted(tmp_path, cl
     assert verdict["disagreements"][0]["reasons"][0].startswith("dual residual")
 
 
-def test_claims_without_a_point_are_refuted_and_what_died_is_listed(
+def test_claims_without_a_point_are_refuted_and_crashes_are_listed(
     truths, tmp_path, cli
 ):
     case, s = truths[2, "primal"]
@@ -530,7 +534,7 @@ def test_claims_without_a_point_are_refuted_and_what_died_is_listed(
     assert verdict["counts"]["declined"] == 1
 
 
-def test_a_claim_that_nothing_refutes_is_listed_all_the_same(tmp_path, cli):
+def test_an_unrefuted_claim_is_listed(tmp_path, cli):
     qp = built("membrane/qp").qp
     denied = PLUGIN.solvers["denies"].prepare(qp, 1e-8)()
     answers = [("a", "half/qp", pulled()), ("denies", "membrane/qp", denied)]
@@ -543,7 +547,9 @@ def test_a_claim_that_nothing_refutes_is_listed_all_the_same(tmp_path, cli):
     assert denied["text"] == told
 
 
-def test_a_form_that_all_deny_is_refuted_by_the_other_forms(truths, tmp_path, cli):
+def test_a_form_that_all_solvers_call_infeasible_is_refuted_by_other_forms(
+    truths, tmp_path, cli
+):
     _, s = truths[2, "dual"]
     denied = PLUGIN.solvers["denies"].prepare(truths[2, "primal"][0].qp, 1e-8)()
     answers = [("a", f"{BEAM}/dual", s), ("denies", f"{BEAM}/primal", denied)]
@@ -553,7 +559,7 @@ def test_a_form_that_all_deny_is_refuted_by_the_other_forms(truths, tmp_path, cl
     assert (code, culprits(verdict)) == (1, {"denies"})
 
 
-def test_mechanics_that_fail_leave_the_residuals(duplicate):
+def test_failing_mechanics_do_not_remove_the_residuals(duplicate):
     def factorise():
         raise ZeroDivisionError("no factor")
 
@@ -629,7 +635,9 @@ def test_bad_input_is_one_line_and_exit_code_2(tmp_path, cli):
         assert "Traceback" not in err
 
 
-def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path, cli):
+def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
+    truths, tmp_path, cli
+):
     folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
     (folder / "report").touch()
     code, _, err = cli(folder, validation_page=write_validation)
@@ -641,7 +649,7 @@ def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path,
     )
 
 
-def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
+def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     truths, tmp_path, cli, svg_only
 ):
     _, s = truths[2, "primal"]
@@ -663,7 +671,7 @@ def test_hostile_names_and_huge_numbers_spoil_neither_page_nor_terminal(
     assert "&lt;b&gt;evil" in page
 
 
-def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
+def test_a_failing_recovery_affects_only_that_answer(duplicate):
     def back(s):
         if s.z[0] == 0:
             raise ZeroDivisionError("no way back")
@@ -700,7 +708,7 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
 
 
 @pytest.mark.parametrize("budget", ["-1", "nan"])
-def test_no_time_for_finer_meshes_is_less_than_none(cli, tmp_path, budget):
+def test_a_negative_time_for_finer_meshes_is_refused(cli, tmp_path, budget):
     code, _, complaint = cli(tmp_path, "--budget", budget)
 
     assert code == 2
@@ -709,7 +717,7 @@ def test_no_time_for_finer_meshes_is_less_than_none(cli, tmp_path, budget):
     assert budget in complaint
 
 
-def test_errors_say_their_norm_and_nothing_is_said_of_a_smalbe_that_took_no_part(
+def test_the_norm_of_errors_is_stated_and_smalbe_only_if_it_was_measured(
     truths, tmp_path, cli
 ):
     for label, told in (("a", False), ("smalbe", True)):

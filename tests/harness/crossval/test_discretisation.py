@@ -113,7 +113,7 @@ def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n)
     ("dim", "least", "most"),
     [(1, 0.9, 1.0), pytest.param(2, 0.6, 0.7, marks=pytest.mark.slow)],
 )
-def test_energies_say_more_than_the_error_where_boundary_values_move(
+def test_energies_differ_from_the_error_if_boundary_values_change(
     tmp_path, dim, least, most
 ):
     """For dim 1, whose boundary consists of points, ‖u_h − u‖² ≤ 2(J_h − J) holds."""
@@ -173,7 +173,7 @@ def test_halved_cells_keep_every_node():
     assert insert_midpoints(x, 1)[1::2].tolist() == [0.5, 2, 5]
 
 
-def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):
+def test_under_a_point_load_only_the_difference_to_the_next_mesh_is_stated(tmp_path):
     (found,) = meshes(tmp_path, "beam-ring/Nr=4/Nh=2/step=1/dual")
 
     assert found.kind == "change"
@@ -191,7 +191,7 @@ def test_the_rate_and_the_error_of_a_sequence_that_has_them_are_found(rate):
     assert found.error == pytest.approx(0.6 / 2)
 
 
-def test_two_meshes_tell_their_difference_only():
+def test_two_meshes_yield_only_their_difference():
     found = estimate_error("box", levels(0.3), note="the next one would be too large")
 
     assert (found.kind, found.rate) == ("change", None)
@@ -199,14 +199,14 @@ def test_two_meshes_tell_their_difference_only():
     assert found.error == found.change == pytest.approx(0.15)
 
 
-def test_what_hardly_falls_is_not_extrapolated():
+def test_a_slowly_decreasing_difference_is_not_extrapolated():
     found = estimate_error("box", levels(0.3, 0.29))
 
     assert found.kind == "change"
     assert "slowly" in found.note
 
 
-def test_what_grows_is_not_said_to_fall():
+def test_an_increasing_difference_is_not_reported_as_decreasing():
     """The second halving changes the solution 2^1.45 = 2.73 times as much
     as the first.
     """
@@ -218,7 +218,7 @@ def test_what_grows_is_not_said_to_fall():
     assert "slowly" not in str(found)
 
 
-def test_what_the_reference_does_not_know_is_no_discretisation_error():
+def test_differences_below_the_reference_error_are_no_discretisation_error():
     found = estimate_error("box", levels(1e-3, bound=1e-2))
 
     assert found.kind == "rounding"
@@ -235,7 +235,7 @@ def test_what_the_reference_does_not_know_is_no_discretisation_error():
         ("beam-ring", dict(Nr=2, Nh=2, depth=2, sides="plane-strain")),
     ],
 )  # fmt: skip
-def test_halved_cells_have_the_bilinear_function_that_the_cells_had(name, keys):
+def test_halved_cells_reproduce_the_bilinear_function_of_the_cells(name, keys):
     """The meshes of the families include curved sides, triangles and hexahedra."""
     family = PROBLEMS[name]
     params = completed(family, keys)
@@ -282,7 +282,7 @@ def test_forms_of_one_physical_case_are_one_line_of_the_file(tmp_path):
     assert len(list((tmp_path / "references").iterdir())) == 6
 
 
-def test_what_cannot_be_told_has_its_reason(tmp_path):
+def test_an_unavailable_error_has_a_reason(tmp_path):
     broken = replace_build(PROBLEMS["obstacle"], ArithmeticError("it is Monday"))
     bare = SimpleNamespace(
         name="bare", defaults={}, forms=("primal",), build=PROBLEMS["obstacle"].build
@@ -300,7 +300,7 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
     assert late[0].levels == large[0].levels == ()
 
 
-def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
+def test_a_mesh_whose_solve_would_exceed_the_budget_is_skipped(tmp_path):
     """The first mesh takes a twentieth of a second, the next one eight
     times as long.
     """
@@ -324,7 +324,7 @@ def test_a_mesh_that_would_take_too_long_is_not_begun(tmp_path):
     assert len(found.levels) <= 1
 
 
-def test_less_time_takes_nothing_away_that_more_time_has_told(tmp_path):
+def test_a_smaller_budget_keeps_earlier_results(tmp_path):
     name = "obstacle/dim=1/n=4/primal"
     known = meshes(tmp_path, name)
 
@@ -333,7 +333,7 @@ def test_less_time_takes_nothing_away_that_more_time_has_told(tmp_path):
     assert read_discretisation(tmp_path)["obstacle/dim=1/n=4"] == known[0]
 
 
-def test_what_was_told_of_other_parameters_or_meshes_does_not_stay(tmp_path):
+def test_results_for_other_parameters_or_meshes_are_removed(tmp_path):
     """A stored estimate with another value of an omitted parameter is discarded."""
     name = "obstacle/dim=1/n=4/primal"
     meshes(tmp_path, name)
@@ -344,7 +344,7 @@ def test_what_was_told_of_other_parameters_or_meshes_does_not_stay(tmp_path):
     assert meshes(tmp_path, name, budget=0.0)[0].error is None
 
 
-def test_a_reason_other_than_time_replaces_what_was_told(tmp_path):
+def test_a_reason_other_than_time_replaces_earlier_results(tmp_path):
     name = "obstacle/dim=1/n=4/primal"
     meshes(tmp_path, name)
     broken = {"obstacle": replace_build(PROBLEMS["obstacle"], OSError("no longer"))}
@@ -375,7 +375,7 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, text):
     assert "\n" not in str(e.value)
 
 
-def test_a_folder_without_the_file_says_nothing(tmp_path):
+def test_a_folder_without_the_file_yields_no_errors(tmp_path):
     assert read_discretisation(tmp_path) == {}
 
 
@@ -473,7 +473,7 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
     ) is is_arc
 
 
-def test_hexahedra_are_interpolated_trilinearly_whatever_their_numbering():
+def test_trilinear_interpolation_of_hexahedra_does_not_depend_on_numbering():
     """x + yz − xyz is trilinear on a box; the nodes of the fine mesh are renumbered."""
 
     def grid(divisions, order=slice(None)):

@@ -16,7 +16,7 @@ def test_a_disc_on_two_ranks_is_refused():
         DistributedDiscs.of(discs, np.array([0, 1, 2]), single_process())
 
 
-def test_no_split_of_a_disc_goes_unnoticed():
+def test_every_split_of_a_disc_is_detected():
     """For random owners of components, a rank refuses if and only if a disc
     is split.
     """

@@ -92,14 +92,14 @@ def test_positive_pivots_below_their_least_value_are_raised_to_it(length):
     assert L @ L.T == pytest.approx(np.diag([1.0, share, 2 * share]) * length**2)
 
 
-def test_where_nothing_cancels_the_factor_is_that_of_cholesky():
+def test_without_cancellation_the_factor_is_that_of_cholesky():
     L_0, M = parts(0.5)
     L = factor_above(np.asfortranarray(M), 0.5, np.asfortranarray(L_0))
     assert np.tril(L) == pytest.approx(np.linalg.cholesky(M), rel=1e-13)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_as_many_rows_are_kept_as_the_rank_that_fractions_tell(seed):
+def test_the_number_of_kept_rows_is_the_rank_in_exact_arithmetic(seed):
     rng = np.random.default_rng(seed)
     G = rng.integers(-2, 3, size=(rng.integers(4, 9), 12))
     mixed = rng.integers(-1, 2, size=(5, len(G))) @ G
@@ -226,14 +226,16 @@ def test_dependent_rows_of_one_rank_are_refused_on_all(where):
 @pytest.mark.parametrize(
     ("shared", "few"), [(0, True), (MAX_FILL, True), (MAX_FILL + 1, False)]
 )
-def test_few_rows_are_shared_where_their_dense_factor_is_the_lesser_work(shared, few):
+def test_few_rows_are_shared_if_their_dense_factor_costs_less(shared, few):
     """Without inner rows, s² entries are compared with MAX_FILL·s."""
     at = on_threads(2, lambda ranks: touched_rows(np.arange(shared), ranks).few_shared)
     assert at == [few, few]
 
 
 @pytest.mark.parametrize(("inner", "few"), [(6, True), (5, False)])
-def test_inner_rows_of_all_ranks_make_shared_ones_few(inner, few, monkeypatch):
+def test_inner_rows_of_all_ranks_reduce_the_number_of_shared_rows(
+    inner, few, monkeypatch
+):
     """For MAX_FILL = 8 and s = 12, s² = 144 ≤ 8 (12 + inner) requires six
     inner rows.
     """
@@ -246,7 +248,7 @@ def test_inner_rows_of_all_ranks_make_shared_ones_few(inner, few, monkeypatch):
     assert on_threads(2, work) == [few, few]
 
 
-def test_rows_know_how_many_ranks_touch_them():
+def test_rows_store_the_number_of_ranks_that_share_them():
     def work(ranks):
         own = np.array([[0, 2, 5, 7], [2, 3, 5, 9], [1, 5, 6, 8]])[ranks.rank]
         at = touched_rows(own, ranks)

@@ -59,7 +59,7 @@ def M():
     return dense
 
 
-def test_rows_are_transposed_chosen_and_normalised(M):
+def test_rows_are_transposed_selected_and_normalised(M):
     rows = CompressedRows(csr_array(M))
 
     def dense(part):
@@ -79,7 +79,7 @@ def test_rows_are_transposed_chosen_and_normalised(M):
         CompressedRows.of_transpose(csr_array(M))
 
 
-def test_outer_products_of_chosen_rows_are_summed(M):
+def test_outer_products_of_selected_rows_are_summed(M):
     rows, weights = CompressedRows(csr_array(M)), np.array([1.0, 0, 1, 0, 0, 2, 1])
     # the empty column has no new number
     place = np.array([2, 0, 1, -1, 3], dtype=np.int32)

@@ -42,7 +42,7 @@ def test_a_total_is_the_sum_in_the_order_of_the_ranks(count):
         assert reductions == 1
 
 
-def test_few_numbers_are_gathered_so_that_all_ranks_round_alike(monkeypatch):
+def test_short_arrays_are_gathered_with_equal_rounding_on_all_ranks(monkeypatch):
     """MPI may sum in any order, whereas gathered numbers are summed in a
     fixed order.
     """
@@ -120,7 +120,7 @@ def test_parts_of_the_time_do_not_overlap(ticking):
     assert ranks.counts == {"reductions": 0, "messages": 0, "bytes": 0}
 
 
-def test_waiting_for_others_is_noted_as_waiting(ticking):
+def test_waiting_for_other_ranks_is_recorded_as_waiting(ticking):
     class Slow:
         size, rank = 2, 0
 
@@ -201,7 +201,7 @@ def test_components_are_functions_of_slices_and_keep_their_ranks():
     assert all(on_threads(2, work))
 
 
-def test_what_is_neither_by_components_nor_a_reduction_is_refused():
+def test_functions_that_are_neither_elementwise_nor_reductions_are_refused():
     def work(ranks):
         v = distributed(np.arange(3.0), ranks)
         for ask in (

@@ -90,7 +90,7 @@ def test_the_digest_changes_with_everything_that_affects_times(quiet, path, valu
     assert digest(changed(quiet, path, value)) != digest(quiet)
 
 
-def test_the_digest_is_12_hex_digits_whatever_the_order_of_keys(quiet):
+def test_the_digest_has_12_hex_digits_and_ignores_the_order_of_keys(quiet):
     reordered = dict(reversed(quiet.items()))
     assert digest(reordered) == digest(quiet)
     assert re.fullmatch(r"[0-9a-f]{12}", digest(quiet))
@@ -196,7 +196,7 @@ def test_thread_variables_take_effect_in_the_captured_process():
         ([WHEEL], None),
     ],
 )
-def test_cholmods_blas_is_the_one_outside_the_wheels_of_others(mapped, name):
+def test_the_blas_of_cholmod_is_not_bundled_with_another_package(mapped, name):
     pools = [pool("libopenblas64_", "numpy") | {"version": "0.3.30"}]
     pools += [pool()] if name and name.startswith("OpenBLAS") else []
     assert system_blas(mapped, pools) == name
@@ -276,7 +276,7 @@ def test_values_that_cannot_be_read_are_unknown_without_a_warning(quiet):
     assert warnings(quiet) == []
 
 
-def test_the_blas_of_each_package_is_named_apart(quiet):
+def test_the_blas_of_each_package_is_listed_separately(quiet):
     pools = [
         pool("libscipy_openblas", "numpy") | {"version": "0.3.31"},
         pool("libmkl_rt", "scipy") | {"version": "2024.1"},
@@ -291,7 +291,7 @@ def test_the_blas_of_each_package_is_named_apart(quiet):
     assert blas["of CHOLMOD"].startswith("OpenBLAS 0.3.21 (pthreads), linked by")
 
 
-def test_a_package_without_a_blas_of_its_own_uses_the_systems(quiet):
+def test_a_package_without_a_bundled_blas_uses_the_blas_of_the_system(quiet):
     pools = [pool("libgomp"), pool()]
     checks = examine(changed(quiet, "threads.pools", pools), QUIET_NOISE)
 
@@ -320,7 +320,7 @@ def test_a_perfect_clock_shows_no_noise_between_equal_arms():
     assert (noise.kernel_seconds, noise.clock_seconds) == (1.0, 1.0)
 
 
-def test_a_steady_drift_hits_both_arms_alike():
+def test_a_steady_drift_affects_both_arms_equally():
     readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
     noise = noise_floor(30_000.0, clock=lambda: next(readings))
     assert noise.one_pair > 0.003  # error if all pairs had the same order
@@ -328,7 +328,7 @@ def test_a_steady_drift_hits_both_arms_alike():
 
 
 @pytest.mark.parametrize("amplitude", [0.05, 0.5])
-def test_the_interval_of_an_unsteady_clock_holds_the_true_ratio(amplitude):
+def test_the_interval_of_a_noisy_clock_contains_the_true_ratio(amplitude):
     rng = np.random.default_rng(271828)
     readings = (k + amplitude * rng.random() for k in count())
     noise = noise_floor(2000.0, clock=lambda: next(readings))
@@ -337,7 +337,7 @@ def test_the_interval_of_an_unsteady_clock_holds_the_true_ratio(amplitude):
     assert noise.high - noise.low < noise.one_pair
 
 
-def test_the_comparison_leaves_the_process_where_it_ran():
+def test_the_comparison_restores_the_cpu_affinity():
     usable = os.sched_getaffinity(0)
     noise = noise_floor(0.05)
     assert os.sched_getaffinity(0) == usable
@@ -366,7 +366,7 @@ def test_every_dependency_is_pinned():
     assert wanted <= {normal(pin.partition("==")[0]) for pin in read_pins()}
 
 
-def test_constraints_are_exact_pins_in_order_and_hold_no_address():
+def test_constraints_are_sorted_exact_pins_without_urls():
     pins = read_pins()
     for pin in pins:
         assert re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.!+]+", pin), pin

@@ -81,7 +81,7 @@ def test_a_file_is_replaced_whole_and_readable_by_all(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["file"]
 
 
-def test_where_the_disk_is_full_the_old_file_stays_and_nothing_beside_it(tmp_path):
+def test_on_a_full_disk_the_old_file_remains_without_temporary_files(tmp_path):
     path = tmp_path / "file"
     replace_file(path, b"old")
     with full(100), pytest.raises(OSError, match="File too large"):
@@ -91,7 +91,7 @@ def test_where_the_disk_is_full_the_old_file_stays_and_nothing_beside_it(tmp_pat
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_what_cannot_be_synced_does_not_replace(tmp_path, monkeypatch):
+def test_a_file_that_cannot_be_synced_replaces_nothing(tmp_path, monkeypatch):
     path = tmp_path / "file"
     replace_file(path, b"old")
 
@@ -115,7 +115,7 @@ def test_a_block_that_raises_replaces_nothing(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
+def test_a_partially_written_line_is_removed_at_once(lines):
     with lines() as file:
         file.append("a" * 50)
         with full(80), pytest.raises(OSError, match="File too large"):
@@ -126,7 +126,7 @@ def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):
     assert lines.path.read_text().split() == ["a" * 50, "c" * 50]
 
 
-def test_what_follows_the_last_newline_is_cut_off_however_long_it_is(lines):
+def test_text_after_the_last_newline_is_removed_at_any_length(lines):
     lines.path.parent.mkdir()
     for tail in (b"x", b"x" * 2**16, b"x" * 200_000, b""):
         for head in (b"", b"one\n", b"one\n" + b"y" * 2**16 + b"\n"):
@@ -137,9 +137,7 @@ def test_what_follows_the_last_newline_is_cut_off_however_long_it_is(lines):
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_a_file_of_lines_that_was_deleted_is_there_again_with_all_of_them(
-    lines, folder
-):
+def test_a_deleted_file_of_lines_is_restored_with_all_lines(lines, folder):
     with lines() as file:
         file.append("one")
         lines.path.unlink()
@@ -153,7 +151,7 @@ def test_a_file_of_lines_that_was_deleted_is_there_again_with_all_of_them(
     assert "deleted" in told
 
 
-def test_a_file_in_place_of_ours_keeps_its_lines_and_gets_those_it_lacks(lines):
+def test_a_replaced_file_keeps_its_lines_and_receives_missing_ones(lines):
     with lines() as file:
         file.append("one")
         file.append("two")
@@ -164,7 +162,7 @@ def test_a_file_in_place_of_ours_keeps_its_lines_and_gets_those_it_lacks(lines):
 
 
 @pytest.mark.parametrize("change", [b"", b"one\nforeign\n", b"two\n", b"one "])
-def test_a_file_that_another_program_writes_is_left_to_it_in_one_line(lines, change):
+def test_a_file_written_by_another_program_is_refused_in_one_line(lines, change):
     changed = pytest.raises(InputError, match="changed by another program")
     with changed, lines() as file:
         file.append("one")
@@ -176,7 +174,7 @@ def test_a_file_that_another_program_writes_is_left_to_it_in_one_line(lines, cha
     assert lines.path.read_bytes() == change
 
 
-def test_a_line_that_another_program_edits_after_the_last_of_ours_is_noticed(lines):
+def test_a_line_edited_by_another_program_is_detected(lines):
     changed = pytest.raises(InputError, match="changed by another program")
     with changed, lines() as file:
         file.append("one")
@@ -185,7 +183,7 @@ def test_a_line_that_another_program_edits_after_the_last_of_ours_is_noticed(lin
         os.utime(lines.path, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
-def test_a_file_of_lines_that_is_only_touched_or_linked_is_written_on(lines):
+def test_touching_or_linking_a_file_of_lines_does_not_stop_writing(lines):
     with lines() as file:
         file.append("one")
         lines.path.touch()
@@ -197,7 +195,7 @@ def test_a_file_of_lines_that_is_only_touched_or_linked_is_written_on(lines):
     assert lines.told == []
 
 
-def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
+def test_a_run_continues_from_lines_edited_before_its_start(lines):
     with lines() as file:
         file.append("one")
     lines.path.write_text("two\n")
@@ -207,7 +205,7 @@ def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
     assert lines.path.read_text().split() == ["two", "three"]
 
 
-def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
+def test_the_message_on_a_full_disk_names_the_disk_and_the_remedy(tmp_path):
     said = "free some space; the same command continues the run"
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         with pytest.raises(InputError) as e, report_full_disk(tmp_path / "none"):
@@ -221,7 +219,7 @@ def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
         raise OSError(errno.EIO, "else")
 
 
-def test_a_failure_is_the_disks_if_it_says_so_or_nothing_can_be_written(tmp_path):
+def test_a_failure_is_attributed_to_the_disk_if_it_is_full(tmp_path):
     refuse_full_disk(tmp_path, "something else")
     with pytest.raises(InputError, match="No space left on device"):
         refuse_full_disk(tmp_path, f"exit code 1: {os.strerror(errno.ENOSPC)}: 'x'")
@@ -232,7 +230,7 @@ def test_a_failure_is_the_disks_if_it_says_so_or_nothing_can_be_written(tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_writers_left_unfinished_goes_and_nothing_else(tmp_path):
+def test_only_unfinished_files_of_writers_are_removed(tmp_path):
     own = [tmp_path / name for name in ("vectors", "cases", "report/tables", "none")]
     for folder in own[:3]:
         folder.mkdir(parents=True)
@@ -249,7 +247,7 @@ def test_what_writers_left_unfinished_goes_and_nothing_else(tmp_path):
     assert sorted(str(p.relative_to(tmp_path)) for p in files) == sorted(others)
 
 
-def test_a_folder_is_held_although_its_lock_is_deleted(tmp_path):
+def test_a_folder_stays_locked_if_its_lock_file_is_deleted(tmp_path):
     lock = FolderLock(tmp_path)
     (tmp_path / ".lock").unlink()
 
@@ -260,7 +258,7 @@ def test_a_folder_is_held_although_its_lock_is_deleted(tmp_path):
     FolderLock(tmp_path).close()
 
 
-def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_path):
+def test_a_folder_locked_by_another_run_after_deletion_of_the_lock_is_refused(tmp_path):
     lock = FolderLock(tmp_path)
     (tmp_path / ".lock").unlink()
     other = FolderLock(tmp_path)
@@ -272,7 +270,7 @@ def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_pa
     other.close()
 
 
-def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
+def test_a_run_killed_at_its_start_leaves_a_recognised_folder(tmp_path):
     FolderLock(tmp_path).close()
     (tmp_path / "suite.toml").write_text("")  # environment.json is missing
     refuse_foreign(tmp_path)
@@ -282,7 +280,7 @@ def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
         refuse_foreign(tmp_path)
 
 
-def test_of_faults_the_last_of_each_measurement_that_is_missing_counts(tmp_path):
+def test_the_last_fault_of_each_missing_measurement_counts(tmp_path):
     every = [fault("a", what="x"), fault("b"), fault("a", what="y"), fault("c")]
     with Lines(tmp_path / FAULTS, print) as file:
         for one in every:
@@ -352,7 +350,9 @@ def cli(capsys, monkeypatch, tmp_path):
     return cli
 
 
-def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_path):
+def test_a_run_and_its_report_state_measurements_prevented_by_faults(
+    cli, monkeypatch, tmp_path
+):
     def measured(worker, qp, record, request, **limits):
         if record.solver == "near":
             raise FaultError("the worker could not be started")
@@ -377,7 +377,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
     assert told not in (tmp_path / "d" / "said").read_text()
 
 
-def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
+def test_a_terminated_run_says_so_and_exits_with_143(cli, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
 
     def measured(*_, **__):
@@ -395,7 +395,7 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".parquet", ".qps"])
 @pytest.mark.parametrize("before", [None, b"of an earlier export"])
-def test_an_export_that_is_asked_to_end_while_it_writes_leaves_no_part(
+def test_a_terminated_export_leaves_no_partial_file(
     monkeypatch, tmp_path, suffix, before
 ):
     """The signal arrives when all bytes are written, but the file is not

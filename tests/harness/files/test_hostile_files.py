@@ -103,14 +103,14 @@ def test_an_operator_in_a_file_is_refused_and_nothing_runs(tmp_path, command, ma
 
 
 @pytest.mark.parametrize("maker", MAKERS)
-def test_even_a_file_of_our_own_names_nothing_but_what_is_in_the_table(tmp_path, maker):
+def test_a_file_can_name_only_functions_in_the_table(tmp_path, maker):
     hostile(tmp_path / "a.npz", maker)
 
     with pytest.raises(InputError, match=r"P is the operator .*; known: ours"):
         load_qp(tmp_path / "a.npz", operators={"ours": None})
 
 
-def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
+def test_the_worker_runs_no_function_named_by_an_untrusted_file(tmp_path):
     """A request without a digest may refer to a file of any origin."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
@@ -134,7 +134,7 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     "suffix", ["", ".npz", ".mat", ".parquet", ".qps", ".msh", ".inp", ".med"]
 )
 @pytest.mark.parametrize("kind", ["zero", "pipe", "folder", "link to zero"])
-def test_what_is_no_regular_file_is_refused_at_once(tmp_path, kind, suffix):
+def test_a_file_that_is_not_regular_is_refused_at_once(tmp_path, kind, suffix):
     path = tmp_path / f"a{suffix}"
     match kind:
         case "pipe":
@@ -368,7 +368,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("K, B, fixed and q are inc", {"fixed": np.array([9]), **ONE_BY_ONE}),
     ],
 )  # fmt: skip
-def test_numbers_that_make_no_qp_are_named(tmp_path, cheaply, write, message):
+def test_numbers_that_define_no_qp_are_named(tmp_path, cheaply, write, message):
     write(tmp_path / "a.npz")
 
     with pytest.raises(InputError, match=message) as caught:
@@ -579,7 +579,7 @@ def test_nodes_below_one_are_refused_in_format_4_too(tmp_path, node):
         read_msh(tmp_path / "a.msh")
 
 
-def test_the_mesh_that_these_are_made_of_is_read(tmp_path):
+def test_the_undamaged_mesh_is_read(tmp_path):
     (tmp_path / "a.msh").write_bytes(msh_22())
 
     assert len(read_msh(tmp_path / "a.msh").cells) == 2
@@ -597,7 +597,7 @@ def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_of_a_thousand_damaged_files_none_raises_or_hangs(tmp_path, kind):
+def test_none_of_a_thousand_damaged_files_causes_a_crash_or_hang(tmp_path, kind):
     survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
 
     assert 0 < survived < 500  # some files survive the damage, others do not

@@ -20,7 +20,7 @@ ARRAYS = {
 }
 
 
-def test_numpy_reads_what_is_written_and_mapping_gives_the_same(tmp_path):
+def test_numpy_reads_written_files_and_mapping_yields_equal_arrays(tmp_path):
     file = tmp_path / "a.npz"
     write_mappable(file, ARRAYS)
     views = mapped(file)
@@ -94,14 +94,14 @@ def test_an_operator_travels_as_arrays_and_is_the_same_operator(operator_qp, tmp
     assert not qp.is_explicit
 
 
-def test_for_other_peoples_solvers_it_is_multiplied_out(operator_qp, tmp_path):
+def test_an_exported_operator_is_written_as_a_matrix(operator_qp, tmp_path):
     save_qp(tmp_path / "qp.npz", operator_qp, {})
     qp, _ = load_qp(tmp_path / "qp.npz")
 
     np.testing.assert_array_equal(csr_array(qp.P).toarray(), np.diag([1.0, 2.0]))
 
 
-def test_putting_an_operator_together_is_charged_to_every_prepare(operator_qp):
+def test_building_an_operator_counts_in_every_preparation(operator_qp):
     built_before_prepare = []
 
     class Looks:

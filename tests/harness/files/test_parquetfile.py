@@ -77,7 +77,7 @@ def test_matrices_come_back_sparse_or_dense_as_they_were(path):
     np.testing.assert_array_equal(qp.ub, np.full(3, np.inf))
 
 
-def test_a_problem_that_somebody_else_wrote_is_dense(path):
+def test_a_problem_written_by_other_software_is_dense(path):
     """A file of pandas has flattened matrices, None for absent data, and no
     metadata.
     """
@@ -94,7 +94,7 @@ def test_a_problem_that_somebody_else_wrote_is_dense(path):
     np.testing.assert_array_equal(qp.lb, np.full(3, -np.inf))
 
 
-def test_a_matrix_too_large_for_a_dense_format_is_refused_before_it_is_made(path):
+def test_a_matrix_too_large_for_a_dense_format_is_refused_before_allocation(path):
     n = 20_000
     large = QP(
         P=eye_array(n, format="csc"), q=np.ones(n), A=no_rows(n), b=np.zeros(0),
@@ -125,7 +125,7 @@ def columns(**changes):
         ({"P": 3.0}, "P is not a list of numbers"),
     ],
 )
-def test_what_is_no_problem_is_refused_in_one_line(path, changes, message):
+def test_a_file_without_a_problem_is_refused_in_one_line(path, changes, message):
     pq.write_table(pa.table(columns(**changes)), path)
     with pytest.raises(InputError, match=message) as caught:
         load_parquet(path)
@@ -134,14 +134,14 @@ def test_what_is_no_problem_is_refused_in_one_line(path, changes, message):
 
 
 @pytest.mark.parametrize("rows", [0, 2])
-def test_a_set_of_several_problems_is_no_problem(path, rows):
+def test_a_set_of_several_problems_is_refused(path, rows):
     one = pa.table(columns())
     pq.write_table(pa.concat_tables([one] * rows) if rows else one.slice(0, 0), path)
     with pytest.raises(InputError, match=f"contains {rows} problems; expected one row"):
         load_parquet(path)
 
 
-def test_files_that_are_none_are_refused(path, tmp_path):
+def test_invalid_and_missing_files_are_refused(path, tmp_path):
     path.write_bytes(b"PAR1 this is none")
     with pytest.raises(InputError, match="malformed; expected a Parquet file"):
         load_parquet(path)

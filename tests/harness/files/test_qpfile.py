@@ -36,7 +36,7 @@ def saved(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [csr_array, csc_array, np.asarray, aslinearoperator])
-def test_a_qp_comes_back_whatever_holds_its_matrix(tmp_path, kind):
+def test_a_qp_survives_the_round_trip_in_every_storage(tmp_path, kind):
     qp = make_qp(kind(P))
     save_qp(tmp_path / "qp.npz", qp, {"name": "three"})
     loaded, meta = load_qp(tmp_path / "qp.npz")
@@ -63,7 +63,7 @@ def test_dense_matrices_come_back_dense_and_sparse_ones_as_csc(tmp_path, kind, d
     assert isinstance(loaded.G, csc_array)
 
 
-def test_the_file_is_what_the_interface_promises(saved):
+def test_the_file_has_the_promised_format(saved):
     with np.load(saved(), allow_pickle=False) as stored:
         parts = {f"{M}_{part}" for M in "PGA" for part in
                  ("data", "indices", "indptr", "shape")}  # fmt: skip
@@ -100,7 +100,7 @@ def test_a_file_name_is_taken_as_it_is(tmp_path):
         ({"P_data": np.array([2.0, np.nan, 1, 3])}, "P_data contains NaN or inf"),
     ],
 )
-def test_a_malformed_file_is_named_with_what_is_wrong(saved, changes, complaint):
+def test_a_malformed_file_is_named_with_the_error(saved, changes, complaint):
     path = saved(**changes)
 
     with pytest.raises(InputError, match=complaint) as caught:
@@ -148,14 +148,14 @@ def test_plain_arrays_are_a_qp(tmp_path):
         np.testing.assert_array_equal(getattr(qp, name), array)
 
 
-def test_of_plain_arrays_those_of_a_cost_alone_are_enough(tmp_path):
+def test_arrays_of_the_objective_alone_define_a_qp(tmp_path):
     np.savez_compressed(tmp_path / "a.npz", P=np.eye(3), q=np.zeros((3, 1)))
     qp, _ = load_qp(tmp_path / "a.npz")
 
     assert qp.sizes == {"variables": 3, "equalities": 0, "inequalities": 0, "bounds": 0}
 
 
-def test_a_sparse_matrix_may_be_given_by_its_parts(tmp_path):
+def test_a_sparse_matrix_may_be_passed_as_its_arrays(tmp_path):
     M = csr_array(np.array([[2.0, 1.0], [1.0, 2.0]])).tocsc()
     parts = {f"P_{part}": getattr(M, part) for part in ("data", "indices", "indptr")}
     np.savez(tmp_path / "a.npz", **plain(P=None, P_shape=M.shape, **parts))
@@ -185,7 +185,7 @@ def test_a_sparse_matrix_may_be_given_by_its_parts(tmp_path):
         ({"lb": [2.0, 0.0]}, "QP bounds cross"),
     ],
 )
-def test_plain_arrays_that_are_no_qp_are_refused(tmp_path, changes, complaint):
+def test_plain_arrays_that_do_not_define_a_qp_are_refused(tmp_path, changes, complaint):
     np.savez(tmp_path / "a.npz", **plain(**changes))
 
     with pytest.raises(InputError) as e:

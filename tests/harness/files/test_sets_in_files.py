@@ -61,7 +61,7 @@ def test_sizes_count_the_blocks_of_every_kind():
     assert "discs" not in qp_over().sizes
 
 
-def test_digests_tell_sets_apart():
+def test_digests_distinguish_sets():
     """A different radius, block, class or order defines a different problem."""
     discs, cones = mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]), mb.Cones([[0, 5]], [0.5])
     one = qp_digest(qp_over(discs, cones))
@@ -156,10 +156,8 @@ def test_mat_and_parquet_with_broken_sets_are_refused(tmp_path):
             mb.build(f"file:{path}")
 
 
-def test_qps_holds_no_sets(tmp_path):
-    with pytest.raises(
-        mb.InputError, match="QPS has no sets of the kind Discs; expect"
-    ):
+def test_qps_files_cannot_store_sets(tmp_path):
+    with pytest.raises(mb.InputError, match="QPS cannot store Discs; expect"):
         mb.export(qp_over(*SETS["discs"]), tmp_path / "qp.qps")
     assert not [*tmp_path.iterdir()]
 

@@ -80,13 +80,13 @@ def test_a_deformed_state_comes_back_with_its_nodal_fields(tmp_path, fields):
     np.testing.assert_array_equal(loaded.displacement, fields.displacement)
 
 
-def test_what_a_nodal_field_is_called_is_part_of_the_digest(tmp_path, fields):
+def test_the_name_of_a_nodal_field_is_part_of_the_digest(tmp_path, fields):
     renamed = replace(fields, nodal={"pressure": fields.nodal["von_mises"]})
 
     assert save_fields(tmp_path, renamed) != save_fields(tmp_path, fields)
 
 
-def test_contact_forces_come_back_where_there_are_any(tmp_path, fields):
+def test_contact_forces_are_restored_if_present(tmp_path, fields):
     with_contact = Fields(
         points=fields.points, cells=fields.cells, bodies=fields.bodies,
         displacement=fields.displacement, contact_nodes=np.array([3]),
@@ -115,7 +115,7 @@ def test_a_missing_or_damaged_file_is_named(tmp_path, solution):
         load_solution(tmp_path, "0000", Status.SOLVED)
 
 
-def test_a_point_is_stored_where_its_folder_was_deleted(tmp_path, solution):
+def test_a_point_is_stored_if_its_folder_was_deleted(tmp_path, solution):
     save_solution(tmp_path, solution)
     shutil.rmtree(tmp_path / "vectors")
     digest = save_solution(tmp_path, solution)

@@ -178,7 +178,7 @@ def bench(tmp_path, watched):
     "solver",
     [a if a in QUICK else pytest.param(a, marks=pytest.mark.slow) for a in OUTCOMES],
 )
-def test_an_accident_costs_its_own_verdict_and_leaves_no_process(
+def test_a_failure_affects_only_its_own_verdict_and_leaves_no_process(
     beside_a_witness, solver
 ):
     verdict, message = OUTCOMES[solver]
@@ -229,7 +229,7 @@ def test_a_time_is_accepted_within_the_bounds_of_the_parent(
         b"{" * 1000, b'{"event": "start"}',
     ],
 )  # fmt: skip
-def test_a_line_that_is_no_reply_to_the_request_is_refused(line):
+def test_a_line_other_than_a_reply_to_the_request_is_refused(line):
     assert event_of(b'{"event": "done"}', "done")
     with pytest.raises(ForeignReplyError) as e:
         event_of(line, "done")
@@ -276,18 +276,18 @@ def check_neighbours(tmp_path, watched, careless):
     assert processes_of(watched) == []
 
 
-def test_neighbours_of_careless_solvers_keep_their_measurements_and_are_alone(
+def test_measurements_beside_misbehaving_solvers_are_kept_and_undisturbed(
     tmp_path, watched
 ):
     check_neighbours(tmp_path, watched, RUN_TOGETHER)
 
 
 @pytest.mark.slow
-def test_neighbours_of_all_careless_solvers_together_are_alone(tmp_path, watched):
+def test_measurements_beside_all_misbehaving_solvers_are_undisturbed(tmp_path, watched):
     check_neighbours(tmp_path, watched, OUTCOMES)
 
 
-def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
+def test_sleeping_threads_may_stay_and_busy_threads_may_not(bench):
     bench("pools")
     pool = bench.process("pools")
     bench("pools")
@@ -326,7 +326,7 @@ def test_a_worker_that_is_killed_before_its_solve_is_a_fault(bench):
         bench("honest", command=command)
 
 
-def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
+def test_a_worker_killed_in_the_warm_up_is_replaced_without_a_loss(
     bench, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("KILLED", str(tmp_path / "killed"))
@@ -356,7 +356,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
         bench("honest", command=["no-such-python"])
 
 
-def test_a_plug_in_that_dies_in_its_import_fails_alone(bench):
+def test_a_plug_in_that_crashes_on_import_affects_no_other_solver(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
     assert record.verdict is Verdict.CRASHED
@@ -436,7 +436,9 @@ def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, watched):
     assert soon(lambda: processes_of(watched) == [])
 
 
-def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatch):
+def test_scratch_folders_of_killed_processes_are_removed_at_the_next_start(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     stale = tmp_path / "mortarbench-scratch-1"
     stale.mkdir()
@@ -448,7 +450,9 @@ def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == []
 
 
-def test_scratch_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+def test_a_scratch_folder_deleted_before_its_lock_is_created_again(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     gone = []
 

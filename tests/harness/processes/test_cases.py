@@ -30,7 +30,7 @@ def get(tmp_path):
     return get
 
 
-def test_a_case_is_built_once_and_found_again(get):
+def test_a_case_is_built_once_and_reused(get):
     first, second = get(name(n=1)), get(name(n=1))
 
     assert first == second
@@ -39,7 +39,7 @@ def test_a_case_is_built_once_and_found_again(get):
     assert len(get.made) == 1
 
 
-def test_other_params_and_other_code_are_other_cases_of_maybe_equal_content(get):
+def test_different_params_or_code_are_stored_as_different_cases(get):
     entries = [get(name(n=1)), get(name(n=2)), get(name(n=1), environment="there")]
 
     assert len(get.made) == 3

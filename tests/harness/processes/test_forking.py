@@ -132,7 +132,7 @@ def results(folder):
     return json.loads(done.stdout)
 
 
-def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
+def test_a_fork_has_the_state_of_a_started_worker_and_none_of_its_parent(
     results, folder
 ):
     (_, _, first), (_, _, second) = results["tell"]
@@ -150,7 +150,7 @@ def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
     assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")
 
 
-def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
+def test_a_fork_runs_no_remaining_code_of_its_parent(results, folder):
     assert results["tell"]
     assert (folder / "held").read_text() == ""
 

@@ -138,7 +138,7 @@ def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured, stage):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", MEASURING + EVALUATING)
-def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
+def test_a_hanging_rank_is_killed_in_every_stage(measured, stage):
     record = measured(stage, "hangs")
 
     assert record.verdict == "time_limit"
@@ -150,7 +150,7 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 @pytest.mark.parametrize(
     ("stage", "rank"), list(product(MEASURING + EVALUATING, ["0", "1"]))
 )
-def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage, rank):
+def test_an_exception_on_one_rank_does_not_leave_others_waiting(measured, stage, rank):
     record = measured(stage, "raises", rank=rank)
 
     if rank == "0" and stage in ("prepare", "solve"):  # the solver on rank 0
@@ -174,7 +174,7 @@ def test_a_case_that_ranks_cannot_emit_fails_with_the_reason(measured, rank):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rank", ["1", "all"])
-def test_an_answer_that_ranks_cannot_judge_is_judged_by_one_process(measured, rank):
+def test_an_answer_that_ranks_cannot_verify_is_verified_by_one_process(measured, rank):
     record = measured("residuals", "raises-after", rank=rank)
 
     assert record.verdict == "verified"
@@ -184,7 +184,7 @@ def test_an_answer_that_ranks_cannot_judge_is_judged_by_one_process(measured, ra
 
 
 @pytest.mark.slow
-def test_quantities_that_fail_on_all_ranks_cost_neither_verdict_nor_bound(measured):
+def test_failing_quantities_affect_neither_verdict_nor_bound(measured):
     record = measured("quantities", "raises-after", rank="all")
 
     assert record.verdict == "verified"

@@ -98,7 +98,7 @@ def answers():
     return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
 
 
-def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
+def test_a_solve_on_ranks_is_verified_and_certified(answers):
     first, _, alone = answers
     assert first.verdict == "verified"
     assert first.energy_bound <= 1e-6
@@ -385,7 +385,7 @@ def test_wrong_ranks_of_a_suite_are_refused(tmp_path, line, message):
         mb.run(suite, out=tmp_path / "out")
 
 
-def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
+def test_a_suite_without_a_solver_for_ranks_is_refused(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace('["smalbe", "clarabel"]', '["clarabel"]'))
 

@@ -112,7 +112,7 @@ def test_one_process_serves_every_measurement_on_one_cpu_with_one_thread(
     assert not running(first["pid"])
 
 
-def test_a_worker_that_dies_is_replaced_and_its_last_words_are_kept(ask):
+def test_a_crashed_worker_is_replaced_and_its_last_output_is_kept(ask):
     first, second = ask("dies"), ask("dies")
 
     assert (first.verdict, first.message) == (
@@ -121,14 +121,14 @@ def test_a_worker_that_dies_is_replaced_and_its_last_words_are_kept(ask):
     assert (second.verdict, second.message) == (first.verdict, first.message)
 
 
-def test_a_death_between_measurements_is_not_blamed_on_the_next_one(ask):
+def test_a_crash_between_measurements_is_not_attributed_to_the_next_one(ask):
     first = ask("dieslater")
     assert soon(lambda: not running(first.answer["counts"]["process"]))
 
     assert ask("dieslater").answer["claimed"] == "solved"
 
 
-def test_a_signal_is_called_by_its_name(ask):
+def test_a_signal_is_reported_by_name(ask):
     reply = ask("segfaults")
 
     assert (reply.verdict, reply.message) == (Verdict.CRASHED, "SIGSEGV")
@@ -193,7 +193,7 @@ def test_a_qp_that_a_solver_changed_is_intact_in_the_next_measurement(ask, tmp_p
     assert answers[0] == answers[1]
 
 
-def test_a_worker_that_cannot_start_says_why(ask):
+def test_a_worker_that_cannot_start_states_the_reason(ask):
     start = [sys.executable, "-c", "raise SystemExit('no such plug-in')"]
     reply = ask("absent", start=start)
 
@@ -268,7 +268,7 @@ def test_lack_of_memory_is_recognised_by_the_peak_and_by_the_message(
     assert out_of_memory(message, peak, 100.0) is expected
 
 
-def test_replies_that_come_together_are_not_waited_for(tmp_path, monkeypatch):
+def test_replies_that_arrive_together_are_read_without_waiting(tmp_path, monkeypatch):
     both = SHOWS.replace('    reply(event="start")\n', "").replace(
         "    reply(\n        event=\"done\",",
         '    both = ""\n'

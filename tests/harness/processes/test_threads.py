@@ -111,7 +111,7 @@ def test_threads_that_build_solve_and_run_at_the_same_time_take_turns(tmp_path):
 
 
 @pytest.mark.slow
-def test_four_hundred_solves_of_eight_threads_are_right_and_leave_nothing(tmp_path):
+def test_four_hundred_solves_in_eight_threads_are_correct_and_leave_no_files(tmp_path):
     found = of_threads(tmp_path, 8, 50, "solve")
     assert_all_right(found, 400)
 
@@ -123,7 +123,7 @@ def worker(tmp_path):
     worker.close()
 
 
-def test_threads_that_share_a_worker_or_close_it_get_an_answer_each(worker):
+def test_threads_that_share_or_close_a_worker_receive_one_answer_each(worker):
     answers = []
 
     def ask():
@@ -179,7 +179,7 @@ def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
             process.kill()
 
 
-def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
+def test_a_worker_reaped_by_other_code_is_replaced(worker):
     first = worker.ask({}, **LIMITS).answer["pid"]
     os.kill(first, signal.SIGKILL)
     with suppress(ChildProcessError):
@@ -233,7 +233,7 @@ def test_a_fork_does_not_wait_for_a_thread_of_its_parent():
         *(pytest.param(c, marks=pytest.mark.slow) for c in ("<&-", ">&-", "2>&-")),
     ],
 )
-def test_closed_standard_streams_cost_no_answer(tmp_path, closed):
+def test_closed_standard_streams_do_not_affect_answers(tmp_path, closed):
     solve = f"{sys.executable} -m mortarbench solve {CASE} --solver smalbe {closed}"
     library = (
         "import mortarbench as mb; from pathlib import Path; "
@@ -254,7 +254,7 @@ def env(tmp_path):
     ("number", "code"),
     [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)],
 )
-def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, code):
+def test_a_terminated_solve_cleans_up_and_says_so(tmp_path, number, code):
     plugin = tmp_path / "hangs.py"
     plugin.write_text(HANGS)
     solve = subprocess.Popen(
@@ -299,7 +299,7 @@ SOLVERS = {"hangs": Hangs()}
 """
 
 
-def test_a_signal_that_is_ignored_stays_so(tmp_path):
+def test_an_ignored_signal_stays_ignored(tmp_path):
     """Test SIGHUP, which nohup ignores."""
     script = (
         "import os, signal; from mortarbench.harness.processes.termination import *\n"
@@ -313,7 +313,7 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
     assert (done.returncode, done.stdout) == (143, b"goes on\n")
 
 
-def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
+def test_a_terminated_export_says_so_and_leaves_no_file(tmp_path):
     """The signal arrives while the case is built."""
     plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
     plugin.write_text(SLOW)

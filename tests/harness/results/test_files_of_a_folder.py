@@ -177,14 +177,14 @@ def try_commands(folder_of_run, tmp_path, name, kind, read):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_faults_of_any_kind_are_read_or_refused_by_every_command(
+def test_faults_of_any_type_are_read_or_refused_by_every_command(
     folder_of_run, tmp_path, kind, read_by_every_command
 ):
     try_commands(folder_of_run, tmp_path, FAULTS, kind, read_by_every_command)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_copies_of_files_are_read_or_refused_where_the_original_is_missing(
+def test_copies_of_files_are_read_or_refused_if_the_original_is_missing(
     folder_of_run, tmp_path, kind, read_by_every_command
 ):
     original = folder_of_run.with_name("qp.npz")

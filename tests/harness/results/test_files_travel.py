@@ -81,7 +81,7 @@ def test_each_content_is_copied_under_its_digest(measured, here, copy):
     assert copy.read_bytes() == (measured / "qps" / "qp.npz").read_bytes()
 
 
-def test_a_folder_that_was_sent_validates_replays_and_reports(here, svg_only):
+def test_a_copied_folder_can_be_validated_replayed_and_reported(here, svg_only):
     (record,) = read_journal(here / "run")
 
     found = mb.validate("run", budget=0)
@@ -98,7 +98,7 @@ def test_a_folder_that_was_sent_validates_replays_and_reports(here, svg_only):
     assert report.files
 
 
-def test_a_folder_that_was_sent_is_continued(here):
+def test_a_run_in_a_copied_folder_continues(here):
     results = mb.run("run/suite.toml", out="run", repeats=2)
 
     assert [r.verdict.value for r in results.records] == ["verified"] * 2
@@ -108,7 +108,7 @@ def test_a_folder_that_was_sent_is_continued(here):
     assert not results.shortfall
 
 
-def test_a_pattern_still_stands_for_files_that_were_there(tmp_path, monkeypatch):
+def test_a_pattern_matches_files_that_no_longer_exist(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, bound in (("a", 0.25), ("b", 0.5)):
         write_qp(tmp_path / "qps" / f"{name}.npz", bound)
@@ -137,7 +137,7 @@ def test_a_path_from_the_folder_of_the_suite_is_found_again(tmp_path, monkeypatc
     assert [r.case for r in after.records] == ["file:../suites/qp.npz"] * 2
 
 
-def test_the_copy_is_used_where_the_original_has_another_content(here):
+def test_the_copy_is_used_if_the_original_has_changed(here):
     (record,) = read_journal(here / "run")
     write_qp(here / "qps" / "qp.npz", 0.75)
 
@@ -181,7 +181,7 @@ def test_an_exchanged_copy_is_refused_in_one_line(here, copy, cli):
     assert not (here / "merged").exists()
 
 
-def test_a_file_that_is_nowhere_is_named_with_its_digest(here, copy, cli):
+def test_a_missing_file_is_named_with_its_digest(here, copy, cli):
     right = digest(copy)
     copy.unlink()
 
@@ -195,7 +195,7 @@ def test_a_file_that_is_nowhere_is_named_with_its_digest(here, copy, cli):
         ) in last
 
 
-def test_a_file_that_is_put_back_is_taken(measured, here, copy):
+def test_a_restored_file_is_used(measured, here, copy):
     copy.unlink()
     shutil.copytree(measured / "qps", here / "qps")
 
@@ -204,7 +204,7 @@ def test_a_file_that_is_put_back_is_taken(measured, here, copy):
     assert copy.exists()  # the file is copied again
 
 
-def test_a_damaged_copy_is_replaced_where_the_original_is_here(measured, here, copy):
+def test_a_damaged_copy_is_replaced_if_the_original_exists(measured, here, copy):
     right = copy.read_bytes()
     copy.write_bytes(b"damaged")
     shutil.copytree(measured / "qps", here / "qps")
@@ -289,7 +289,7 @@ def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
 
 
 @pytest.mark.parametrize("digits", ["../../secret", "a/b", "", "0" * 64])
-def test_a_digest_of_a_journal_leads_nowhere(here, digits):
+def test_a_digest_in_a_journal_cannot_lead_out_of_the_folder(here, digits):
     (here / "secret.npz").write_bytes(b"secret")
     source = SourceFile(path="qps/qp.npz", sha256=digits, suffix=".npz")
 
@@ -337,7 +337,7 @@ def test_fresh_deletes_copies_and_nothing_else_in_their_folder(measured, here, c
     assert (here / "run" / "files" / "of-the-user.mat").read_text() == "mine"
 
 
-def test_fresh_does_not_delete_what_it_is_to_measure(here, copy, cli):
+def test_fresh_does_not_delete_the_files_to_be_measured(here, copy, cli):
     (here / "s.toml").write_text(SUITE.format(f'"{copy.relative_to(here)}"'))
 
     code, _, said = cli("run", "s.toml", "--out", "run", "--fresh")

@@ -103,7 +103,7 @@ def test_the_message_on_a_damaged_line_contains_the_remedy(tmp_path, bad):
 
 
 @pytest.mark.parametrize("bad", ["nonsense", '{"schema": 99}', '{"schema": 1}', ""])
-def test_a_bad_line_that_is_whole_is_named(tmp_path, bad):
+def test_a_complete_invalid_line_is_named(tmp_path, bad):
     with Journal(tmp_path, "here") as journal:
         journal.append(record("a"))
     file = tmp_path / "journal" / "here.jsonl"
@@ -139,7 +139,7 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
     assert str(e.value) == (f"{file}, line 2: {field} = {value!r}; expected {expected}")
 
 
-def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
+def test_a_line_of_the_first_schema_is_read_with_its_meaning(tmp_path):
     """Its residuals have other scales; residuals and verdict are kept."""
     row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
     for name in ("decided_by", "optimum_error"):
@@ -156,7 +156,7 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
     assert json.loads(old.to_json())["schema"] == 1
 
 
-def test_a_measurement_has_the_name_that_older_folders_give_it():
+def test_a_measurement_has_the_same_name_as_in_older_folders():
     """With another run_id, a continued run would repeat all measurements."""
     box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(

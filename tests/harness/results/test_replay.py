@@ -96,7 +96,7 @@ def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, sol
     assert told["environment"] == []
 
 
-def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
+def test_the_point_and_the_times_are_compared_with_the_stored_ones(cli, stored):
     then = [stored["half", 1, repeat] for repeat in (0, 1)]
     told = json.loads(cli("replay", "done", then[0].run_id, "--json")[1])
     ratio, least, greatest = told["ratios"]["solve_seconds"]
@@ -120,7 +120,7 @@ def test_the_ratio_of_times_names_its_times(cli, stored):
     assert float(ratio) == pytest.approx(now / np.mean(times), rel=1e-2, abs=6e-3)
 
 
-def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):
+def test_a_replay_does_not_change_the_folder(cli, stored, tmp_path):
     def content():
         files = (f for f in (tmp_path / "done").rglob("*") if f.is_file())
         return {f: f.read_bytes() for f in files}
@@ -183,7 +183,9 @@ sequence = "depth"
 
 
 @pytest.mark.parametrize("solver", ["exact (A/A)", "liar"])
-def test_a_step_of_a_sequence_is_made_again_after_those_before(cli, tmp_path, solver):
+def test_a_step_of_a_sequence_is_repeated_after_the_earlier_steps(
+    cli, tmp_path, solver
+):
     (tmp_path / "steps.toml").write_text(SEQUENCE)
     assert cli("run", "steps.toml", "--out", "done")[0] == 0
     records = [r for r in read_journal(tmp_path / "done") if r.solver == solver]
@@ -221,7 +223,7 @@ def test_the_first_digits_of_a_run_id_suffice(cli, stored):
     assert then in cli("replay", "done", short)[1]
 
 
-def test_an_unknown_run_id_is_one_line_with_the_nearest(cli, stored):
+def test_an_unknown_run_id_is_reported_with_the_most_similar_one(cli, stored):
     then = stored["exact", 1, 0].run_id
     other = "x" + then[1:]
     code, out, err = cli("replay", "done", other)
@@ -232,13 +234,13 @@ def test_an_unknown_run_id_is_one_line_with_the_nearest(cli, stored):
 
 
 @pytest.mark.parametrize("run_id", ["", "g"])
-def test_digits_that_name_none_or_many_are_refused(cli, stored, run_id):
+def test_ambiguous_or_unknown_digits_are_refused(cli, stored, run_id):
     code, _, err = cli("replay", "done", run_id)
 
     assert (code, err.count("\n")) == (2, 1)
 
 
-def test_a_folder_without_a_journal_is_one_line(cli):
+def test_a_folder_without_a_journal_is_reported_in_one_line(cli):
     code, _, err = cli("replay", "nowhere", "0123")
 
     assert (code, err.count("\n")) == (2, 1)
@@ -246,7 +248,9 @@ def test_a_folder_without_a_journal_is_one_line(cli):
 
 
 @pytest.mark.parametrize("missing", ["suite.toml", "environment.json"])
-def test_a_stored_run_that_lost_a_file_is_one_line(cli, stored, tmp_path, missing):
+def test_a_missing_file_of_a_stored_run_is_reported_in_one_line(
+    cli, stored, tmp_path, missing
+):
     (tmp_path / "done" / missing).unlink()
     code, _, err = cli("replay", "done", stored["exact", 1, 0].run_id)
 
@@ -255,7 +259,7 @@ def test_a_stored_run_that_lost_a_file_is_one_line(cli, stored, tmp_path, missin
 
 
 @pytest.mark.parametrize("lost", [{"solvers": {}}, {"families": {}}])
-def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
+def test_a_missing_plug_in_is_requested(cli, registries, tmp_path, lost):
     (tmp_path / "toy.toml").write_text(SUITE)
     (tmp_path / "empty.py").write_text("SOLVERS = {}\n")
     little = ("--solver", "exact", "--repeats", "1")
@@ -268,7 +272,7 @@ def test_a_plug_in_that_is_needed_is_asked_for(cli, registries, tmp_path, lost):
     assert "--plugin empty.py" in err
 
 
-def test_a_case_whose_file_has_changed_is_that_of_the_copy_or_refused(
+def test_a_case_with_a_changed_file_uses_the_copy_or_is_refused(
     cli, manufactured, tmp_path
 ):
     qp, _ = manufactured("box")
@@ -297,7 +301,9 @@ def test_a_case_whose_file_has_changed_is_that_of_the_copy_or_refused(
 
 
 @pytest.mark.parametrize("shape", ["box", "everything"])
-def test_equal_qps_have_one_digest_and_others_another(manufactured, tmp_path, shape):
+def test_equal_qps_have_equal_digests_and_different_qps_do_not(
+    manufactured, tmp_path, shape
+):
     qp, _ = manufactured(shape)
     file = tmp_path / "a.npz"
     digest = save_qp(file, qp, {"name": "whatever"})

@@ -174,7 +174,7 @@ def all_cpus():
 
 
 @pytest.mark.usefixtures("all_cpus")  # each node needs a CPU
-def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
+def test_two_workers_measure_the_same_as_one_although_one_is_killed(
     cli, cluster, tmp_path
 ):
     cli("run", "toy.toml", "--out", "alone")
@@ -207,7 +207,7 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
         assert len({r.case for r in records if r.block == number}) == 1
 
 
-def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
+def test_results_of_a_lost_worker_are_kept_and_the_rest_is_a_new_block(
     cli, cluster, tmp_path
 ):
     victim = cluster.join()
@@ -246,7 +246,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
     assert "--nthreads 1" in err.splitlines()[-1]
 
 
-def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
+def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
@@ -276,7 +276,7 @@ def ctrl_c_enabled():
 
 
 @pytest.mark.usefixtures("ctrl_c_enabled")
-def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
+def test_ctrl_c_during_the_start_of_a_local_cluster_is_deferred():
     from mortarbench.harness.running.cluster import _delay_interrupt
 
     start = multiprocessing.get_context("spawn").Process  # as Dask does
@@ -294,7 +294,7 @@ def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_proces
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
-def test_without_dask_one_line_says_what_to_install(cli, monkeypatch):
+def test_a_missing_dask_is_reported_with_the_package_to_install(cli, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", "local")
 
@@ -303,7 +303,7 @@ def test_without_dask_one_line_says_what_to_install(cli, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
+def test_a_lost_scheduler_ends_the_run_and_the_same_command_continues(
     cli, cluster, tmp_path
 ):
     cluster.join()
@@ -332,7 +332,7 @@ def descendants(process):
     return [*children, *(d for child in children for d in descendants(child))]
 
 
-def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
+def test_a_finished_run_leaves_nothing_on_the_nodes(cli, cluster):
     worker = cluster.join()
     assert soon(lambda: descendants(worker.pid))  # processes that would outlive the run
     before, idle = set(descendants(worker.pid)), []
@@ -367,7 +367,7 @@ def start(*arguments):
 
 
 @pytest.mark.slow
-def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
+def test_after_a_killed_parent_the_next_run_cleans_up_and_continues(
     cli, cluster, tmp_path
 ):
     worker = cluster.join(serves=False)
@@ -396,7 +396,7 @@ def one_cpu():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_cpu")
-def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_missed_yet(
+def test_a_worker_with_one_cpu_serves_a_run_beside_an_orphaned_worker(
     cli, cluster, tmp_path
 ):
     """A scheduler may detect a dead client only after the start of the next run.
@@ -430,7 +430,7 @@ except mb.InputError as e:
 """
 
 
-def test_a_script_that_would_also_run_in_the_workers_is_refused_in_one_line(tmp_path):
+def test_a_script_without_a_main_guard_is_refused_in_one_line(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
     text = (
         SUITE.format(repeats=1).replace("well", "string").replace('"dual"', '"primal"')
@@ -454,7 +454,7 @@ def test_a_script_that_would_also_run_in_the_workers_is_refused_in_one_line(tmp_
 
 
 @pytest.mark.slow
-def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured(
+def test_a_block_that_kills_every_worker_is_abandoned_and_others_are_measured(
     cli, tmp_path
 ):
     code, out, err = cli(
@@ -495,7 +495,7 @@ def test_an_equal_node_is_stored_without_a_warning(meet):
     assert (len(kept), said) == (1, [])
 
 
-def test_another_environment_is_stored_and_warned_of_once(meet):
+def test_another_environment_is_stored_with_one_warning(meet):
     for _ in range(2):
         kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
     assert len(kept) == 1

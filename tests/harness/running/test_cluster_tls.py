@@ -100,7 +100,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     assert set(measured(tmp_path / "out").values()) == {Verdict.VERIFIED}
 
 
-def test_without_certificates_one_line_says_where_dask_looks_for_them():
+def test_missing_certificates_are_reported_with_the_paths_searched_by_dask():
     cluster = on_cluster(
         "tls://127.0.0.1:9", plugins=[], operators={}, environment={}, keep=None,
         warn=None,

@@ -27,7 +27,7 @@ def ours(shared):
     return shared / f"mortarbench-{os.getuid()}"
 
 
-def test_stations_on_one_machine_have_different_cpus_until_there_are_none(shared):
+def test_workers_on_one_machine_use_different_cpus_while_available(shared):
     usable = os.sched_getaffinity(0)
     with ExitStack() as stack:
         assert {claim_cpu(stack) for _ in usable} == usable
@@ -37,7 +37,7 @@ def test_stations_on_one_machine_have_different_cpus_until_there_are_none(shared
         assert claim_cpu(stack) in usable
 
 
-def test_only_this_user_can_enter_the_folder_of_locks(shared):
+def test_only_this_user_can_access_the_lock_folder(shared):
     with ExitStack() as stack:
         claim_cpu(stack)
     assert ours(shared).stat().st_mode & 0o777 == 0o700
@@ -57,7 +57,7 @@ def open_to_all(path, elsewhere):
 
 
 @pytest.mark.parametrize("plant", [link_elsewhere, file_instead, open_to_all])
-def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant):
+def test_a_lock_folder_that_others_can_write_is_refused(shared, plant):
     elsewhere = shared / "elsewhere"
     elsewhere.mkdir(mode=0o700)
     plant(ours(shared), elsewhere)
@@ -68,7 +68,7 @@ def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant
     assert not list(elsewhere.iterdir())
 
 
-def test_a_folder_of_locks_of_another_user_is_refused(shared, monkeypatch):
+def test_a_lock_folder_of_another_user_is_refused(shared, monkeypatch):
     us = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: us + 1)
     ours(shared).mkdir(mode=0o700)  # owned by us, not by the other user

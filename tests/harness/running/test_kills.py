@@ -195,7 +195,7 @@ def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path):
 
 
 @pytest.mark.slow
-def test_so_does_one_of_four_repeats(tmp_path):
+def test_a_disturbed_run_with_four_repeats_ends_as_an_undisturbed_one(tmp_path):
     check(tmp_path, [kill_one] * 2 + [ask_to_end] + [fill_by_limit] * 2, seed=161803)
 
 
@@ -205,18 +205,18 @@ def test_a_run_killed_fifty_times_ends_as_an_undisturbed_one(tmp_path):
 
 
 @pytest.mark.slow
-def test_twenty_kills_and_eight_full_disks_cost_no_measurement_and_no_verdict(tmp_path):
+def test_twenty_kills_and_eight_full_disks_lose_no_measurement_or_verdict(tmp_path):
     check(tmp_path, [kill_one] * 20 + [fill_by_limit] * 8, seed=271828)
 
 
 @pytest.mark.slow
-def test_a_file_system_that_fills_up_costs_no_measurement_and_no_verdict(small_disk):
+def test_a_full_file_system_loses_no_measurement_or_verdict(small_disk):
     tmp_path, fill = small_disk
     check(tmp_path, [fill] * 8, seed=173205, out=tmp_path / "disk" / "out")
 
 
 @pytest.mark.slow
-def test_a_run_that_is_asked_to_end_twenty_times_continues(tmp_path):
+def test_a_run_terminated_twenty_times_continues(tmp_path):
     check(tmp_path, [ask_to_end] * 20, seed=223606)
 
 

@@ -41,7 +41,7 @@ def test_welchs_interval_of_equally_scattered_samples_is_students():
 
 
 @pytest.mark.parametrize("scatter", [1e-3, 1.0, 10.0])
-def test_a_sample_without_scatter_leaves_the_freedom_of_the_other(scatter):
+def test_a_constant_sample_leaves_the_degrees_of_freedom_of_the_other(scatter):
     """Four values have variance s², and their mean s²/4; the other three are equal."""
     noisy = np.exp(scatter * np.sqrt(3) / 2 * np.array([-1, -1, 1, 1]))
     still = np.exp(np.full(3, 5.0))
@@ -51,7 +51,7 @@ def test_a_sample_without_scatter_leaves_the_freedom_of_the_other(scatter):
     assert logs(unpaired_ratio(still, noisy)) == interval(5, half)
 
 
-def test_without_scatter_there_is_no_width():
+def test_constant_samples_have_an_interval_of_width_zero():
     ratio = unpaired_ratio([2.0, 2.0], [1.0, 1.0, 1.0])
 
     assert logs(ratio) == interval(np.log(2), 0)

@@ -170,7 +170,7 @@ WAITED_FOR = {"printsendlessly"}
     ],
     ids=["few", "all"],
 )
-def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
+def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_valid(
     measure, tmp_path, solvers
 ):
     cases = [{"h": 0.5}, {"h": 1.0}]
@@ -258,7 +258,7 @@ def test_one_solver_drives_all_steps_of_a_sequence(measure, tmp_path):
     assert {r.iterations for r in records if r.solver == "honest"} == {1}
 
 
-def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_path):
+def test_a_sequence_and_a_cold_solve_of_a_case_are_two_measurements(measure, tmp_path):
     both = three_steps("honest")
     measure(replace(both, cases=both.sequences[0][:1]))
     first = [r for r in read_journal(tmp_path) if r.params["h"] == 0.5]
@@ -330,7 +330,7 @@ def test_an_interrupted_sequence_is_repeated_from_its_first_step(measure, tmp_pa
     assert len({r.run_id for r in records}) == 3
 
 
-def test_answers_of_a_sweep_are_judged_at_one_accuracy(measure, tmp_path):
+def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
     sweep = suite("honest", "zero", tolerances=(0.1, 1e-8), accuracy=1e-6)
     measure(sweep)
 
@@ -531,7 +531,7 @@ def test_a_case_that_cannot_be_built_is_reported_and_retried(
         ("fields", "no fields: ZeroDivisionError: no field"),
     ],
 )
-def test_a_failing_evaluation_costs_a_note_only(measure, tmp_path, fault, note):
+def test_a_failing_evaluation_only_adds_a_note(measure, tmp_path, fault, note):
     measure(suite("honest", cases=[{"fault": fault}]))
     (r,) = read_journal(tmp_path)
 
@@ -605,7 +605,7 @@ def test_a_comment_does_not_change_a_suite(measure, tmp_path):
 @pytest.mark.parametrize(
     "name", ["journal/a.txt", "vectors/a.npz", "report/a.html", "suite.toml"]
 )
-def test_a_folder_with_other_things_under_our_names_is_left_alone(
+def test_a_folder_with_other_files_under_reserved_names_is_unchanged(
     measure, tmp_path, name, fresh
 ):
     mine = tmp_path / "home" / name
@@ -674,7 +674,7 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
     assert len(measure(suite("honest")).records) == 1
 
 
-def test_a_folder_that_cannot_be_made_is_refused(measure, tmp_path):
+def test_a_folder_that_cannot_be_created_is_refused(measure, tmp_path):
     (tmp_path / ".lock").mkdir()
 
     with pytest.raises(InputError, match="expected a folder that can be written"):
@@ -689,7 +689,7 @@ def once_each(folder, count):
 
 
 @pytest.mark.parametrize("lost", ["journal", "vectors", "cases", ".scratch", ".lock"])
-def test_files_deleted_during_a_run_cost_no_measurement(measure, tmp_path, lost):
+def test_files_deleted_during_a_run_lose_no_measurement(measure, tmp_path, lost):
     def delete():
         path = tmp_path / lost
         path.unlink() if path.is_file() else shutil.rmtree(path)
@@ -730,7 +730,7 @@ def test_a_run_whose_folder_is_deleted_keeps_its_journal_and_continues(
     once_each(out, 3)
 
 
-def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
+def test_on_any_full_disk_a_run_ends_in_one_line_and_can_continue(
     measure, tmp_path, monkeypatch
 ):
     whole = suite("honest", "zero")
@@ -816,7 +816,7 @@ def test_a_measurement_prevented_by_a_fault_is_retried_at_once(
     assert len(watched.records) == 2
 
 
-def test_a_measurement_prevented_twice_is_left_to_the_next_run(
+def test_a_measurement_prevented_twice_is_retried_by_the_next_run(
     measure, tmp_path, faults
 ):
     whole = suite("honest", "zero", repeats=2)
@@ -878,7 +878,7 @@ def kill_worker(solver):
                 os.kill(process, signal.SIGKILL)
 
 
-def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
+def test_a_worker_killed_between_two_steps_of_a_sequence_loses_none(
     measure, tmp_path, own_interpreters
 ):
     measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))

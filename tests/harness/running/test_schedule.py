@@ -105,7 +105,7 @@ def records_of(blocks):
     return [record for block in blocks for turn in block.turns for record in turn]
 
 
-def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
+def test_a_resumed_run_measures_only_missing_measurements():
     """Test every number of earlier measurements; block numbers stay distinct."""
     suite = dict(
         tolerances=(1e-4, 1e-6), repeats=2,
@@ -126,7 +126,7 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
         assert numbers == list(range(first, first + len(numbers)))
 
 
-def test_a_solver_that_declined_a_case_is_not_asked_again():
+def test_a_declined_case_is_not_offered_again():
     schedule = schedule_of()
     asked = []
     for block in schedule.blocks():
@@ -138,7 +138,7 @@ def test_a_solver_that_declined_a_case_is_not_asked_again():
     assert (asked.count("a"), asked.count("b")) == (1, 3)
 
 
-def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
+def test_a_case_that_cannot_be_built_is_omitted_from_later_blocks():
     cases = cases_of(1, 2)
     schedule = schedule_of(cases=cases)
     blocks = schedule.blocks()
@@ -163,7 +163,7 @@ def test_without_a_precision_the_repeats_of_the_suite_are_measured():
     assert len(records_after(0.5)) == 2 * 3
 
 
-def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
+def test_precise_times_need_only_the_repeats_of_the_suite():
     assert len(records_after(1e-4, precision=0.05)) == 2 * 3
 
 

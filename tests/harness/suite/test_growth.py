@@ -22,7 +22,7 @@ SUITE = {
         {"null_arm": "a"},
     ],
 )
-def test_a_suite_that_asks_for_more_is_the_same(more):
+def test_an_extended_suite_counts_as_the_same_suite(more):
     assert incompatibility(SUITE, SUITE | more) == ""
 
 
@@ -46,7 +46,7 @@ def test_settings_of_past_measurements_may_not_change(change, said):
     assert incompatibility(SUITE, SUITE | change) == said
 
 
-def test_a_stopping_rule_may_become_stricter_and_not_laxer():
+def test_a_stopping_rule_may_only_become_stricter():
     ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
 
     assert incompatibility(ruled, ruled | {"precision": 0.05}) == ""

@@ -123,7 +123,7 @@ def test_labels_contain_the_value_in_canonical_form():
     assert labels("alpha=1e-3") == labels("alpha=0.001")
 
 
-def test_an_option_goes_before_that_of_the_suite():
+def test_an_option_overrides_the_option_in_the_suite():
     own = SolverSpec(name="method", label="mine", options={"max_iter": 9, "alpha": 2.0})
     (changed,) = sweep([own], {"max_iter": ["5"]}, SOLVERS)
 
@@ -178,8 +178,8 @@ def test_the_label_of_the_suite_is_found_in_a_longer_one():
 
 @dataclass(frozen=True)
 class Sized:
-    rho: float = 1  # an int, as people write it
-    start: Any = 0  # no type: that of the default
+    rho: float = 1  # an int, as users may write
+    start: Any = 0  # not annotated: the type of the default
 
     declines, prepare = Method.declines, Method.prepare
 

@@ -76,7 +76,7 @@ def test_missing_keys_take_their_defaults(load):
     assert suite.text == MINIMAL
 
 
-def test_a_suite_contains_the_given_values(load):
+def test_a_suite_contains_the_values_of_the_file(load):
     suite = load(
         """
         name = "demo"
@@ -120,7 +120,7 @@ def test_forms_of_the_same_parameters_are_neighbours(load):
     ]  # fmt: skip
 
 
-def test_zipped_lists_run_together_where_the_first_of_them_stands(load):
+def test_zipped_lists_vary_together_at_the_position_of_the_first(load):
     suite = load(
         MINIMAL
         + 'forms = ["dual"]\nzip = [["m", "n"]]\n'
@@ -342,7 +342,7 @@ def test_limits_change_the_suite_as_run_and_nothing_else_does(narrowed):
 
 
 @pytest.mark.parametrize("head", ["", "time_limit = 7\n"])
-def test_a_limit_of_the_suite_is_no_option_of_a_solver(load, head):
+def test_a_limit_of_the_suite_cannot_be_set_as_a_solver_option(load, head):
     text = head + (
         "name = 'demo'\n[[solvers]]\nname = 'osqp'\n"
         "[solvers.options]\nmax_iter = 3\ntime_limit = 9\n" + BLOCK
@@ -378,7 +378,7 @@ def test_a_contradictory_override_is_refused(narrowed, changes, message):
     ("name", "cases"),
     [("demo", 14), ("smoke", 3), ("scaling", 12), ("large", 6)],
 )
-def test_the_suites_of_the_checkout_keep_their_promises(name, cases):
+def test_suites_of_the_checkout_have_the_expected_cases_and_solvers(name, cases):
     path = ROOT / "suites" / f"{name}.toml"
     suite = load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
 
@@ -417,7 +417,9 @@ def paths_of(suite):
     return [c.params["path"] for c in suite.cases if "path" in c.params]
 
 
-def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monkeypatch):
+def test_files_of_a_suite_are_searched_here_and_then_beside_the_suite(
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     elsewhere = paths_of(shipped("crossval"))
     monkeypatch.chdir(ROOT / "suites")
@@ -470,7 +472,7 @@ def test_a_pattern_of_paths_is_the_files_that_match_sorted(
     assert patterned(tmp_path, path) == expected
 
 
-def test_a_pattern_is_sought_beside_the_suite_too(tmp_path, monkeypatch):
+def test_a_pattern_is_also_searched_beside_the_suite(tmp_path, monkeypatch):
     folder_of_files(tmp_path, monkeypatch, here=False)
 
     assert patterned(tmp_path, '"set/[ab].qps"') == ["../set/a.qps", "../set/b.qps"]
@@ -519,7 +521,7 @@ def test_suites_beyond_the_paper_can_be_narrowed(name):
     assert {"smalbe", "osqp", "piqp"} == {s.label for s in narrowed.solvers}
 
 
-def test_the_suite_of_accuracies_judges_at_one():
+def test_the_accuracy_suite_verifies_at_one_accuracy():
     sweep = shipped("accuracy")
 
     assert sweep.accuracy == 1e-6
@@ -603,7 +605,7 @@ def test_a_sequence_along_no_list_is_refused(tmp_path, key):
 GROWING = "growing = 'n'\nparams = { n = [2, 4, 8], kind = ['soft', 'hard'] }"
 
 
-def test_a_growing_series_knows_its_next_smaller_case_and_a_case_to_warm_up(load):
+def test_a_growing_series_provides_the_next_smaller_and_a_warm_up_case(load):
     suite = load(MINIMAL + GROWING)
 
     growth = suite.growing["well/n=8/kind=hard/dual"]

@@ -27,14 +27,14 @@ def moved(B, c, u, *, R=None, softness=None, closed=None):
         return feasible_at_rows(exact, R, softness, u, closed)
 
 
-def test_what_penetrates_nothing_stays():
+def test_an_admissible_displacement_is_unchanged():
     found = moved([[1, 1]], [3], [1, 1])
 
     assert (found.u == [1, 1]).all()
     assert found.theta == 1
 
 
-def test_nodes_share_the_way_out_as_they_are_soft():
+def test_corrections_are_distributed_by_compliance():
     """From (1, 1), u₁ + u₂ ≤ 1 and least Σδᵢ²/sᵢ with s = (1, 3) give δ = −(¼, ¾)."""
     found = moved([[1, 1]], [1], [1, 1], softness=[1, 3])
 
@@ -58,7 +58,7 @@ def test_a_closed_row_is_closed_though_it_is_not_violated():
     assert found.u[0] <= 3
 
 
-def test_what_supports_hold_is_shrunk_until_it_fits():
+def test_supported_bodies_are_scaled_until_admissible():
     """No component can move, so (2, 3) is halved to satisfy the limits (1, 2)."""
     found = moved(np.eye(2), [1, 2], [2, 3], softness=[0, 0])
 

@@ -150,13 +150,13 @@ def violations(name: str, count: int) -> list[str]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_no_disturbed_solution_is_further_off_than_its_bound(name):
+def test_no_disturbed_solution_exceeds_its_bound(name):
     assert violations(name, 20) == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_none_of_ten_thousand_is(name):
+def test_none_of_ten_thousand_errors_exceeds_its_bound(name):
     assert violations(name, PERTURBATIONS // len(CASES)) == []
 
 
@@ -198,7 +198,7 @@ def forms_of(names: Sequence[str]) -> list[tuple[str, str]]:
     return [(n, form) for n in names for form in PROBLEMS[n.partition("/")[0]].forms]
 
 
-def test_bounds_of_what_solvers_return_are_sharp():
+def test_bounds_of_solver_answers_are_sharp():
     cases = forms_of((CASES[0], CASES[3], CASES[7]))
     labels = ("smalbe", "clarabel", "piqp")
     found = [e for case in cases for e in effectivities(*case, labels)]
@@ -207,7 +207,7 @@ def test_bounds_of_what_solvers_return_are_sharp():
     assert min(found) >= 1 / ROUNDED
 
 
-def test_bounds_in_space_are_sharper():
+def test_bounds_in_space_are_sharp():
     labels = ("smalbe", "clarabel", "piqp", "osqp")
     cases = forms_of(("cube-wall/n=3", "hertz-sphere/n=1"))
     found = [e for case in cases for e in effectivities(*case, labels)]
@@ -218,7 +218,7 @@ def test_bounds_in_space_are_sharper():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_so_are_those_of_the_fleet(name):
+def test_bounds_of_all_solvers_are_sharp(name):
     fleet = ("smalbe", "osqp", "clarabel", "proxqp", "piqp", "scs", "highs", "daqp")
     found = [e for case in forms_of((name,)) for e in effectivities(*case, fleet)]
     assert np.median(found) <= 3
@@ -242,7 +242,7 @@ def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("size", [1e160, 1e300])
-def test_answers_beyond_all_numbers_have_no_certificate_or_an_honest_one(name, size):
+def test_answers_that_overflow_have_no_certificate_or_a_valid_one(name, size):
     problem = known(name)
     s = problem.solution()
     for far in (replace(s, x=size * (1 + s.x)), replace(s, z=size * (1 + s.z))):
@@ -255,7 +255,7 @@ def test_answers_beyond_all_numbers_have_no_certificate_or_an_honest_one(name, s
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_dwarfs_the_solution_is_not_measured_by_itself(name):
+def test_a_huge_error_is_not_measured_relative_to_itself(name):
     """An error of ten times the solution is relative to the solution, not
     the answer.
     """
@@ -265,7 +265,7 @@ def test_what_dwarfs_the_solution_is_not_measured_by_itself(name):
     assert found.bound * problem.exact.norm >= problem.error(-10 * s.x.astype(Real))
 
 
-def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
+def test_a_stored_reference_is_only_an_initial_guess(tmp_path):
     mechanics = known(CASES[0]).mechanics
     fresh = reference_point(mechanics, reference_solution, tmp_path)
     (stored,) = tmp_path.iterdir()
@@ -285,7 +285,7 @@ def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
     assert reference_point(mechanics, reference_solution, tmp_path).bound < 1e-8
 
 
-def test_the_same_point_is_certified_once_and_another_one_anew(tmp_path, monkeypatch):
+def test_equal_points_are_certified_once_and_others_again(tmp_path, monkeypatch):
     calls = []
 
     def counted(case, s):

@@ -95,7 +95,7 @@ def test_no_bound_of_a_short_search_is_exceeded():
 
 
 @pytest.mark.slow
-def test_of_ten_thousand_attacked_bounds_none_is_exceeded():
+def test_none_of_ten_thousand_attacked_bounds_is_exceeded():
     failures, count, ratio = exceeded(3141, 12_000)
     assert failures == []
     assert count >= 10_000

@@ -212,16 +212,16 @@ def sharp(cases: Sequence[str], count: int) -> None:
     assert np.median(rough) <= 1.5 * np.median(smooth)
 
 
-def test_no_disturbed_solution_with_friction_is_further_off_than_its_bound():
+def test_no_disturbed_solution_with_friction_exceeds_its_bound():
     sharp(list(CASES), 10)
 
 
-def test_nor_is_one_of_a_body_that_friction_alone_holds():
+def test_no_disturbed_solution_of_a_body_held_by_friction_exceeds_its_bound():
     assert attacked(INCLINE, 20)[0] == []
 
 
 @pytest.mark.parametrize("name", [IN_SPACE[0], IN_SPACE[4], IN_SPACE[5]])
-def test_nor_is_one_in_space(name):
+def test_no_disturbed_solution_in_space_exceeds_its_bound(name):
     faults, effectivities = attacked(name, 15)
 
     assert faults == []
@@ -229,7 +229,7 @@ def test_nor_is_one_in_space(name):
 
 
 @pytest.mark.slow
-def test_none_of_ten_thousand_in_space_is():
+def test_none_of_ten_thousand_errors_in_space_exceeds_its_bound():
     sharp = []
     for name in IN_SPACE:
         faults, effectivities = attacked(name, PERTURBATIONS // len(IN_SPACE) + 1)
@@ -256,12 +256,12 @@ def test_vectors_in_space_stick_and_slip_obliquely():
 
 
 @pytest.mark.slow
-def test_none_of_ten_thousand_is():
+def test_none_of_ten_thousand_errors_exceeds_its_bound():
     sharp(list(CASES), PERTURBATIONS // len(CASES))
     assert attacked(INCLINE, PERTURBATIONS // len(CASES))[0] == []
 
 
-def test_the_cases_have_rows_that_stick_and_slip_either_way_and_are_open():
+def test_the_cases_contain_sticking_slipping_and_open_rows():
     found = set()
     for name in CASES:
         problem = known(name)
@@ -290,7 +290,7 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 
 
 @pytest.mark.parametrize("name", list(CASES)[:3])
-def test_what_solvers_return_is_bounded_in_every_form(name):
+def test_errors_of_solver_answers_are_bounded_in_every_form(name):
     problem, found = known(name), []
     for form in ("primal", "dual", "dual-bounds"):
         case = build(name, form)
@@ -309,7 +309,7 @@ def test_what_solvers_return_is_bounded_in_every_form(name):
 
 
 @pytest.mark.parametrize("far", [-1.0, 1.0])
-def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypatch):
+def test_a_body_may_have_slid_by_its_displacement_in_either_direction(far, monkeypatch):
     """A block sticks on an incline; the errors of the pair are not included."""
     problem, seen = known(INCLINE), []
     mechanics, reach = problem.mechanics, certificate._reach

@@ -174,7 +174,7 @@ def test_no_answer_is_further_from_the_stored_problem_than_its_bound(name):
 
 
 @pytest.mark.slow
-def test_none_of_ten_thousand_is_and_bounds_are_sharp():
+def test_none_of_ten_thousand_errors_exceeds_its_sharp_bound():
     results = [attack(name, 10_000 // len(MAKERS) + 1) for name in MAKERS]
     assert [told for told, _ in results] == [[]] * len(MAKERS)
     assert np.median([e for _, sharp in results for e in sharp]) <= 2
@@ -223,14 +223,14 @@ def test_a_free_plate_on_a_disc_rests_on_no_row_at_the_end_of_the_arc(
     assert at.z[far].max() <= 1e-8 * at.z.max()
 
 
-def test_a_load_that_nothing_balances_is_named():
+def test_an_unbalanced_load_is_named():
     mechanics = disc_between_plates(push=0.1).mechanics
     s = answer(0 * mechanics.exact.f, np.ones_like(mechanics.exact.c))
     with pytest.raises(UncertifiableError, match="load of body upper along x"):
         certify(mechanics, s)
 
 
-def test_a_load_that_contact_would_have_to_pull_is_another_cause():
+def test_a_load_that_requires_tensile_contact_has_another_message():
     mechanics = disc_between_plates().mechanics
     lifted = replace(mechanics, primal=replace(mechanics.primal, q=-mechanics.primal.q))
     s = answer(0 * lifted.exact.f, np.ones_like(lifted.exact.c))
@@ -238,7 +238,7 @@ def test_a_load_that_contact_would_have_to_pull_is_another_cause():
         certify(lifted, s)
 
 
-def test_contact_feels_no_sliding_but_all_else():
+def test_contact_rows_vanish_only_on_sliding():
     """Each of two bodies has three rigid motions, of which only sliding is free.
 
     If the disc is the master of node-to-segment rows, it is a polygon, and its rows
@@ -251,7 +251,7 @@ def test_contact_feels_no_sliding_but_all_else():
     assert (motions.constrained.shape[1], motions.free.shape[1]) == (6, 0)
 
 
-def test_what_rigid_motions_do_to_a_stored_matrix_is_known_to_its_last_digits():
+def test_products_of_a_stored_matrix_with_rigid_motions_are_exact():
     from fractions import Fraction
 
     mechanics = disc_between_plates().mechanics
@@ -282,7 +282,7 @@ def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
         assert attained == pytest.approx(compliance, rel=1e-9)
 
 
-def test_the_charge_of_rounding_solves_its_inequality():
+def test_the_bound_for_rounding_satisfies_its_inequality():
     """One motion: γ ≤ 2√s with s = 1 + charge, and charge ≥ 2γρ + 4√s γσ + 2γ²κ."""
     reach = _Reach(np.zeros(1), np.full(1, 2.0), np.zeros(1))
 
@@ -298,7 +298,7 @@ def test_the_charge_of_rounding_solves_its_inequality():
     assert charge(0, 0, 1.0) == np.inf  # rounding outweighs the contact forces
 
 
-def test_a_gap_that_is_closed_from_the_start_lets_nothing_shrink():
+def test_an_initially_closed_gap_prevents_scaling():
     """If u = 0 penetrates (c < 0), no θu with θ < 1 is used."""
     mechanics = named("obstacle/dim=1/n=16").mechanics
     primal = mechanics.primal
@@ -343,7 +343,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
         assert (np.abs(left) <= 1e-16 * terms.max()).all()
 
 
-def test_balance_is_not_sought_beyond_what_rounding_allows():
+def test_balance_is_required_only_up_to_rounding():
     """Sums with cancellation are accurate only up to the rounding of their terms."""
     G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
     lam = np.ones(2, dtype=Real)
@@ -377,7 +377,7 @@ def pair(**fields: object) -> Certificate:
     )  # fmt: skip
 
 
-def test_the_pair_near_zero_is_evaluated_where_no_other_one_proves_anything():
+def test_the_pair_near_zero_is_used_if_no_other_pair_yields_a_bound():
     def never():
         raise AssertionError("a pair near the answer is enough")
 
@@ -425,7 +425,7 @@ def test_parts_of_a_bound_are_lengths_relative_to_the_least_solution():
     }  # fmt: skip
 
 
-def test_no_error_is_none_and_any_other_is_infinite_beside_a_solution_of_zero():
+def test_the_relative_error_for_a_zero_solution_is_zero_or_infinite():
     assert pair(least=0.0).bound == 0.0
     assert pair(least=0.0, claimed=1e-300).bound == np.inf
     assert pair(least=-1.0, claimed=1.0).bound == np.inf
@@ -435,7 +435,7 @@ def test_no_error_is_none_and_any_other_is_infinite_beside_a_solution_of_zero():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("vector", ["x", "z"])
-def test_a_single_number_that_is_none_leaves_nothing_to_certify(vector, value):
+def test_one_nan_in_a_point_prevents_certification(vector, value):
     mechanics, u, lam, _ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
     s = answer(u, lam)
     getattr(s, vector)[1] = value
@@ -443,7 +443,7 @@ def test_a_single_number_that_is_none_leaves_nothing_to_certify(vector, value):
         certify(mechanics, s)
 
 
-def test_of_a_pair_that_proves_nothing_the_solution_may_be_zero(monkeypatch):
+def test_without_a_proof_the_solution_may_be_zero(monkeypatch):
     mechanics, *_ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
 
     def refused(*args):
@@ -456,7 +456,9 @@ def test_of_a_pair_that_proves_nothing_the_solution_may_be_zero(monkeypatch):
 
 @pytest.mark.parametrize("name", ["disc under rollers", "tilted disc"])
 @pytest.mark.parametrize("size", [1e-4, 1e-3])
-def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name, size):
+def test_the_norm_of_the_solution_is_bounded_by_its_distance_from_the_midpoint(
+    name, size
+):
     """By (3), ‖u*‖ ≥ ‖M‖ − √(g − ¼‖û − u_λ‖²) for the midpoint M of û and u_λ."""
     mechanics, u, lam, norm = known(name)
     disturbed = _noise(mechanics, answer(u, lam), size, np.random.default_rng(0))
@@ -467,7 +469,7 @@ def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name,
     assert found.least <= norm * ROUNDED
 
 
-def test_what_a_solve_leaves_undone_widens_the_ball_around_the_midpoint(monkeypatch):
+def test_an_inexact_solve_enlarges_the_ball_around_the_midpoint(monkeypatch):
     """The error of a solve also increases the distance of u_λ. No body
     moves rigidly.
     """
@@ -488,7 +490,7 @@ def test_what_a_solve_leaves_undone_widens_the_ball_around_the_midpoint(monkeypa
     assert not found.seminorm
 
 
-def test_what_subdomains_do_not_feel_joins_the_error_of_the_answer(monkeypatch):
+def test_displacements_without_subdomain_energy_add_to_the_error(monkeypatch):
     mechanics, u, lam, norm = known("beam-ring/Nr=2/Nh=2/step=5")
     s, force = answer(0 * u, lam), mechanics.exact.f / 10
     least = certify(mechanics, s).claimed
@@ -538,7 +540,7 @@ def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
         ("beam-ring/Nr=2/Nh=2/step=5", 1e-4, 2),  # supports fix all bodies
     ],
 )
-def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
+def test_rows_are_exchanged_if_only_contact_supports_a_body(
     name, bound, count, monkeypatch
 ):
     """Certificates are replaced by certificates whose only error is work."""
@@ -549,7 +551,7 @@ def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
 
 
 @pytest.mark.parametrize("name", ["disc under rollers", "tilted disc", RATIOS[3]])
-def test_motions_either_way_are_bounded(name, monkeypatch):
+def test_motions_in_both_directions_are_bounded(name, monkeypatch):
     """Bounds do not depend on the sign of a rigid motion, which is arbitrary."""
     mechanics, u, lam, _ = known(name)
     reach, seen = certificate._reach, []

@@ -111,18 +111,18 @@ def test_bounds_alone_contradict_nothing():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_planted_solutions_are_not_argued_away(shape):
+def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
     assert margin(manufactured(shape)[0]) is None
 
 
 @pytest.mark.parametrize("z", [(1, 1 + 1e-9), (1e-30, 1e-30), (1e200, 1e200)])
-def test_the_ray_of_a_solver_is_mended_before_it_is_believed(z):
+def test_the_ray_of_a_solver_is_corrected_before_its_check(z):
     """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so it must be corrected."""
     assert margin(infeasible(), z=z) == 1
 
 
 @pytest.mark.parametrize("z", [(1, -1), (np.nan, 1), (np.inf, 1), (0, 0), (1, 2)])
-def test_a_useless_ray_leaves_a_true_claim_true(z):
+def test_a_useless_ray_does_not_refute_a_true_claim(z):
     assert margin(infeasible(), z=z) == 1
 
 
@@ -167,7 +167,7 @@ def record():
     )  # fmt: skip
 
 
-def test_a_right_claim_is_a_verdict_of_its_own_and_a_wrong_one_stays_refuted():
+def test_a_correct_infeasibility_claim_is_verified_and_a_wrong_one_refuted():
     for qp, expected in (
         (infeasible(), Verdict.VERIFIED_INFEASIBLE),
         (unbounded(), Verdict.INFEASIBLE_CLAIM),
@@ -179,7 +179,7 @@ def test_a_right_claim_is_a_verdict_of_its_own_and_a_wrong_one_stays_refuted():
             assert rejudged(Record.from_json(got.to_json()), factor) is expected
 
 
-def test_other_claims_on_an_infeasible_qp_are_judged_as_before():
+def test_other_claims_on_an_infeasible_qp_keep_their_verdicts():
     qp = infeasible()
     for claimed, expected in (
         (Status.SOLVED, Verdict.WRONG),
@@ -190,7 +190,7 @@ def test_other_claims_on_an_infeasible_qp_are_judged_as_before():
         assert got.verdict is expected
 
 
-def test_a_right_claim_counts_though_its_point_violates_rows_by_less_than_verified():
+def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
     """For x ≤ 1 and x ≥ 1 + 1e-9, x = 1 has residuals below the tolerance 1e-8."""
     qp = qp_of(G=[[1], [-1]], h=[1, -1 - 1e-9])
     point = Solution(
@@ -219,12 +219,12 @@ def search(seeds):
     return proofs
 
 
-def test_no_feasible_qp_of_a_search_is_proven_infeasible_nor_a_contradiction_missed():
+def test_all_infeasibility_proofs_of_a_short_search_are_correct():
     assert search(range(60)) >= 5
 
 
 @pytest.mark.slow
-def test_no_feasible_qp_of_a_long_search_is_proven_infeasible():
+def test_all_infeasibility_proofs_of_a_long_search_are_correct():
     end = monotonic() + 90
     seeds = count(10**6)
     assert (

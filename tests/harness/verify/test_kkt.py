@@ -138,7 +138,7 @@ def at(x, y=(), z_box=(0, 0)):
     ],
     ids=["bound", "row", "gradient", "energy", "overflow"],
 )  # fmt: skip
-def test_no_part_of_an_answer_can_excuse_another(qp, s):
+def test_large_parts_of_an_answer_do_not_hide_errors_in_others(qp, s):
     assert not kkt_residuals(qp, s).worst <= 0.1
 
 
@@ -192,7 +192,7 @@ def test_units_of_objective_variables_and_rows_do_not_matter(manufactured, seed)
     assert kkt_residuals(scaled, same) == pytest.approx(kkt_residuals(qp, s), rel=1e-10)
 
 
-def test_no_point_no_residual(manufactured):
+def test_without_a_point_there_are_no_residuals(manufactured):
     qp, _ = manufactured("everything", seed=271828, dense=True)
     r = kkt_residuals(qp, Solution.without_point(qp, Status.SOLVED))
 
@@ -238,7 +238,7 @@ def test_a_loose_tolerance_does_not_verify_a_refutation():
 
 
 @pytest.mark.parametrize("unit", [2.0**-20, 2.0**20])
-def test_an_operator_is_judged_alike_in_all_units(manufactured, unit):
+def test_verdicts_for_an_operator_do_not_depend_on_units(manufactured, unit):
     qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
 
@@ -254,7 +254,9 @@ def test_an_operator_is_judged_alike_in_all_units(manufactured, unit):
     assert found == pytest.approx(kkt_residuals(operator_in(1.0), moved), rel=1e-9)
 
 
-def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufactured):
+def test_an_operator_without_diagonal_has_the_other_residuals_of_its_matrix(
+    manufactured,
+):
     """Lengths depend on Pᵢᵢ, so that they differ if the operator has no diagonal."""
     qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
@@ -266,7 +268,7 @@ def test_an_operator_has_the_residuals_of_its_matrix_but_for_its_diagonal(manufa
     assert 0.1 <= other.dual / one.dual <= 10
 
 
-def test_an_operator_that_tells_its_diagonal_is_judged_as_its_matrix(manufactured):
+def test_an_operator_with_diagonal_has_the_residuals_of_its_matrix(manufactured):
     qp, s = manufactured("everything", seed=314159, dense=True)
 
     class Telling:
@@ -298,7 +300,7 @@ def test_a_row_without_entries_does_not_inflate_the_scale_of_x():
     assert kkt_residuals(empty, point).worst < 1e-13
 
 
-def test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer():
+def test_rounding_in_products_with_an_operator_does_not_refute_an_answer():
     """min ½x₁² − x₁ at its minimum; x₂ is arbitrary."""
 
     def product(x):
@@ -324,7 +326,7 @@ def test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer():
         (diagonal([1, 4], [-1, -1]), 1 / 8),  # the smallest
     ],
 )
-def test_the_least_scale_of_energy_is_a_hundredth_of_what_a_variable_gains_alone(
+def test_the_least_energy_scale_is_a_hundredth_of_the_gain_of_one_variable(
     qp, expected
 ):
     nowhere = at(0 * qp.q, z_box=0 * qp.q)

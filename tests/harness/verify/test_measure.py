@@ -63,7 +63,9 @@ def outcome(solver, qp):
         ),
     ],
 )
-def test_whatever_a_solver_does_is_a_status_and_one_line(qp, solver, status, message):
+def test_every_behaviour_of_a_solver_yields_a_status_and_one_line(
+    qp, solver, status, message
+):
     assert outcome(solver, qp) == (status, message)
 
 
@@ -114,7 +116,7 @@ def test_a_failure_ends_with_the_last_place_in_the_solver_s_own_file(
     )
 
 
-def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
+def test_a_shortened_failure_message_keeps_its_location(qp, tmp_path):
     path = tmp_path / f"{'long' * 50}.py"
     code = ADMM.replace("import helper", "")
     path.write_text(code.replace("helper.fails(q)", "{}['9' * 4000]"))
@@ -134,7 +136,7 @@ def test_a_long_message_of_a_failure_keeps_its_place(qp, tmp_path):
         (object(), "object"),
     ],
 )
-def test_what_declines_returns_is_none_or_a_text(qp, reason, got):
+def test_declines_must_return_none_or_text(qp, reason, got):
     class Vague(type(PLUGIN.solvers["honest"])):
         def declines(self, qp):
             return reason
@@ -182,7 +184,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
     assert now[0] == pytest.approx(0.005 * (1 + loops if loops > 1 else 1))
 
 
-def test_each_phase_has_a_peak_of_its_own(qp):
+def test_each_phase_has_a_separate_memory_peak(qp):
     """Memory allocated and freed by `prepare` does not count towards the solve."""
     honest = PLUGIN.solvers["honest"]
 
@@ -197,7 +199,7 @@ def test_each_phase_has_a_peak_of_its_own(qp):
     assert m.peak_mib == m.prepare_peak_mib
 
 
-def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
+def test_the_peak_excludes_earlier_measurements(qp):
     class Hungry(type(PLUGIN.solvers["honest"])):
         def act(self, qp):
             np.ones(2**24)  # 128 MiB
@@ -212,7 +214,7 @@ def test_the_peak_is_that_of_this_measurement_and_not_of_what_was_before(qp):
     assert after < before + 50
 
 
-def test_values_that_only_look_plain_become_plain(qp):
+def test_subclasses_of_plain_types_become_plain(qp):
     s = measure(PLUGIN.solvers["numpyscalars"], qp, 1e-6).solution
 
     assert s.status is Status.SOLVED
@@ -278,7 +280,7 @@ def test_a_history_that_would_fill_the_disk_is_dropped_and_the_answer_kept(
     assert s.message == "history dropped: it has 160 bytes, expected at most 100"
 
 
-def test_garbage_is_not_collected_while_the_clock_runs(qp):
+def test_garbage_collection_is_off_during_timed_phases(qp):
     class Looks(type(PLUGIN.solvers["honest"])):
         def act(self, qp):
             raise ValueError(f"gc is {gc.isenabled()}")
@@ -288,7 +290,7 @@ def test_garbage_is_not_collected_while_the_clock_runs(qp):
     assert gc.isenabled()
 
 
-def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
+def test_every_repeat_receives_an_equal_copy_of_the_qp(qp, monkeypatch):
     monkeypatch.setattr(measuring, "_inner", lambda *_: 3)
     seen = []
 
@@ -308,7 +310,7 @@ def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
         assert not other.q.flags.writeable
 
 
-def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
+def test_the_time_of_declines_is_measured(qp, monkeypatch):
     asked = []
     clock = iter(range(100))
 
@@ -351,14 +353,14 @@ def by_products():
     )  # fmt: skip
 
 
-def test_a_small_operator_is_multiplied_out_for_who_needs_its_entries(by_products):
+def test_a_small_operator_is_assembled_for_solvers_that_need_entries(by_products):
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
     assert s.status is Status.SOLVED
     assert s.x == pytest.approx([1, 1 / 2, 1 / 4])
 
 
-def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
+def test_a_large_operator_is_not_assembled(by_products, monkeypatch):
     monkeypatch.setattr(measuring, "MAX_ASSEMBLED_ROWS", 2)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
@@ -369,9 +371,7 @@ def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
     )
 
 
-def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
-    by_products, monkeypatch
-):
+def test_an_operator_that_exceeds_memory_is_not_assembled(by_products, monkeypatch):
     monkeypatch.setattr(measuring, "too_large", lambda *_: True)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
@@ -387,7 +387,7 @@ def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
         (-(10**300), "a number far outside this range"),
     ],
 )
-def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, shown):
+def test_an_impossible_count_is_refused_and_shown_if_short(qp, iterations, shown):
     class Counts(type(PLUGIN.solvers["honest"])):
         def act(self, qp):
             return replace(super().act(qp), iterations=iterations)
@@ -400,7 +400,7 @@ def test_a_count_that_cannot_be_is_refused_and_shown_if_short(qp, iterations, sh
     )
 
 
-def test_processes_of_runs_import_nothing_that_they_never_call():
+def test_processes_of_runs_import_no_unused_modules():
     """Processes start tens of times in a run, so imports such as statistics
     are costly.
     """

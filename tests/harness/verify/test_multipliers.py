@@ -82,7 +82,7 @@ def test_a_point_beside_the_solution_has_no_multipliers():
     assert min(left) > 10 * TOL
 
 
-def test_a_nearly_active_row_bears_what_its_slack_permits():
+def test_the_force_of_a_nearly_active_row_is_limited_by_its_slack():
     """For min ½x² − x, x ≤ ½, at x = ½ − δ, the multiplier ½ has the cost ½δ."""
     delta = 1e-9
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
@@ -92,7 +92,7 @@ def test_a_nearly_active_row_bears_what_its_slack_permits():
     assert 1e-10 < kkt_residuals(qp, s).worst < 1e-8
 
 
-def test_an_inactive_row_bears_nothing():
+def test_an_inactive_row_has_zero_force():
     """The minimum of ½x² − x is at 1, so x = 0 is refuted in spite of the row x ≤ ½."""
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
     s = with_multipliers(qp, np.array([0.0]))
@@ -100,7 +100,7 @@ def test_an_inactive_row_bears_nothing():
     assert kkt_residuals(qp, s).worst > 0.1
 
 
-def test_a_row_that_pulls_the_wrong_way_bears_nothing():
+def test_a_row_with_the_wrong_sign_has_zero_force():
     qp = QP.from_arrays([[1.0]], [-1.0], lb=[0.0], G=[[-1.0]], h=[0.0])
     s = with_multipliers(qp, np.array([0.0]))
 
@@ -139,7 +139,7 @@ def test_units_of_rows_and_variables_change_nothing(power):
         assert kkt_residuals(scaled, with_multipliers(scaled, x / D)).worst <= 1e-11
 
 
-def test_multipliers_that_are_given_stay():
+def test_passed_multipliers_are_unchanged():
     """One of two equal rows has a given multiplier; the other gets the remainder."""
     qp = QP.from_arrays([[1.0]], [-3.0], G=[[1.0]], h=[1.0], ub=[1.0])
     one = np.array([1.0])

@@ -171,7 +171,7 @@ def search(seed, tries, each=40):
     return wrong, refuted, verified, proven / (tries // each)
 
 
-def test_a_short_search_over_sets_deceives_no_verdict():
+def test_no_verdict_is_wrong_in_a_short_search_over_sets():
     wrong, refuted, verified, proven = search(271828, 400)
 
     assert (wrong, refuted) == ([], [])
@@ -180,7 +180,7 @@ def test_a_short_search_over_sets_deceives_no_verdict():
 
 
 @pytest.mark.slow
-def test_a_long_search_over_sets_deceives_no_verdict():
+def test_no_verdict_is_wrong_in_a_long_search_over_sets():
     wrong, refuted, verified, proven = search(314159, 25_000)
 
     assert (wrong, refuted) == ([], [])
@@ -218,7 +218,7 @@ def test_multipliers_of_a_solution_over_balls_prove_it(seed):
 
 
 @pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny ball")])
-def test_multipliers_over_balls_are_found_whatever_rows_they_share(trap):
+def test_multipliers_over_balls_are_computed_also_with_common_rows(trap):
     """Solutions are rounded, so they are on the spheres only up to rounding."""
     worst = []
     for seed in range(20):
@@ -231,7 +231,7 @@ def test_multipliers_over_balls_are_found_whatever_rows_they_share(trap):
     assert np.quantile(worst, 0.9) <= 1e-7
 
 
-def test_no_multipliers_prove_a_point_that_is_no_solution():
+def test_no_multipliers_verify_a_non_optimal_point():
     for seed in range(20):
         qp, s = with_solution(seed)
         x = qp.sets[1].project(s.x * (1 + 1e-2 * np.sign(s.x)))

@@ -64,7 +64,7 @@ def test_residuals_by_ranks_are_those_of_one_process(found, case):
 
 
 @pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH])
-def test_a_wrong_answer_is_found_out_by_ranks(found, case):
+def test_a_wrong_answer_is_refuted_by_ranks(found, case):
     *sound, wrong = (answer["by_ranks"]["values"] for answer in found[case])
 
     assert max(wrong["primal"], wrong["dual"]) > 1e-4
@@ -87,7 +87,7 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
 
 
 @pytest.mark.parametrize("case", [HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN])
-def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case):
+def test_certificates_of_bodies_held_by_contact_are_those_of_one_process(found, case):
     for answer in found[case]:
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
@@ -102,7 +102,7 @@ def test_certificates_of_what_contact_holds_are_those_of_one_process(found, case
         )
 
 
-def test_what_supports_eliminate_is_certified_in_subdomains_that_float(found):
+def test_eliminated_supports_are_certified_in_floating_subdomains(found):
     for answer in found[ELIMINATED]:
         # one process finds the nearest u_λ of the whole body
         bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
@@ -157,7 +157,7 @@ def test_sizes_are_those_of_the_whole(found, case):
         assert answer["sizes"][0] == answer["sizes"][1]
 
 
-def test_digests_tell_qps_apart_and_not_the_ranks_that_emit_them(found):
+def test_digests_depend_on_the_qp_and_not_on_the_number_of_ranks(found):
     digests = [answers[0]["digests"] for answers in found.values()]
 
     assert all(by_ranks == by_one for by_ranks, by_one in digests)
@@ -198,7 +198,7 @@ def test_no_answer_is_found_whose_error_exceeds_the_bound_of_ranks(count, ranks,
         assert np.median(found["sharp"]) < 2
 
 
-def test_a_load_that_nothing_balances_is_refused_in_the_words_of_one_process():
+def test_an_unbalanced_load_is_refused_with_the_message_of_one_process():
     pushed, lifted = searched(2, 0)
 
     assert pushed[0] == pushed[1]

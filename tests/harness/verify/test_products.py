@@ -47,7 +47,7 @@ def test_projected_products_of_a_singular_matrix_keep_digits_beyond_a_double():
 
 
 @pytest.mark.parametrize("precision", [np.float64, np.longdouble])
-def test_motions_are_taken_out_on_both_sides_of_the_product(precision):
+def test_rigid_motions_are_removed_on_both_sides_of_the_product(precision):
     rng = np.random.default_rng(1)
     M, R = rng.normal(size=(9, 9)), np.linalg.qr(rng.normal(size=(9, 3)))[0]
     v = rng.normal(size=9)
@@ -58,7 +58,7 @@ def test_motions_are_taken_out_on_both_sides_of_the_product(precision):
     assert_allclose(found.astype(float), P @ M @ P @ v, atol=1e-13)
 
 
-def test_parts_are_multiplied_where_they_begin_and_nothing_else_is_written():
+def test_products_of_slices_write_only_their_slice():
     v = np.array([7.0, 1, 3, -2, 5, 0, 0, 0, 0, 7, 5, -2, 3, 1])
     found = projected(LAPLACIAN, ONES, [10, 1, 5], v, left=99)
 

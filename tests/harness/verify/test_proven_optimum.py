@@ -88,7 +88,7 @@ UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
         (UNITS, at([1, 0])),  # below its bound by the entire bound
     ],
 )
-def test_a_wrong_point_is_refuted_by_its_residuals(qp, s):
+def test_a_wrong_point_is_refuted_by_residuals(qp, s):
     assert judge(qp, s) is Verdict.WRONG
     assert judge(qp, s, 1e-3) is not Verdict.VERIFIED
 
@@ -169,7 +169,7 @@ def test_residuals_refute_no_point_between_nearly_parallel_rows():
 
 
 @pytest.mark.parametrize("angle", [0.3, 1.0, 2.5])
-def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(angle):
+def test_a_weak_oblique_direction_is_resolved_exactly_without_a_reference(angle):
     """P has curvature 1e-16 along a direction of slope 1e-8, rotated and rounded."""
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     P = turn @ np.diag([1, 1e-16]) @ turn.T
@@ -186,13 +186,13 @@ def test_a_weak_oblique_direction_is_known_exactly_where_no_reference_knows_it(a
     assert error > 1e-4
 
 
-def test_a_row_is_judged_by_its_own_terms_where_it_has_a_right_hand_side():
+def test_a_row_with_a_right_hand_side_is_judged_relative_to_its_terms():
     moved = replace(BETWEEN, x=BETWEEN.x + np.array([1.5, 0]))
 
     assert judge(MOVED, moved, 1e-4) is not Verdict.VERIFIED
 
 
-def test_a_reference_refutes_what_residuals_do_not_and_the_record_says_so():
+def test_a_refutation_by_the_reference_is_recorded():
     assert kkt_residuals(WEAK, SHORT).worst <= 10 * TOL
 
     measured = judged(new_record(), WEAK, SHORT, proves(reference_solution))
@@ -236,7 +236,7 @@ def test_a_point_with_nan_anywhere_is_not_verified_by_a_reference(name):
     assert measured.verdict is Verdict.WRONG
 
 
-def test_where_the_reference_fails_residuals_stand():
+def test_if_the_reference_fails_residuals_decide():
     def fails(_):
         raise ArithmeticError
 
@@ -265,7 +265,7 @@ CANCELLED = (  # f* = 2⁻²⁰ between terms of 50 to 1400; some multipliers ar
 
 
 @pytest.mark.parametrize(("kinds", "number"), CANCELLED)
-def test_what_is_left_when_terms_cancel_is_known_exactly(kinds, number):
+def test_cancelling_terms_are_evaluated_exactly(kinds, number):
     planted = hard(frozenset(kinds), number)
     attack = Attack(planted, np.random.default_rng(1))
 
@@ -278,7 +278,7 @@ def test_what_is_left_when_terms_cancel_is_known_exactly(kinds, number):
     assert all(attack.verified(attack.rounded()) for _ in range(5))
 
 
-def test_a_point_that_is_no_optimum_has_no_exact_value():
+def test_a_non_optimal_point_has_no_exact_value():
     qp = qp_of(np.eye(2), [-1, -1], A=[[1, 1]], b=[1], ub=[1e7, 1e7])
     right, wrong = at([0.5, 0.5], [0.5]), at([1e7, 0], [0], z_box=[1, 0])
 
@@ -380,7 +380,7 @@ def test_a_qp_is_small_up_to_400_variables_and_rows(rows, expected):
 
 
 @pytest.mark.parametrize(("n", "expected"), [(4000, True), (4001, False)])
-def test_variables_that_are_coupled_to_none_may_be_ten_times_as_many(n, expected):
+def test_uncoupled_variables_may_be_ten_times_as_many(n, expected):
     assert is_small(replace(qp_of([1], [0]), **vectors(n), P=eye_array(n))) is expected
 
 
@@ -399,7 +399,7 @@ def vectors(n):
     )  # fmt: skip
 
 
-def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
+def test_a_remote_reference_point_hides_no_error():
     """Terms are 1e24 at a solution 1e10 along the free direction x₁ = −x₃,
     f* = 2⁻²⁰.
     """
@@ -439,7 +439,7 @@ BESIDE = qp_of([0, 0], [4e9, 1], A=[[0, 1]], b=[3.5], lb=[-3, -INF])
     ],
     ids=["far bounds", "other variables", "other rows"],
 )  # fmt: skip
-def test_nothing_that_is_large_excuses_all_of_what_is_small(qp, right, wrong, tol):
+def test_large_terms_do_not_hide_small_violations(qp, right, wrong, tol):
     def verified(s, tol):
         residuals = kkt_residuals(qp, s)
         error = decided(qp, s, residuals, tol, proves(reference_solution))
@@ -449,13 +449,13 @@ def test_nothing_that_is_large_excuses_all_of_what_is_small(qp, right, wrong, to
     assert not verified(wrong, tol)
 
 
-def test_far_bounds_do_not_excuse_an_error_where_residuals_alone_decide():
+def test_remote_bounds_hide_no_error_if_residuals_decide():
     s = at([2] * 3, z=[0.5] * 3)  # 6 for 1.5
 
     assert kkt_residuals(WIDE, s, generous=True).worst > 0.1
 
 
-def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
+def test_a_cancelling_objective_is_accurate_relative_to_its_terms():
     """min ½x², x = 1, with a fixed variable of cost −½: f* = 0, terms of ½."""
     qp = qp_of([1, 0], [0, -0.5], A=[[1, 0]], b=[1], lb=[-INF, 1], ub=[INF, 1])
     s = at([1 + 1e-9, 1], [-1 - 1e-9], z_box=[0, 0.5])
@@ -749,7 +749,7 @@ def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(w
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
-def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
+def test_a_search_of_a_hundred_thousand_points_finds_no_wrong_verdict(way):
     """One of 7500 right points is refuted, for a big-M problem (docs/verdicts.md)."""
     wrong, refuted, verified = search(314159, 100_000 // len(WAYS), way)
 
@@ -769,9 +769,7 @@ def idle_beside(*values, count=400):
     ("cost", "bend", "tol"),
     [(1e7, 1e-6, 1e-8), (1e3, 1e-6, 1e-4), (1e12, 1e-6, 1e-8), (1e5, 1e-3, 1e-6)],
 )
-def test_a_row_violated_wholly_is_not_excused_by_costs_beside_it(
-    cost, bend, tol, count
-):
+def test_other_costs_do_not_hide_a_violated_row(cost, bend, tol, count):
     """min Cx₁ + x₂ + ½s‖x‖², x₂ = 1, x₁ ≥ 0 has x* = (0, 1)."""
     q, row, pulls, right = idle_beside(
         [cost, 1], [0, 1], [-cost, 0], [0, 1], count=count
@@ -788,7 +786,7 @@ def test_a_row_violated_wholly_is_not_excused_by_costs_beside_it(
 
 @pytest.mark.parametrize("count", [0, 400])
 @pytest.mark.parametrize("tol", [1e-8, 1e-4])
-def test_an_operator_that_tells_no_diagonal_excuses_no_force(tol, count):
+def test_an_operator_without_diagonal_hides_no_force(tol, count):
     """min ½x₂² + 3e5x₁ + x₂, x₁ = 0 has x* = (0, −1)."""
     q, row, bends, right = idle_beside([3e5, 1], [1, 0], [1, 1], [0, -1], count=count)
     qp = replace(qp_of(bends, q, A=[row], b=[0]), P=Products(np.diag(bends)))
@@ -798,7 +796,7 @@ def test_an_operator_that_tells_no_diagonal_excuses_no_force(tol, count):
 
 
 @pytest.mark.parametrize("count", [0, 400])
-def test_a_narrow_box_lends_no_length_to_a_row(count):
+def test_a_narrow_box_does_not_increase_the_scale_of_a_row(count):
     """x₁ has stiffness 1e18 and bounds 2e-9 apart; x₂ = 1 has stiffness 1."""
     bends, q, row, wrong = idle_beside(
         [1e18, 1], [-1e18, 0], [0, 1], [1, 0], count=count
@@ -820,7 +818,7 @@ def judge_decided(qp, s, tol=TOL):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("count", [0, 400])
-def test_a_row_that_is_far_away_excuses_no_violation(sign, count):
+def test_a_remote_row_hides_no_violation(sign, count):
     """min ½x₁² − x₁, x₁ = x₂ ≤ ½, x₂ ≥ −1e12 has x* = (½, ½)."""
     bends, q, row, far, right, wrong, pulls = idle_beside(
         [1, 0], [-1, 0], [sign, -sign], [0, -1], [0.5, 0.5], [1, 0.5], [0, 0.5],
@@ -853,7 +851,7 @@ def test_a_chain_of_idle_variables_is_as_long_as_its_first_row(rows, off):
             assert judge(qp, far) is Verdict.WRONG
 
 
-def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
+def test_a_row_of_large_variables_is_satisfied_to_their_accuracy():
     """x* = (512, −512) is 256 times the length over which the energy changes by E."""
     soft = 2.0**-18  # curvature along (1, −1), in which x is long
     P = np.array([[1 + soft, 1 - soft], [1 - soft, 1 + soft]])
@@ -878,7 +876,7 @@ def objective(qp, x):
 
 
 @pytest.mark.parametrize("cost", [1e6, 1e9, 1e12])
-def test_costs_on_bounds_do_not_excuse_an_objective_that_vanishes(cost):
+def test_costs_on_bounds_hide_no_error_of_a_vanishing_objective(cost):
     """x* = (0, 0, 0, 1, 1), f* = 0 with terms 1 and ½; the costs have energies C²."""
     qp = qp_of(
         [1, 1, 1, 1, 0], [cost] * 3 + [-1, 0.5],
@@ -896,7 +894,7 @@ def test_costs_on_bounds_do_not_excuse_an_objective_that_vanishes(cost):
         assert judged_at(1 - 2 * np.sqrt(100 * tol), tol) is not Verdict.VERIFIED
 
 
-def test_a_tiny_cost_beside_others_is_no_unit_of_a_solution_that_vanishes():
+def test_a_tiny_cost_is_not_the_scale_of_a_vanishing_solution():
     """min ½‖x‖² + x₁ + x₂ + 1e-9·x₃, x ≥ 0 has x* = 0."""
     qp = qp_of([1] * 3, [1, 1, 1e-9], lb=0)
     pulls = [-1, -1, -1e-9]
@@ -908,9 +906,7 @@ def test_a_tiny_cost_beside_others_is_no_unit_of_a_solution_that_vanishes():
 @pytest.mark.parametrize(
     ("n", "with_row"), [(1, False), (3, False), (403, False), (1, True), (3, True)]
 )
-def test_a_point_at_rounding_of_zero_is_right_where_all_data_are_of_order_one(
-    n, with_row
-):
+def test_a_point_within_rounding_of_zero_is_verified_for_data_of_order_one(n, with_row):
     """min Σxⱼ, x ≥ 0, possibly with Σxⱼ ≥ 0, has x* = 0; 1e-11 is not an error."""
     G, h = ([-np.ones(n)], [0]) if with_row else (None, ())
     qp = qp_of([0] * n, [1] * n, G=G, h=h, lb=0)

@@ -67,7 +67,7 @@ class Broken:
     to_primal = staticmethod(fault)
 
 
-def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
+def test_the_name_of_a_measurement_depends_only_on_what_is_measured():
     names = [
         record().run_id,
         record(tol=1e-6).run_id,
@@ -100,7 +100,7 @@ def test_measurements_have_the_names_that_they_have_in_earlier_journals():
         assert same.run_id == r["run_id"]
 
 
-def test_what_was_declined_is_declined_and_has_no_residuals():
+def test_a_declined_measurement_has_no_residuals():
     answer = Solution.without_point(QP_, Status.DECLINED, "bounds only")
     got = judged(record(), QP_, answer)
 
@@ -119,7 +119,7 @@ def test_a_solution_is_verified_and_has_its_objective():
     ("tol", "accuracy", "is_right"),
     [(1e-8, None, False), (1e-2, None, True), (1e-8, 1e-2, True), (1e-2, 1e-8, False)],
 )
-def test_the_accuracy_of_a_suite_goes_before_the_tolerance(tol, accuracy, is_right):
+def test_the_accuracy_of_a_suite_overrides_the_tolerance(tol, accuracy, is_right):
     near = replace(POINT, x=POINT.x + np.array([-1e-3, 1e-3]))
     got = judged(record(tol, accuracy=accuracy), QP_, near)
 
@@ -128,7 +128,7 @@ def test_the_accuracy_of_a_suite_goes_before_the_tolerance(tol, accuracy, is_rig
 
 @pytest.mark.parametrize("name", ["x", "y", "z", "z_box"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_point_that_is_not_finite_means_nothing(name, value):
+def test_a_point_that_is_not_finite_has_no_results(name, value):
     vector = getattr(POINT, name).copy()
     vector[0] = value
     broken = replace(POINT, **{name: vector})
@@ -144,14 +144,14 @@ def test_quantities_are_plain_numbers():
     assert type(quantities["first"]) is float
 
 
-def test_a_point_too_large_for_its_quantities_warns_nobody():
+def test_a_point_that_overflows_its_quantities_causes_no_warning():
     large = replace(POINT, x=np.full(2, 1e200))
     found = quantities_of(case(lambda s: {"value": QP_.objective(s.x)}), large)
 
     assert found == ({"value": np.inf}, "")
 
 
-def test_what_a_family_cannot_compute_is_a_note_of_one_line():
+def test_failing_quantities_add_a_one_line_note():
     message = "ZeroDivisionError: two lines"
 
     assert quantities_of(case(fault), POINT) == ({}, f"no quantities: {message}")
@@ -160,12 +160,12 @@ def test_what_a_family_cannot_compute_is_a_note_of_one_line():
     )  # fmt: skip
 
 
-def test_without_mechanics_there_is_no_bound_and_nothing_to_note():
+def test_without_mechanics_there_is_no_bound_and_no_note():
     assert certified(case(), POINT) == ({}, "")
 
 
 @pytest.mark.parametrize("is_bounded", [True, False])
-def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
+def test_the_time_of_certification_is_recorded_with_or_without_a_bound(
     monkeypatch, is_bounded
 ):
     """The clock advances by 2 s at its second reading."""
@@ -231,7 +231,7 @@ def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
     return evaluated_by_ranks(emitted, s, ranks)
 
 
-def test_ranks_find_the_objective_and_no_residual_of_a_solution():
+def test_ranks_compute_the_objective_and_zero_residuals_of_a_solution():
     found = on_one_rank()
 
     values = found.pop("values")
@@ -241,14 +241,14 @@ def test_ranks_find_the_objective_and_no_residual_of_a_solution():
     assert set(found.values()) == {None}  # no value is available
 
 
-def test_ranks_say_nothing_of_a_point_that_is_not_finite():
+def test_ranks_return_no_results_for_a_point_that_is_not_finite():
     found = on_one_rank([np.nan, 1], quantities=lambda: {"first": 0.25})
 
     assert found.pop("notes") == []
     assert set(found.values()) == {None}
 
 
-def test_ranks_give_physical_results_as_plain_numbers():
+def test_ranks_return_physical_results_as_plain_numbers():
     found = on_one_rank(quantities=lambda: {"first": np.float64(0.25)})
 
     assert found["quantities"] == {"first": 0.25}
@@ -256,14 +256,14 @@ def test_ranks_give_physical_results_as_plain_numbers():
     assert found["recover_seconds"] >= 0
 
 
-def test_results_that_ranks_cannot_compute_are_none_and_a_note_of_one_line():
+def test_results_that_fail_on_ranks_are_none_with_a_one_line_note():
     found = on_one_rank(quantities=lambda: fault(None))
 
     assert found["quantities"] == {}
     assert found["notes"] == ["no quantities: ZeroDivisionError: two lines"]
 
 
-def test_a_bound_that_ranks_cannot_give_is_a_note(monkeypatch):
+def test_a_failing_bound_on_ranks_adds_a_note(monkeypatch):
     def certify(*mechanics):
         raise UncertifiableError("no admissible pair")
 

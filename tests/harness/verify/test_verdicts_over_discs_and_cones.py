@@ -266,7 +266,7 @@ def search(seed, tries, each=200, traps=None):
     return wrong, refuted, verified, proven / (tries // each)
 
 
-def test_a_short_search_deceives_no_verdict():
+def test_no_verdict_is_wrong_in_a_short_search():
     wrong, refuted, verified, proven = search(271828, 120, 40)
 
     assert (wrong, refuted) == ([], [])
@@ -275,7 +275,7 @@ def test_a_short_search_deceives_no_verdict():
 
 
 @pytest.mark.slow
-def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
+def test_no_verdict_is_wrong_on_a_hundred_thousand_points():
     wrong, refuted, verified, proven = search(314159, 100_000)
 
     assert (wrong, refuted) == ([], [])
@@ -284,7 +284,7 @@ def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
 
 
 @pytest.mark.slow
-def test_residuals_alone_deceive_no_verdict_without_traps():
+def test_residuals_alone_yield_no_wrong_verdict_on_regular_points():
     """Without a reference solve, the error of f is at most ten times the residuals."""
     rng, verified = np.random.default_rng(161803), 0
     for _ in range(200):
@@ -344,7 +344,7 @@ def _shorten_normal(z, one, block):
 
 
 @pytest.mark.parametrize(("length", "accepted"), [(1e-10, True), (1e-5, False)])
-def test_a_disc_of_tiny_radius_is_judged_by_its_neighbour(length, accepted):
+def test_a_tiny_disc_is_judged_relative_to_its_neighbour(length, accepted):
     """At the edge of a contact zone, a friction bound is far below rounding."""
     P = np.eye(4) + np.kron(np.ones((2, 2)), np.eye(2))
     qp = QP.from_arrays(P, [-3, 0, -3, 0], sets=[Discs([[0, 1], [2, 3]], [1, 1e-12])])
@@ -353,7 +353,7 @@ def test_a_disc_of_tiny_radius_is_judged_by_its_neighbour(length, accepted):
 
 
 @pytest.mark.parametrize("trap", ["", *TRAPS])
-def test_further_measures_vanish_at_solutions_and_are_of_first_order(trap):
+def test_additional_measures_vanish_at_solutions_and_are_of_first_order(trap):
     for seed in range(10):
         planted = ExactProblem({trap}, seed)
         qp, s = planted.qp, planted.solution
@@ -406,7 +406,7 @@ def test_distances_to_normal_cones_are_euclidean():
 
 
 @pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny")])
-def test_multipliers_are_found_for_points_alone(trap):
+def test_multipliers_are_computed_for_points(trap):
     worst = []
     for seed in range(5):
         planted = ExactProblem({trap}, seed)
@@ -416,7 +416,7 @@ def test_multipliers_are_found_for_points_alone(trap):
     assert np.quantile(worst, 0.8) <= 1e-7
 
 
-def test_verify_and_solve_report_the_further_measures(tmp_path, capsys):
+def test_verify_and_solve_report_the_additional_measures(tmp_path, capsys):
     planted = ExactProblem(set(), 5)
     found = mb.verify(planted.qp, planted.solution.x)
     assert found.verdict is mb.Verdict.VERIFIED
@@ -471,7 +471,7 @@ def test_equivalent_formulations_have_the_same_residuals(trap):
         )
 
 
-def test_a_reversed_or_shifted_cone_is_no_cone():
+def test_a_reversed_or_shifted_cone_is_refused():
     qp = mb.QP.from_arrays(np.eye(3), [1, 1, 1], sets=[Cones([[0, 1, 2]], [1])])
     with pytest.raises(ValueError, match="Cones cannot be scaled unevenly or rever"):
         mirror(qp, [0])

@@ -88,7 +88,7 @@ def test_an_unbalanced_load_is_refused_by_name(fixed, forces, message):
     assert str(e.value).startswith(message)
 
 
-def test_bodies_that_can_only_move_together_are_both_named():
+def test_bodies_that_can_only_move_together_are_all_named():
     """The lower block is pushed up against the upper block, which has no support."""
     fixed = [("lower", "left", "x"), ("upper", "left", "x")]
     forces = [("lower", "bottom left", [0, 4]), ("lower", "bottom right", [0, 4])]
@@ -100,7 +100,7 @@ def test_bodies_that_can_only_move_together_are_both_named():
     )
 
 
-def test_of_bodies_that_move_together_the_one_without_supports_is_named():
+def test_among_bodies_moving_together_the_unsupported_one_is_named():
     fixed = [("upper", "top left", "x"), ("upper", "bottom left", "x")]
     with pytest.raises(InputError) as e:
         check_balance(*blocks(fixed=fixed, forces=DOWN))
@@ -111,7 +111,7 @@ def test_of_bodies_that_move_together_the_one_without_supports_is_named():
     )
 
 
-def test_bodies_that_supports_hold_need_no_contact():
+def test_supported_bodies_need_no_contact():
     bodies, rows = blocks(
         fixed=[SUPPORT, ("upper", "top", "xy")],
         forces=[("upper", "bottom left", [5, 5])],
@@ -120,7 +120,7 @@ def test_bodies_that_supports_hold_need_no_contact():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_loads_are_refused_where_a_linear_program_has_a_free_motion(seed):
+def test_loads_are_refused_if_and_only_if_a_linear_program_has_a_free_motion(seed):
     """The linear program maximises fᵀr over rigid motions r with B_D r = 0 and B r ≤ 0
     whose components are at most 1 in magnitude."""
     rng = np.random.default_rng(seed)

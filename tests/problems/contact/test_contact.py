@@ -184,7 +184,7 @@ def test_a_master_without_a_segment_or_a_place_is_refused(master, message):
         rows(np.array([[1.0, 0.25]]), master)
 
 
-def test_a_slave_that_has_flown_away_is_refused():
+def test_a_slave_far_away_from_the_master_is_refused():
     with pytest.raises(InputError, match=r"slave: node 0 is at \[inf, 0.25\]"):
         rows(np.array([[np.inf, 0.25]]), MASTER)
 

@@ -42,7 +42,7 @@ METHODS = {
 
 @quick
 @given(side=sides())
-def test_rows_are_blind_to_translations(side):
+def test_rows_are_invariant_under_translations(side):
     for name, method in METHODS.items():
         B, c, *_ = method(*side)
         forces = B.toarray().reshape(len(c), len(side[0]), 2)

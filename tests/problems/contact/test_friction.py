@@ -50,7 +50,7 @@ def test_the_fixed_point_satisfies_coulombs_law(cohesion):
         assert one.unsettled == pytest.approx(float(off[0]))
 
 
-def test_a_bound_of_zero_is_as_far_from_the_law_as_the_law_demands():
+def test_the_residual_at_a_bound_of_zero_is_the_bound_of_the_law():
     first, *others = coulomb_fixed_point(friction(0.5), lifted(0.0), step=1)
 
     assert first.unsettled == 3.0
@@ -97,7 +97,7 @@ def test_slow_convergence_ends_after_a_thousand_problems():
     assert len(calls) == 1000
 
 
-def test_a_bound_that_holds_no_equilibrium_is_named():
+def test_a_bound_without_equilibrium_is_named():
     def normal(one):
         if one.bound > 2:
             raise ArithmeticError("no optimal point")
@@ -120,7 +120,7 @@ def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
         select_iterate(problems, 4, 5)
 
 
-def test_nodes_are_pressed_and_never_pulled():
+def test_contact_forces_on_nodes_are_compressive():
     force = forces_at_nodes(np.array([2.0, -1.0, 3.0]), np.array([4, 0, 1]), 5)
 
     assert force.tolist() == [0, 3, 0, 0, 2]

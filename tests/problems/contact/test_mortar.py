@@ -86,7 +86,7 @@ def test_a_master_node_is_projected_along_the_normal_field():
     assert xi == pytest.approx([-0.281575016087237], abs=1e-15)
 
 
-def test_a_ray_meets_the_master_where_the_lines_cross():
+def test_a_ray_meets_the_master_at_the_intersection_of_the_lines():
     """The ray from the middle of (0, 0)-(2, 0) meets the line through (0, −1) and (2,
     −3)."""
     s, m = sides([[0, 0], [2, 0]], [[2, -3], [0, -1]])
@@ -211,7 +211,7 @@ def test_a_row_of_the_dual_basis_pulls_the_slave_along_the_normal_of_its_node():
     assert pull == pytest.approx(share[:, None] * s.node_normal, abs=1e-15)
 
 
-def test_a_sliver_of_cover_keeps_D_equal_to_the_cover():
+def test_a_tiny_covered_part_keeps_D_equal_to_the_covered_length():
     slave, master = flat(7, 0.0, rightwards=True), [[3 / 7 + 1e-7, 0], [-1, 0]]
     I = integrate(*sides(slave, master), "dual", Reach())
 
@@ -257,7 +257,7 @@ def test_the_rays_of_a_curved_slave_cover_it_once():
 
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_the_search_loses_no_overlap(seed, monkeypatch):
+def test_the_search_finds_every_overlap(seed, monkeypatch):
     rng = np.random.default_rng(seed)
     slave, master = arcs(70)
     s, m = sides(slave + 0.02 * rng.standard_normal(slave.shape),

@@ -57,7 +57,7 @@ def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
     )
 
 
-def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
+def test_the_closest_segment_is_found_on_a_chain_with_loops():
     """Sub-chains of four segments are closed, so that their chords have length zero."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])

@@ -268,7 +268,7 @@ def test_the_reference_finds_the_planted_active_set():
     assert s.status is Status.SOLVED
 
 
-def test_the_reference_of_the_primal_is_what_its_dual_leads_back_to():
+def test_the_reference_of_the_primal_is_recovered_from_its_dual():
     primal = clamped_bar()
     dual = dual_bounds(primal, regular_inverse(primal.P, np.arange(1, 12)))
     back = dual.recover(reference_solution(dual.qp))
@@ -290,7 +290,7 @@ def test_recovery_keeps_the_claim():
 
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_a_dual_is_charged_for_a_factor_that_was_there_already(form):
+def test_the_time_of_a_dual_includes_a_cached_factorisation(form):
     family = PROBLEMS["beam-ring"]
     for step in (1, 2):
         params = family.complete(dict(Nr=3, Nh=2, step=step))
@@ -319,7 +319,7 @@ class Counted:
 @pytest.mark.parametrize(
     ("factorise", "transform"), [("floating", dualise), ("clamped", dual_bounds)]
 )
-def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transform):
+def test_a_path_of_many_steps_recovers_only_requested_steps(factorise, transform):
     geometry = (3, 2, 4, "strain")
     bodies, inverse = (
         model(*geometry),

@@ -45,7 +45,7 @@ def assembled(qp):
 
 @pytest.mark.parametrize("law", [0.0, 3e8], ids=["smooth", "tresca"])
 @pytest.mark.parametrize("rows", GLUING)
-def test_the_solution_is_that_of_the_whole(rows, law):
+def test_the_solution_is_that_of_the_undecomposed_body(rows, law):
     primal, friction = posed(law)
     _, torn_apart = dual_of(primal, friction, rows)
     whole = dualise(primal, factorise_floating(BODIES), friction=friction)

@@ -106,7 +106,7 @@ def test_two_bodies_with_second_derivatives_converge_quadratically():
     assert found[2] <= max(10 * found[1] ** 2, 1e-11)
 
 
-def test_the_equilibrium_does_not_depend_on_how_it_is_found():
+def test_the_equilibrium_does_not_depend_on_the_load_path():
     with_curvature, without = (
         ring_path(contact_stiffness=c).iterations(2)[-1].answer.x
         for c in ("geometric", "none")
@@ -150,8 +150,7 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
 
 @pytest.fixture(scope="module")
 def equilibrium():
-    """Return a path, its last configuration and the multipliers (places,) of the
-    latter."""
+    """Return a path, its last configuration and the multipliers (places,) there."""
     path = patch_path(contact="nts")
     last = path.iterations(1)[-1]
     lam = path._at_places(last)
@@ -161,7 +160,7 @@ def equilibrium():
     return path, at, lam
 
 
-def test_the_residual_holds_the_largest_penetration(equilibrium):
+def test_the_residual_includes_the_largest_penetration(equilibrium):
     path, at, lam = equilibrium
     gap = at.gap.copy()
     open_row = int(np.argmin(lam[at.rows.place]))
@@ -173,7 +172,7 @@ def test_the_residual_holds_the_largest_penetration(equilibrium):
     assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
 
 
-def test_the_residual_holds_gaps_under_multipliers_by_their_share(equilibrium):
+def test_the_residual_weights_gaps_by_shares_of_multipliers(equilibrium):
     path, at, lam = equilibrium
     row, other = 0, 1
     pressing = np.zeros_like(lam)
@@ -234,7 +233,7 @@ def configuration(u, energy, gap, r=-1.0, strain_energy=0.0):
         ({1.0: (1.1, 5.0), 0.5: (0.9, 0.5)}, 0.5),
     ],
 )
-def test_a_step_has_to_bring_its_share_of_the_predicted_decrease(table, length):
+def test_a_step_must_achieve_a_fraction_of_the_predicted_decrease(table, length):
     path = OneUnknown(bodies=None, cells=None, gaps=None, reference=table)
     posed = SimpleNamespace(
         load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
@@ -245,7 +244,7 @@ def test_a_step_has_to_bring_its_share_of_the_predicted_decrease(table, length):
     assert at.u[0] == length
 
 
-def test_a_full_step_that_halves_the_least_residual_is_taken_whatever_it_costs():
+def test_a_full_step_that_halves_the_least_residual_is_always_accepted():
     table = {1.0: (9.0, -3.0), 0.5: (-9.0, 0.0)}
     path = OneUnknown(bodies=None, cells=None, gaps=None, reference=table)
     posed = SimpleNamespace(
@@ -274,7 +273,7 @@ def test_only_a_full_step_may_halve_the_residual_instead():
     assert searched(table, configuration(0.0, 0.0, 0.0), best=4.0, steps=2) == 0.25
 
 
-def test_a_direction_uphill_may_not_raise_the_merit_function():
+def test_an_ascent_direction_may_not_increase_the_merit_function():
     """With the slope +1, Armijo's condition alone would admit an increase of 1e-4."""
     table = {1.0: (5e-5, 0.0), 0.5: (-1e-9, 0.0)}
     assert searched(table, configuration(0.0, 0.0, 0.0, r=1.0)) == 0.5
@@ -436,7 +435,7 @@ def test_a_load_has_a_number_of_iterations():
     assert message == "at the load factor 1, 60 iterations left a residual of 1.0e+00"
 
 
-def test_weights_are_above_all_multipliers_so_far_however_small():
+def test_weights_exceed_all_previous_multipliers():
     lam = {1: 0.02, 2: 0.1, 3: 0.05, 4: 0.0}
     _, log = iterated(
         lambda n: (1.0, 1.0 if n < 4 else 0.0), lambda n: np.array([0.0, lam[n]])
@@ -563,7 +562,7 @@ def test_contact_stiffness_that_leaves_the_tangent_definite_is_part_of_it():
         assert abs(difference).max() <= 1e-12 * abs(K).max()
 
 
-def test_contact_stiffness_is_asked_for_in_units_and_kept_without():
+def test_contact_stiffness_is_requested_in_units_and_stored_without_units():
     asked = []
 
     def curvature(u, lam):
@@ -580,7 +579,7 @@ def test_contact_stiffness_is_asked_for_in_units_and_kept_without():
     assert (K == np.array([[7, 0, 2], [0, 0, 0], [2, 0, 1]]) / 4).all()
 
 
-def test_a_tangent_that_cannot_be_made_convex_ends_the_load(monkeypatch):
+def test_a_tangent_that_cannot_be_made_convex_ends_the_load_step(monkeypatch):
     path = ring_path()
     last = path.iterations(1)[-1]
     at = path._configuration(last.u, last.load_factor, last.gaps)
@@ -593,7 +592,7 @@ def test_a_tangent_that_cannot_be_made_convex_ends_the_load(monkeypatch):
         path._convex(at, np.zeros(path._places), None)
 
 
-def test_an_answer_that_is_none_ends_the_load():
+def test_a_wrong_or_missing_answer_ends_the_load():
     path = ring_path()
     last = path.iterations(1)[-1]
 
@@ -613,7 +612,7 @@ def test_an_answer_that_is_none_ends_the_load():
             other._solve(last.primal, other._inverse(last.tangent.K))
 
 
-def test_bodies_that_nothing_touches_are_in_equilibrium_without_a_reference():
+def test_bodies_without_contact_need_no_reference_solution():
     path = ring_path()
     last = path.iterations(1)[-1]
     rows = last.rows
@@ -628,7 +627,7 @@ def test_bodies_that_nothing_touches_are_in_equilibrium_without_a_reference():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_rotations_either_way_are_rotations(monkeypatch, sign):
+def test_rotations_of_either_sign_are_detected(monkeypatch, sign):
     bodies = beam_ring.model(2, 2, 4, "strain")
     one_node = np.unique(bodies.B_D.indices)[:2]
     rows = csr_array(eye_array(bodies.mesh.dofs, format="csr")[one_node])
@@ -645,7 +644,7 @@ def test_rotations_either_way_are_rotations(monkeypatch, sign):
         path.iterations(1)
 
 
-def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
+def test_the_penalty_exceeds_every_previous_multiplier(monkeypatch):
     """The penalty is exact for weights above ‖λ‖∞, and weights never decrease."""
     seen, move = [], newton.NewtonPath._line_search
 
@@ -672,7 +671,7 @@ def test_a_load_is_settled_by_a_full_step_to_equilibrium_and_no_earlier():
     assert all(i.length < 1 or i.residual > 1e-9 for i in before)
 
 
-def test_a_load_step_that_fails_comes_in_parts(monkeypatch):
+def test_a_failed_load_step_is_subdivided(monkeypatch):
     whole = ring_path(steps=1)
     expected = whole.iterations(1)[-1].answer.x
     beam_ring._newton_path.cache_clear()
@@ -699,7 +698,7 @@ def test_the_line_search_decreases_the_penalty_function():
     assert all(merit[j + 1] < merit[j] for j in short)
 
 
-def test_an_impossible_load_says_where_it_stopped(monkeypatch):
+def test_the_message_for_an_impossible_load_states_the_last_load_reached(monkeypatch):
     monkeypatch.setattr(newton, "MAX_HALVINGS", 0)
     path = plane_path(n=1, load=1e5, material="svk")
 
@@ -726,7 +725,7 @@ def test_advice_is_a_larger_load_for_tiny_loads_and_a_smaller_one_otherwise(
         plane_path(load=9.0).iterations(1)  # not cached by another test
 
 
-def test_an_iteration_that_is_not_there_is_refused():
+def test_a_missing_iteration_is_refused():
     count = len(plane_path().iterations(1))
 
     with pytest.raises(InputError, match=f"newton=99: step 1 has {count} Newton"):
@@ -773,7 +772,7 @@ def test_a_node_between_two_segments_keeps_one_of_them():
     assert 0 < penetration <= 1e-5
 
 
-def test_contact_stiffness_needs_bodies_that_supports_hold():
+def test_contact_stiffness_needs_supported_bodies():
     path = patch_path(contact="nts", contact_stiffness="geometric")
 
     reason = "is not built for bodies supported by contact alone"

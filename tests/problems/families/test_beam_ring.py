@@ -123,7 +123,7 @@ def test_every_form_gives_the_same_displacement_energy_and_multipliers(plane):
 
 
 @pytest.mark.parametrize("transform", ["dual", "dual-bounds"])
-def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
+def test_recovery_yields_a_primal_solution_with_all_multipliers(
     transform,
 ):
     bodies = model(4, 3, 6, "strain")
@@ -199,7 +199,7 @@ def test_forces_are_in_equilibrium():
     assert total + result["contact_force"] == pytest.approx([0, 1e8], abs=1)
 
 
-def test_no_contact_no_force():
+def test_without_contact_there_is_no_contact_force():
     """Under an upward load, the beam does not touch the ring, and λ_I = 0 exactly."""
     case = build("dual-bounds", Nr=4, Nh=3, steps=1)
     primal = build("primal", Nr=4, Nh=3, steps=1)
@@ -210,7 +210,7 @@ def test_no_contact_no_force():
     assert (reference_solution(lifted).x == 0).all()
 
 
-def test_the_load_of_a_step_is_its_share():
+def test_the_load_of_a_step_is_its_fraction_of_the_full_load():
     full, half = (build("primal", Nr=4, Nh=3, steps=4, step=k).qp.q for k in (4, 2))
 
     assert half == pytest.approx(full / 2)
@@ -256,7 +256,7 @@ def test_linearised_to_convergence_it_has_the_reference_values(
     assert result["active"] == active
 
 
-def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
+def test_the_load_steps_of_the_paper_are_of_first_order():
     """The tip deflection is compared with that of the converged linearisation.
 
     Halving the load step halves the error. Three linearisations of a single load step
@@ -301,7 +301,7 @@ def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
         ),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
+def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
     with pytest.raises(InputError, match="beam-ring: ") as e:
         FAMILY.check(FAMILY.complete(bad))
 

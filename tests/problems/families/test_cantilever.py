@@ -48,7 +48,7 @@ def emitted(name):
 
 
 @pytest.mark.parametrize(("load", "ny"), [(1, 8), (10, 4)])
-def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
+def test_the_tip_of_a_slender_beam_agrees_with_the_elastica(load, ny):
     case, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
 
     assert answer.verdict == "verified"
@@ -121,7 +121,7 @@ def test_every_iteration_is_a_convex_qp_in_the_total_displacement():
         assert following is at or np.allclose(following.u, at.u + step, atol=1e-14)
 
 
-def test_forms_pose_the_same_iteration():
+def test_all_forms_define_the_same_iteration():
     name = "cantilever/slenderness=4/ny=2/load=2/newton=2"
     primal, dual = (emitted(f"{name}/{form}") for form in ("primal", "dual"))
 

@@ -23,7 +23,7 @@ STRETCHED = dict(lower=3, upper=2, ratio=3.0)
      (FrictionLaw("coulomb", mu=0.1), dict(friction="coulomb", mu=0.1)),
      (None, {})],
 )  # fmt: skip
-def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
+def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
     params = PATCH.complete(STRETCHED | keys)
     case = PATCH.build(form, params, reference_solution)
     own = one_step(model(params), form, friction=law, reference=reference_solution)
@@ -54,7 +54,7 @@ def test_invalid_laws_are_refused_in_one_line(law, message):
     assert "\n" not in str(e.value)
 
 
-def test_friction_may_hold_a_load_along_the_side():
+def test_friction_can_balance_a_tangential_load():
     """Without friction, the tangential load on the upper block is not balanced."""
     bodies = model(PATCH.complete(STRETCHED))
     upper = bodies.body_of_node == 1
@@ -72,7 +72,7 @@ def test_friction_may_hold_a_load_along_the_side():
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
-def test_bodies_in_parts_are_those_in_one_piece(glue):
+def test_decomposed_bodies_have_the_solution_of_undecomposed_ones(glue):
     bodies = model(PATCH.complete(STRETCHED | {"lower": 5, "upper": 4}))
     law = FrictionLaw("tresca", bound=1e5)
     whole = one_step(bodies, "dual", friction=law)
@@ -91,6 +91,6 @@ def test_bodies_in_parts_are_those_in_one_piece(glue):
      ("dual", {"parts": 1}, "parts=1 for 2 bodies"),
      ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
 )  # fmt: skip
-def test_impossible_parts_are_refused(form, keys, message):
+def test_impossible_decompositions_are_refused(form, keys, message):
     with pytest.raises(InputError, match=message):
         one_step(model(PATCH.complete({})), form, **keys)

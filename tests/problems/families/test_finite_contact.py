@@ -211,7 +211,7 @@ def test_inconsistent_keys_are_refused_in_one_line(name, message):
     assert "\n" not in str(e.value)
 
 
-def test_a_material_that_softens_is_refused_where_it_does():
+def test_a_softening_material_is_refused_at_the_softening_stretch():
     """The pressure on this material is largest at the stretch 1/√3."""
     with pytest.raises(InputError, match=r"material=svk softens from 0\.5774 on"):
         built("contact-patch", stretch=0.5, material="svk")

@@ -94,7 +94,7 @@ def test_shear_without_contact_is_counted_separately():
     assert counts == [values[name] for name in states]
 
 
-def test_coulomb_grants_no_shear_without_contact():
+def test_coulombs_law_permits_no_shear_without_contact():
     _, _, values = solved("beam-ring/steps=1/friction=coulomb/mu=0.3/dual")
     assert values["sliding_without_contact"] == 0
     assert values["shear_without_contact"] == 0
@@ -220,14 +220,14 @@ def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
         block_on_incline(0.2, law)
 
 
-def test_the_limit_of_coulomb_is_refused_in_the_same_words():
+def test_the_limit_of_coulombs_law_is_refused_with_the_same_message():
     with pytest.raises(
         InputError, match=r"no equilibrium .* friction cannot hold the load; expected"
     ):
         block_on_incline(0.412371 + 4e-4, COULOMB)
 
 
-def test_loads_are_balanced_where_friction_may_hold_them():
+def test_friction_may_balance_loads():
     """The balance is checked as for the family `bodies`; without friction, the block
     slides."""
     bodies = incline(0.3)
@@ -252,7 +252,7 @@ def test_below_the_limit_forces_do_not_depend_on_the_law(push):
         )
 
 
-def test_quasi_static_slip_begins_where_the_step_before_ended():
+def test_quasi_static_slip_starts_from_the_previous_step():
     """The load grows in two equal steps; with loading=static, the first step has no
     effect on the second."""
     name = f"{SMALL.replace('steps=1', 'steps=2')}/friction=tresca/bound=5e7"
@@ -268,7 +268,7 @@ def test_quasi_static_slip_begins_where_the_step_before_ended():
     assert kkt_residuals(path.qp, s).worst < 1e-9
 
 
-def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
+def test_iterates_are_the_tresca_problems_of_the_fixed_point_iteration():
     """The bound of each iterate is mu times the normal force of its predecessor."""
     name = f"{SMALL}/friction=coulomb/mu=0.3"
     _, _, first = solved(f"{name}/iterate=1/dual-bounds")
@@ -320,7 +320,7 @@ def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, message):
 @pytest.mark.parametrize(
     "load", [(0.0, 1.0), pytest.param((1.0, 1.0), marks=pytest.mark.slow)]
 )
-def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(load):
+def test_a_divergent_fixed_point_iteration_ends_with_its_last_residual(load):
     """The tip of a slender beam touches a wall across the beam, where slip causes large
     changes of the pressure."""
     mesh = rectangle((0.0, 0.0), (4.0, 0.2), (20, 2))

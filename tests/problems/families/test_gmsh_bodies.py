@@ -137,7 +137,9 @@ def build(text):
 
 @pytest.mark.parametrize("writer", [msh22, msh41])
 @pytest.mark.parametrize("flip", [False, True])
-def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, flip):
+def test_bodies_of_the_paper_from_a_gmsh_file_give_the_same_results(
+    described, writer, flip
+):
     described(writer(POINTS, *parts(flip)))
     ours = assemble_stiffness(read_bodies(Path("a.toml"), "strain"))
 
@@ -155,7 +157,7 @@ def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, 
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
+def test_triangles_of_any_orientation_are_read(tmp_path, clockwise):
     quads, curves, spots = parts()
     triangles = {
         name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
@@ -214,7 +216,7 @@ def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
         assert energies[0] == pytest.approx(energies[1], rel=1e-9)
 
 
-def test_settings_come_from_the_file_unless_the_name_has_them(described):
+def test_settings_in_the_name_override_those_in_the_file(described):
     text = described()
     plain, other = (parse(text + keys + "/dual", PROBLEMS)
                     for keys in ("", "/steps=4/plane=stress"))  # fmt: skip
@@ -227,7 +229,7 @@ def test_settings_come_from_the_file_unless_the_name_has_them(described):
     assert again == other
 
 
-def test_the_file_may_ask_for_finite_strain(described):
+def test_the_file_may_request_finite_strain(described):
     name = described(toml='kinematics = "finite"\nmaterial = "svk"\n' + TOML)
     params = parse(f"{name}/dual", PROBLEMS).params
 
@@ -289,7 +291,7 @@ def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
     assert bodies.force == 1e8
 
 
-def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(described):
+def test_bodies_held_only_by_contact_have_one_qp_and_no_load_path(described):
     text = described(toml=FLOATING.replace("force = [0, -1e8]", TOP))
 
     dual = build(f"{text}/steps=1/dual")
@@ -347,7 +349,7 @@ def sheared_blocks(described):
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
 @pytest.mark.parametrize("step", [1, 2, 3])
-def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
+def test_a_block_held_by_friction_is_loaded_in_steps(
     sheared_blocks, contact, form, step
 ):
     """After step k of 3, stress and displacement (γy, −εy) are k/3 of their final
@@ -369,7 +371,7 @@ def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
     assert force == pytest.approx(share * np.array([-8e5, 2e6]), abs=1)
 
 
-def test_the_last_of_several_relinearisations_is_the_same_where_rows_stay(
+def test_relinearisation_has_no_effect_if_rows_do_not_change(
     sheared_blocks,
 ):
     once = build(f"{sheared_blocks()}/steps=1/dual")
@@ -380,7 +382,7 @@ def test_the_last_of_several_relinearisations_is_the_same_where_rows_stay(
     )
 
 
-def test_more_shear_than_friction_bears_is_refused_in_every_step(sheared_blocks):
+def test_more_shear_than_friction_allows_is_refused_in_every_step(sheared_blocks):
     text = sheared_blocks(SHEARED.replace("4e5", "6e5"))
     for step in (1, 2):
         with pytest.raises(InputError, match="friction cannot hold the load"):
@@ -422,7 +424,7 @@ def test_a_mesh_in_another_unit_of_length_is_the_same_problem(described, unit, s
     )
 
 
-def test_a_modulus_in_megapascals_is_remarked_upon_and_a_rubber_is_not(described):
+def test_a_modulus_in_megapascals_causes_a_remark_and_a_rubber_does_not(described):
     soft = build(f"{described(toml=TOML.replace('200e9', '210000'))}/step=1/primal")
     (remark,) = soft.remarks
 
@@ -434,7 +436,7 @@ def test_a_modulus_in_megapascals_is_remarked_upon_and_a_rubber_is_not(described
 PAIR = '[[contacts]]\nslave = "{}"\nmaster = "{}"\n'
 
 
-def test_two_passes_are_remarked_upon_and_share_the_force(described):
+def test_two_passes_cause_a_remark_and_share_the_force(described):
     one = build(f"{described()}/step=1/dual-bounds")
     two = build(
         f"{described(toml=TOML + PAIR.format('bottom', 'outer'))}/step=1/dual-bounds"
@@ -582,9 +584,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
          '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, where"),
     ],
 )  # fmt: skip
-def test_a_load_that_its_supports_take_up_is_refused(
-    described, load, supports, message
-):
+def test_a_load_only_on_supports_is_refused(described, load, supports, message):
     """A load is rejected if supports fix all displacements in its direction."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
@@ -606,7 +606,7 @@ def test_a_load_that_its_supports_take_up_is_refused(
         ('boundary = "left"\nforce = [0, 0]\n[[loads]]\n' + POINT_LOAD, ""),
     ],
 )  # fmt: skip
-def test_a_load_that_supports_take_up_in_part_is_a_load(described, load, supports):
+def test_a_load_partly_on_supports_is_accepted(described, load, supports):
     toml = TOML.replace(POINT_LOAD, load) + supports
     assert build(f"{described(toml=toml)}/step=1/dual").qp.q.any()
 
@@ -657,7 +657,7 @@ def bent(points):
         (lambda p, c: (bent(p), {"a": c}, {}, {}), "the cell around ("),
     ],
 )  # fmt: skip
-def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
+def test_an_unsuitable_mesh_is_refused(tmp_path, contents, message):
     content = contents(*square())
     kinds = {"quad_type": content[4]} if len(content) > 4 else {}
     with pytest.raises(InputError, match=r"m\.msh: ") as e:
@@ -819,7 +819,7 @@ def test_a_bad_name_is_refused(described, text, message):
     assert str(e.value).startswith(message)
 
 
-def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_it(
+def test_friction_is_the_same_from_the_key_the_file_or_the_pair(
     described,
 ):
     law = 'friction = "coulomb"\nmu = 0.3\n'
@@ -860,7 +860,7 @@ def test_a_law_of_a_pair_that_does_not_fit_is_refused_in_one_line(
     assert "\n" not in str(e.value)
 
 
-def test_a_pair_may_lack_the_friction_that_the_others_have(described):
+def test_friction_can_be_omitted_for_one_pair(described):
     name = described(toml=TOML + 'friction = "none"')
     qp = build(f"{name}/friction=coulomb/mu=1/dual-bounds").qp
 

@@ -33,7 +33,7 @@ def solved(n, form="dual-bounds", tol=1e-10, **keys):
 
 
 @pytest.mark.parametrize("n", [32, pytest.param(128, marks=pytest.mark.slow)])
-def test_it_has_the_digits_of_the_prototype(n):
+def test_the_result_has_the_digits_of_the_prototype(n):
     case, s = solved(n)
     got = case.quantities(s)
     displacement, force = PROTOTYPE[n]

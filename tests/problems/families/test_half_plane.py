@@ -69,7 +69,7 @@ def test_the_exact_traction_adds_up_to_its_force_and_keeps_to_coulomb_s_law(Q, p
         assert moment(2) == pytest.approx(MU * EXACT.P * a**2 / 4 * (1 - c4), rel=1e-8)
 
 
-def test_full_unloading_to_the_other_side_is_loading_to_the_other_side():
+def test_full_reversal_equals_loading_in_the_opposite_direction():
     x = np.linspace(-EXACT.a, EXACT.a, 101)
 
     assert tangential(-0.6, 0.6).traction(x) == pytest.approx(
@@ -148,7 +148,7 @@ def test_400_elements_have_hertz_s_pressure():
 
 
 @pytest.mark.parametrize(("Q", "peak"), [(0.2, 0.6), (-0.9, 0.9), (0.0, 0.5)])
-def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
+def test_unloading_causes_slip_from_the_edge(Q, peak):
     got = result(n=400, law="cattaneo", Q=Q, peak=peak)
 
     assert got["shear_l2_error"] < 8e-3  # relative to q, which is small after unloading
@@ -194,7 +194,7 @@ def test_unused_and_missing_keys_of_the_law_are_refused_in_one_line(name, messag
     assert "\n" not in str(e.value)
 
 
-def test_a_peak_that_was_never_passed_is_not_in_the_name():
+def test_an_unused_peak_is_not_in_the_canonical_name():
     case = parse("half-plane/law=cattaneo/Q=0.5/peak=0.5/dual", PROBLEMS)
 
     assert str(case) == "half-plane/law=cattaneo/Q=0.5/dual"

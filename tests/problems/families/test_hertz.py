@@ -67,7 +67,7 @@ def test_a_cylinder_on_a_rigid_plane_is_in_hertz_contact(form, plane):
     assert got["contact_force"] == pytest.approx([0, 1e7], abs=1e-2)
 
 
-def test_the_force_error_tells_by_how_much_the_forces_miss_the_load():
+def test_the_force_error_is_the_difference_of_forces_and_load():
     case, s = solved(PLANE)
     too_much = replace(s, x=1.01 * s.x)
 
@@ -92,7 +92,7 @@ def test_the_pressure_converges(family):
     assert np.divide(errors[:-1], errors[1:]).min() > 2
 
 
-def test_the_pressure_is_symmetric_and_none_pulls():
+def test_the_pressure_is_symmetric_and_nonnegative():
     _, s = solved(PLANE)
     force = s.x[2:]
 
@@ -208,7 +208,7 @@ def sheared_result(form="dual", **keys):
         pytest.param(0.75, "mortar", marks=pytest.mark.slow),
     ],
 )
-def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
+def test_slip_starts_at_the_edge_as_in_cattaneo_and_mindlin(Q, contact):
     """There are 20 cells per a, a/R = 0.027, and c is computed from the second moment
     of the traction."""
     got = sheared_result(Q=Q, contact=contact)
@@ -224,7 +224,7 @@ def test_slip_comes_in_from_the_edge_as_cattaneo_and_mindlin_say(Q, contact):
 
 
 @pytest.mark.parametrize("Q", [0.2, pytest.param(-0.6, marks=pytest.mark.slow)])
-def test_unloading_lets_it_slip_back_from_the_edge(Q):
+def test_unloading_causes_reverse_slip_from_the_edge(Q):
     got = sheared_result(Q=Q, peak=0.6)
 
     assert abs(got["stick_half_width_error"]) < 0.01
@@ -233,7 +233,7 @@ def test_unloading_lets_it_slip_back_from_the_edge(Q):
     assert got["stick"] == pytest.approx(40 * np.sqrt(1 - (0.6 - Q) / 2), abs=2)
 
 
-def test_in_proportion_only_the_last_node_at_each_edge_slips():
+def test_under_proportional_load_only_the_edge_nodes_slip():
     """For a single static load, the tractions are as if Q had been applied last."""
     keys = dict(n=6, m=6, Q=0.5)
     got = sheared_result(**keys, steps=6, programme="proportional")
@@ -246,7 +246,7 @@ def test_in_proportion_only_the_last_node_at_each_edge_slips():
 
 
 @pytest.mark.slow
-def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
+def test_under_proportional_load_shear_tends_to_a_fraction_of_the_pressure():
     """The exact traction is (Q/P)p; the errors are of about first order in h and in the
     load step."""
     errors = []
@@ -262,7 +262,7 @@ def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
     assert errors[-1][1] < 0.06
 
 
-def test_the_tangential_force_turns_no_body():
+def test_the_tangential_force_rotates_no_body():
     """The loads on each body have no moment and the resultant ±Q, and supports have no
     reactions."""
     keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
@@ -285,7 +285,7 @@ def test_the_tangential_force_turns_no_body():
 
 
 @pytest.mark.parametrize("keys", [dict(), dict(contact="nts"), dict(slave="lower")])
-def test_the_slip_begins_where_symmetry_puts_the_cylinders(keys):
+def test_slip_starts_from_the_symmetric_position_of_the_cylinders(keys):
     """Without friction, the cylinders could roll on each other under P."""
     keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
     case = CYLINDER.build("dual", CYLINDER.complete(keys), reference_solution)
@@ -305,7 +305,7 @@ def test_friction_holds_equal_cylinders_together_without_a_force():
     assert got["dissipation"] < 1e-5 * abs(got["energy"])
 
 
-def test_of_a_fixed_point_every_tresca_problem_can_be_had():
+def test_every_tresca_problem_of_a_fixed_point_is_available():
     count = sheared_result(n=5, m=5, Q=0.5)["tresca_problems"]
     residuals = [
         sheared_result(n=5, m=5, Q=0.5, iterate=i)["friction_residual"]
@@ -341,7 +341,7 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message)
 
 
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
-def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(ratio):
+def test_cells_keep_their_area_if_the_contact_is_wider_than_the_cylinder(ratio):
     """If the uniform part of the arc exceeds the half disc, K is indefinite."""
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)

@@ -82,9 +82,7 @@ OF_MOOSE, OF_TWO = (0.1, 15000 / np.pi / 0.01, 0.01), (0.648715, 11.345743, 0.10
         (f"n=4/{MOOSE}/contact=nts", OF_MOOSE, 0.03),
     ],
 )
-def test_two_spheres_on_meshes_that_do_not_match_touch_as_hertz_says(
-    keys, exact, limit
-):
+def test_two_spheres_with_non_matching_meshes_agree_with_hertz(keys, exact, limit):
     values = solved(f"{keys}/dual")[2]
     a, p0, approach = exact
     P = p0 * 2 / 3 * np.pi * a**2
@@ -237,6 +235,6 @@ def test_a_tangential_force_leaves_the_middle_sticking():
         ("n=0/dual", "n=0 must be at least 1"),
     ],
 )
-def test_what_has_no_meaning_is_refused(keys, message):
+def test_meaningless_combinations_are_refused(keys, message):
     with pytest.raises(InputError, match=message):
         parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)

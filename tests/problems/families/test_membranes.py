@@ -87,7 +87,7 @@ def test_the_forms_have_one_solution_in_every_gluing(glue):
     assert energy == pytest.approx(whole["energy"], rel=1e-10)
 
 
-def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
+def test_contact_supports_the_right_membrane_on_part_of_the_edge():
     """The contact force equals the load, ¼, and only a part of the edge is in
     contact."""
     case = built("dual", S=2, n=8)
@@ -101,7 +101,7 @@ def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
-def test_smalbe_solves_it_as_an_operator(glue):
+def test_smalbe_solves_the_dual_as_an_operator(glue):
     case = built("dual", S=2, n=4, glue=glue)
     s = SMALBE().prepare(case.qp, 1e-6)()
 
@@ -130,7 +130,7 @@ def test_energies_fall_to_a_limit_as_the_mesh_is_refined():
     assert (steps[1:] < 0.5 * steps[:-1]).all()
 
 
-def test_the_mat_file_holds_the_dual_in_the_notation_of_the_paper(tmp_path):
+def test_the_mat_file_contains_the_dual_in_the_notation_of_the_paper(tmp_path):
     case = built("dual", S=2, n=2)
     save_mat(tmp_path / "m.mat", case.qp, {}, case.matrices)
     M = {

@@ -40,7 +40,7 @@ def rates(errors):
 
 
 @pytest.mark.parametrize("dim", [1, 2])
-def test_the_exact_height_bends_by_the_load_where_it_is_free(dim):
+def test_off_the_obstacle_the_exact_height_satisfies_the_differential_equation(dim):
     """Δu = 2 for r > 1; for r ≤ 1 the solution is zero, and its slope is continuous at
     r = 1."""
     rng = np.random.default_rng(20090)
@@ -70,7 +70,7 @@ def test_the_exact_energy_is_that_of_the_exact_height(dim, n):
     assert density.mean() * 3**dim == pytest.approx(exact_energy(dim), rel=1e-5)
 
 
-def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
+def test_the_string_is_exact_at_the_nodes_if_contact_ends_at_a_node():
     """Linear elements are exact at nodes if the contact region ends at a node."""
     case, s = solved(SMALBE(), "primal", 1, 12)
     got = case.quantities(s)
@@ -178,7 +178,7 @@ def test_the_exact_energy_over_the_hemisphere_is_that_of_the_exact_height():
 @pytest.mark.parametrize(
     "form", ["primal", pytest.param("dual-bounds", marks=pytest.mark.slow)]
 )
-def test_over_the_hemisphere_it_converges_with_second_order(form):
+def test_over_the_hemisphere_the_membrane_converges_with_second_order(form):
     got = []
     for n in (16, 32, 64):
         params = {"dim": 2, "n": n, "shape": "hemisphere"}
@@ -199,7 +199,7 @@ def test_over_the_hemisphere_it_converges_with_second_order(form):
         ({"shape": "hemisphere", "dim": 1}, "shape=hemisphere needs dim=2"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
+def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
     with pytest.raises(InputError, match="obstacle: ") as e:
         FAMILY.check({**FAMILY.defaults, **bad})
 

@@ -79,7 +79,7 @@ def test_node_to_segment_has_the_errors_of_an_independent_code(mesh, slave, perc
 
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
-def test_the_whole_pressure_passes_even_where_its_distribution_is_wrong(contact):
+def test_the_total_pressure_is_exact_even_if_its_distribution_is_wrong(contact):
     on_lower = solved(contact=contact, slave="upper")[2]
     on_upper = solved(contact=contact, slave="lower")[2]
 
@@ -125,7 +125,7 @@ def test_the_energy_is_minus_half_the_work_of_the_pressure(form):
         ({"basis": "cubic"}, "basis='cubic' is unknown, expected 'dual' or 'standard'"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
+def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
     with pytest.raises(InputError, match="contact-patch: ") as e:
         FAMILY.check({**FAMILY.defaults, **bad})
 

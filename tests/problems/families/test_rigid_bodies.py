@@ -57,7 +57,8 @@ DISC = 'shape = "cylinder", centre = [0, -2], radius = 2'
 
 def block(folder, toml):
     """Write a block of 1 m (in space 0.5 m deep) whose foot is at height zero, and a
-    TOML file; return the path of the latter."""
+    TOML file; return the path of the TOML file.
+    """
     if toml.count("traction = [0, -"):
         mesh = rectangle((0, 0), (1, 1), (CELLS[0], CELLS[2]))
         chains = {"left": "left", "foot": "bottom", "top": "top"}
@@ -221,7 +222,7 @@ def against(problem, rigid):
     return case.quantities(SOLVERS["smalbe"].prepare(case.qp, 1e-11)())
 
 
-def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
+def test_a_sphere_on_a_rigid_sphere_agrees_with_hertz():
     """The relative curvature is 1/R = 1/8 + 1/24."""
     family = PROBLEMS["hertz-sphere"]
     problem = family.contact_problem(family.complete({"n": 4}))
@@ -234,7 +235,7 @@ def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
     assert values["contact_force"] == pytest.approx([0, 0, 10], abs=1e-8)
 
 
-def test_a_cylinder_on_a_rigid_cylinder_touches_as_hertz_says():
+def test_a_cylinder_on_a_rigid_cylinder_agrees_with_hertz():
     """The relative curvature is 1/R = 1/8 + 1/24 per mm; in the plane, a cylinder is a
     disc."""
     family = PROBLEMS["hertz-plane"]

@@ -149,7 +149,7 @@ def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
          "body 'upper': nothing balances its load in y; expected a support"),
     ],
 )  # fmt: skip
-def test_what_volumes_do_not_support_is_refused_in_one_line(
+def test_settings_unsupported_for_volumes_are_refused_in_one_line(
     tmp_path, old, new, keys, message
 ):
     toml = TOML.replace(old, new) if old else TOML

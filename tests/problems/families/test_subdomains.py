@@ -67,11 +67,11 @@ def check(name, cut, glue):
 
 @pytest.mark.parametrize("glue", GLUES)
 @pytest.mark.parametrize(("name", "cut"), CASES)
-def test_the_displacement_is_that_of_the_bodies_in_one_piece(name, cut, glue):
+def test_the_displacement_is_that_of_the_undecomposed_bodies(name, cut, glue):
     check(name, cut, glue)
 
 
-def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
+def test_the_first_step_factorises_no_undecomposed_body(monkeypatch):
     def refused(*_: object) -> None:
         raise AssertionError("a factor of the whole")
 
@@ -90,11 +90,11 @@ def press(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("glue", GLUES)
-def test_bodies_of_any_mesh_are_cut_into_parts(press, glue):
+def test_bodies_of_any_mesh_can_be_decomposed(press, glue):
     check(press, "parts=8", glue)
 
 
-def test_bodies_with_friction_are_cut_into_parts(press):
+def test_bodies_with_friction_can_be_decomposed(press):
     check(f"{press}/friction=tresca/bound=1e7", "parts=8", "orthonormal")
 
 

@@ -31,7 +31,7 @@ def test_the_journal_bearing_has_its_published_optimum(points, optimum):
     assert case.quantities(s)["energy"] == pytest.approx(optimum, abs=6e-6)
 
 
-def test_the_film_is_symmetric_and_carries_where_it_narrows():
+def test_the_film_is_symmetric_and_has_pressure_where_it_narrows():
     """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −ε sin ξ is negative for ξ < π only, which
     makes v positive there."""
     n = 31
@@ -60,7 +60,7 @@ def test_an_elastic_bar_has_saint_venant_s_stiffness():
 
 
 @pytest.mark.parametrize("twist", [1e4, 1e8])
-def test_a_plastic_bar_is_a_roof(twist):
+def test_the_stress_function_of_a_plastic_bar_is_the_distance_to_the_boundary(twist):
     """v is the distance from the boundary, with |∇v| = 1 except at the ridges and the
     volume ⅙."""
     n = 31
@@ -75,7 +75,7 @@ def test_a_plastic_bar_is_a_roof(twist):
     )
 
 
-def test_a_bar_twisted_back_is_its_mirror_image():
+def test_a_bar_twisted_in_reverse_has_the_mirrored_solution():
     """If c changes sign, v changes sign, and the opposite bound is active."""
     case, s = solved(Torsion(), n=20)
     qp = case.qp
@@ -108,7 +108,7 @@ def test_the_string_bends_by_its_load_or_lies_on_the_obstacle():
     ],
     ids=["string", "torsion", "journal bearing"],
 )  # fmt: skip
-def test_another_method_finds_the_same(family, keys):
+def test_another_method_has_the_same_solution(family, keys):
     case, s = solved(family, **keys)
     _, other = solved(family, Clarabel(), **keys)
 

@@ -62,7 +62,7 @@ def test_every_boundary_has_the_body_on_its_left(mesh):
     assert flux == pytest.approx(2 * signed_areas(mesh).sum())
 
 
-def test_boundaries_of_the_ring_lie_where_their_names_say():
+def test_boundaries_of_the_ring_have_the_named_positions():
     ring = half_ring((1, 0), (0.3, 0.49), (24, 4))
     x = {name: ring.points[nodes] for name, nodes in ring.boundaries.items()}
 

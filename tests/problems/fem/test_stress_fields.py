@@ -43,7 +43,7 @@ def test_each_body_has_the_stress_of_its_own_material_up_to_its_boundary(plane):
             assert nodal[name][mine] == pytest.approx(value, rel=1e-9)
 
 
-def test_plane_strain_has_a_stress_across_the_plane_and_plane_stress_none():
+def test_only_plane_strain_has_a_stress_across_the_plane():
     """In plane strain, σ_z follows from ε_z = (σ_z − ν(σ_x + σ_y))/E = 0."""
     strain, stress = (
         nodal_stresses(b, stretched(b)) for b in (model(2, 2, 4, p) for p in PLANES)
@@ -117,7 +117,7 @@ def test_all_six_stresses_of_a_body_in_space_are_exact():
 @pytest.mark.parametrize(
     "inverse", [factorise_clamped, factorise_supported, factorise_floating]
 )
-def test_bodies_in_space_stand_under_forces_at_one_corner(inverse):
+def test_bodies_in_space_are_supported_by_forces_at_one_corner(inverse):
     """K⁺ is tested for a cube with a clamped side and for a floating cube."""
     fixed = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
     bodies = cube(fixed)

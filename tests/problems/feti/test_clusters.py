@@ -242,7 +242,7 @@ def test_multipliers_whose_forces_act_on_averages_alone_do_not_drift(preconditio
     "name",
     ["plate/Sx=4/Sy=2/n=2/cluster=2", "beam-ring/Nr=4/Nh=2/steps=1/feti=2/cluster=2"],
 )
-def test_ranks_have_whole_clusters_and_the_same_operator(name, monkeypatch):
+def test_ranks_contain_whole_clusters_and_have_the_same_operator(name, monkeypatch):
     without_lock(monkeypatch, DualOperator, "_blocks")
     qp, x = built(name).qp, np.sin(np.arange(built(name).qp.q.size))
     whole = qp.P.build()

@@ -42,7 +42,7 @@ def loads(work):
     return done
 
 
-def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
+def test_two_ranks_share_an_odd_number_of_equal_classes_evenly():
     classes = dict.fromkeys("abcdefghi", 4)
 
     assert loads([classes, classes]).tolist() == [18, 18]
@@ -91,12 +91,12 @@ def test_blocks_fill_the_time_until_the_last_factor_is_sent():
     assert blocks_before_exchange(smaller, 1) == 2
 
 
-def test_the_largest_kinds_are_shared_out_first():
+def test_the_largest_classes_are_assigned_first():
     classes = {"a": 4, "b": 4, "c": 8}
     assert loads([classes, classes]).tolist() == [8, 8]
 
 
-def test_only_ranks_that_have_a_kind_do_anything_for_it():
+def test_only_ranks_with_a_subdomain_of_a_class_work_on_the_class():
     tasks = assign_factorisations([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
 
     assert tasks["a"] == (8, [0], 0, 0)
@@ -105,7 +105,7 @@ def test_only_ranks_that_have_a_kind_do_anything_for_it():
     assert [blocks_before_exchange(tasks, rank) for rank in range(3)] == [1, 1, 1]
 
 
-def test_one_rank_does_all():
+def test_a_single_rank_factorises_all_classes():
     assert loads([{"a": 3, "b": 5}]).tolist() == [8]
 
 
@@ -258,7 +258,7 @@ def test_contact_rows_are_inverted_in_distributed_or_replicated_form(
         assert "_replicated_inverse" in ways
 
 
-def test_owners_of_rows_are_those_that_touch_them_in_turn():
+def test_rows_are_owned_in_turn_by_the_ranks_that_touch_them():
     reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
     rows = np.array([4, 5, 6, 7, 9])
     assert assign_owners(rows, reach).tolist() == [0, 1, 0, 1, 2]
@@ -279,7 +279,9 @@ def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn)
         assert parts.owner[row] == ranks[row % len(ranks)]
 
 
-def test_subdomains_are_weighed_by_dense_blocks_and_joined_by_rows(torn, monkeypatch):
+def test_subdomains_are_weighted_by_dense_blocks_and_connected_by_rows(
+    torn, monkeypatch
+):
     seen = {}
 
     def noted(graph, work, size, ranks, cluster):
@@ -343,7 +345,7 @@ BOTH = [0, 0, 1, 1, 0, 0, 1, 1]
         ([ONLY_WORK, BETTER, ONLY_WORK], BETTER, 37),
     ],
 )
-def test_among_partitions_with_balanced_work_the_best_sizes_win(
+def test_among_partitions_with_balanced_work_the_best_sizes_are_chosen(
     answers, taken, asked, monkeypatch
 ):
     """If sizes are out of balance, METIS runs with 12 seeds and three weights of the
@@ -383,7 +385,7 @@ def test_weights_of_sizes_are_a_quarter_a_half_and_one(monkeypatch):
 
 
 @pytest.mark.parametrize("unit", [1, 10])
-def test_work_is_weighed_in_units_of_the_least(unit, monkeypatch):
+def test_work_is_measured_in_units_of_the_smallest(unit, monkeypatch):
     weights = []
 
     def answer(graph, weight, ranks, seed=None):
@@ -408,7 +410,7 @@ def test_ranks_that_metis_leaves_idle_get_a_subdomain_of_the_largest(monkeypatch
     assert found.tolist() == [0, 0, 2, 2, 2, 3, 1]
 
 
-def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
+def test_all_ranks_with_a_subdomain_of_a_class_receive_its_blocks(torn):
     F, qp = dual_of(torn)
 
     def work(ranks):
@@ -432,7 +434,7 @@ def halo_of(ranks, here):
     return build_halo(ranks, rows, reach, assign_owners(rows, reach))
 
 
-def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
+def test_rows_are_coupled_if_the_sum_over_ranks_exceeds_rounding():
     """Two ranks share rows 0 … 5, and each rank touches two further rows alone."""
     here = np.zeros((2, 10), dtype=bool)
     here[:, :6] = here[0, [6, 8]] = here[1, [7, 9]] = True

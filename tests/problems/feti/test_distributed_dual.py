@@ -82,14 +82,14 @@ def described(tmp_path_factory):
     }
 
 
-def test_bodies_without_parts_are_emitted_by_one_process(described):
+def test_undecomposed_bodies_are_emitted_by_one_process(described):
     case = parse(described["whole"], PROBLEMS)
 
     assert case.family.emission(case.form, case.params) is None
 
 
 @pytest.mark.slow
-def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
+def test_ranks_iterate_coulomb_s_law_for_bodies_held_by_contact(described):
     for case in emitted(2, [described["coulomb"]]).values():
         assert case["entries"][0] == case["entries"][1]
         assert max(*case["errors"].values(), *case["bounds"]) < SOLVED, case
@@ -125,7 +125,7 @@ def test_shares_are_the_qp_of_one_process_row_by_row(found, case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_kind_that_several_ranks_have_is_factorised_by_one_of_them(found, case):
+def test_a_class_on_several_ranks_is_factorised_by_one_rank(found, case):
     of = found[case]
     assert sorted(of["factorised"]) == sorted(set(of["formed"]))
 
@@ -150,7 +150,7 @@ def test_every_disc_has_one_owner(found):
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_the_reference_over_ranks_comes_out_of_circles(ranks):
+def test_the_reference_over_ranks_does_not_cycle(ranks):
     (of,) = emitted(ranks, [CIRCLES]).values()
 
     assert max(*of["errors"].values(), *of["bounds"]) < SOLVED, of
@@ -213,7 +213,7 @@ def generated(rng, count=8):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_no_choice_of_keys_settles_coulomb_s_law_elsewhere(seed):
+def test_no_choice_of_keys_has_another_fixed_point_of_coulomb_s_law(seed):
     for case, of in emitted(
         1 + seed % 2, generated_with_coulomb_s_law(np.random.default_rng(seed))
     ).items():

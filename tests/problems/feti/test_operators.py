@@ -66,7 +66,7 @@ def dense(pair):
     return K, pair.B.toarray(), pair.domains.kernel.toarray()
 
 
-def test_the_kernel_is_orthonormal_and_costs_no_energy(pair):
+def test_the_kernel_is_orthonormal_and_has_no_energy(pair):
     K, _, R = dense(pair)
 
     assert_allclose(R.T @ R, np.eye(R.shape[1]), atol=1e-13)
@@ -101,7 +101,7 @@ def test_a_product_with_a_matrix_is_that_with_each_column(pair):
     assert_allclose(F @ x, columns, rtol=1e-12, atol=1e-14)
 
 
-def test_a_block_that_is_not_formed_gives_the_same_product(pair):
+def test_an_implicit_block_gives_the_same_product(pair):
     arrays = operator_of(pair).arrays
     implicit = dual_operator_from_arrays(
         {**arrays, "explicit": np.zeros_like(arrays["explicit"])}
@@ -212,7 +212,7 @@ def test_preconditioners_add_nothing_in_the_kernel_of_redundant_rows():
     assert_allclose(deaf.T @ M(np.eye(len(B))), 0, atol=1e-13)
 
 
-def test_small_blocks_are_inverted_as_moore_and_penrose_do():
+def test_small_blocks_are_pseudoinverted():
     rng = np.random.default_rng(8)
     of_rank_one = np.outer([1.0, -2.0, 3.0], [1.0, -2.0, 3.0])
     regular = np.diag([2.0, 3.0]) + 1
@@ -238,7 +238,7 @@ def test_contact_rows_do_not_affect_the_weights_of_equality_rows(kind):
     assert_allclose(found, equations, atol=1e-12 * abs(equations).max())
 
 
-def test_preconditioners_bring_the_spectrum_together():
+def test_preconditioners_reduce_the_condition_number():
     """The condition number is smallest with the Dirichlet preconditioner, and largest
     without a preconditioner."""
     pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
@@ -296,7 +296,7 @@ def test_equal_subdomains_share_one_stored_stiffness():
     assert many["kind"].size == 9 * few["kind"].size
 
 
-def test_a_kind_without_kernel_has_its_inverse():
+def test_a_class_without_kernel_has_its_inverse():
     """This is the case of eliminated supports, as in FETI-1."""
     (kind,) = membranes().classes
     n = kind.K.shape[0]

@@ -33,7 +33,7 @@ def test_parts_are_connected_of_one_body_and_about_equal(parts):
     assert np.array_equal(label, graph_partition(mesh.points, mesh.cells, body, parts))
 
 
-def test_cells_are_neighbours_where_they_share_an_edge():
+def test_cells_that_share_an_edge_are_neighbours():
     """The mesh is a 2 × 2 grid and a triangle that shares only a node with the grid."""
     cells = np.array([[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7],
                       [8, 9, 10, 10]])  # fmt: skip
@@ -44,7 +44,7 @@ def test_cells_are_neighbours_where_they_share_an_edge():
     assert pairs == {(0, 1), (0, 2), (1, 3), (2, 3)}
 
 
-def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
+def test_a_separate_piece_joins_the_part_with_the_longest_common_boundary():
     strip = rectangle((0.0, 0.0), (6.0, 1.0), (6, 1))
     graph = neighbours(strip.points, strip.cells)
     label = partition._reconnect(graph, np.array([0, 0, 1, 1, 1, 0]))
@@ -52,7 +52,7 @@ def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
     assert label.tolist() == [0, 0, 1, 1, 1, 1]
 
 
-def test_cells_that_hang_together_in_a_node_are_no_body():
+def test_cells_connected_only_at_a_node_are_not_a_body():
     cells = np.array([[0, 1, 4, 3], [4, 5, 8, 7], [9, 10, 12, 11], [11, 12, 14, 13]])
     with pytest.raises(InputError, match="are not all connected by edges"):
         graph_partition(np.eye(15)[:, :2], cells, np.array([0, 0, 1, 1]), 2)
@@ -78,7 +78,7 @@ def test_parts_of_long_and_thin_cells_are_compact():
     assert np.median([max(box) / min(box) for box in boxes]) <= 4
 
 
-def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
+def test_hexahedra_that_share_a_face_of_positive_area_are_neighbours():
     """For cells of 1 × 2 × 4, the weight of a face of area A is 100 A^⅓ d^−⅔, with the
     distance d of the centres."""
     mesh = bricks((2, 2, 2), (2.0, 4.0, 8.0))
@@ -92,7 +92,7 @@ def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
 
 
 @pytest.mark.parametrize("parts", [2, 5, 8])
-def test_parts_of_hexahedra_hang_together_by_faces(parts):
+def test_parts_of_hexahedra_are_connected_by_faces(parts):
     mesh = bricks((6, 4, 4), (1.5, 1.0, 1.0))
     points, cells = mesh.points, mesh.cells
     label = graph_partition(points, cells, np.zeros(len(cells), dtype=np.int64), parts)

@@ -76,7 +76,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert abs(jumps).max() <= 1e-15  # copies are equal
 
 
-def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
+def test_a_floating_body_has_six_orthonormal_motions_without_energy():
     own = torn(box(), np.zeros(0, dtype=np.int64))
     floating = local_bodies(own).floating
     R = floating.motions.toarray()

@@ -56,7 +56,7 @@ def test_equality_rows_remove_their_directions() -> None:
     assert_allclose([found.smallest, found.largest], entries[[1, 38]], rtol=1e-10)
 
 
-def test_a_preconditioner_changes_the_operator_not_where_it_acts() -> None:
+def test_a_preconditioner_changes_the_operator_but_not_its_space() -> None:
     entries = np.linspace(2.0, 50.0, 40)
     near = 1 / entries
     near[[3, 7]] *= [0.25, 4.0]
@@ -65,7 +65,7 @@ def test_a_preconditioner_changes_the_operator_not_where_it_acts() -> None:
 
 
 @pytest.mark.parametrize("crowded", ["below", "above"])
-def test_the_error_bounds_hold_and_are_as_small_as_asked(crowded: str) -> None:
+def test_the_error_bounds_hold_and_are_within_the_tolerance(crowded: str) -> None:
     entries = 1.0 + 9.0 * np.linspace(0.0, 1.0, 400) ** 2
     if crowded == "above":
         entries = 11.0 - entries
@@ -222,7 +222,7 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_ritz_values_are_as_far_off_as_their_residuals_are_long(
+def test_errors_of_ritz_values_are_bounded_by_residuals(
     sign: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The residual norm of a Ritz vector is the norm of the next Lanczos vector times

@@ -75,7 +75,7 @@ def test_the_factor_is_the_stiffness_of_a_saw_tooth_relative_to_squares(nu, r):
     assert along_row == pytest.approx([exact], rel=1e-9)
 
 
-def test_the_factor_is_a_mean_where_interfaces_cross_and_one_without_any():
+def test_the_factor_is_averaged_at_crosspoints_and_one_without_interfaces():
     lines = np.array([[True, True], [True, False], [False, True], [False, False]])
     both, row, column, none = shape_factors(np.array([[1.0, 2.0]] * 4), lines, 0.5)
 

@@ -144,7 +144,7 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
         assert_array_equal(of.cells(s), of.cells(first))
 
 
-def test_sides_of_bodies_and_interfaces_have_holders_and_points(known):
+def test_sides_of_bodies_and_interfaces_have_subdomains_and_points(known):
     of, mesh, _, whole = known
     multiplicity = np.bincount(whole.node)
     for chain in (*mesh.boundaries.values(), np.flatnonzero(multiplicity > 1)):

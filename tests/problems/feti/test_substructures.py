@@ -35,7 +35,7 @@ def test_a_solve_projects_out_rigid_motions(
     assert np.abs(R.T @ found).max() <= 1e-9 * np.abs(found).max()
 
 
-def test_a_subdomain_without_force_stays_where_it_is(parts: LocalProblems) -> None:
+def test_a_subdomain_without_force_has_no_displacement(parts: LocalProblems) -> None:
     start = parts.torn.domains.start
     b = np.zeros(start[-1])
     b[start[1] : start[2]] = np.random.default_rng(9).standard_normal(

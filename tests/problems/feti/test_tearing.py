@@ -38,7 +38,7 @@ def test_blocks_are_as_equal_as_whole_numbers_allow() -> None:
     assert blocks((4, 2, 2), 1).tolist() == list(range(16))
 
 
-def test_one_block_holds_what_is_not_larger_than_it() -> None:
+def test_cells_not_larger_than_a_block_form_one_block() -> None:
     assert not blocks((8, 5), 8).any()
 
 
@@ -161,7 +161,7 @@ def sides(wide, deep):
     return (deep, np.ones(wide.size)), (np.ones(deep.size), wide)
 
 
-def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
+def test_rounding_of_points_creates_no_classes_but_another_shape_does() -> None:
     mesh = rectangle((0.3, 0.1), (2.1, 0.7), (6, 2))
     cells, of_one = mesh.cells, np.zeros(12, dtype=np.int64)
     label = blocks((6, 2), 2)
@@ -173,7 +173,7 @@ def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
     assert decompose(mesh.points, cells, label, of_two).class_of.tolist() == [0, 1, 0]
 
 
-def test_a_mirror_image_is_of_another_kind() -> None:
+def test_a_mirror_image_belongs_to_another_class() -> None:
     points = np.array([[0, 0], [3, 0], [2, 1], [0, 1]], dtype=float)
     mirrored = points * [-1, 1] + [10, 0]
     cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
@@ -182,20 +182,20 @@ def test_a_mirror_image_is_of_another_kind() -> None:
     assert both.class_of.tolist() == [0, 1]
 
 
-def test_rectangles_are_of_one_kind_and_each_layer_of_the_ring_is_of_one() -> None:
+def test_rectangles_form_one_class_and_each_layer_of_the_ring_one_class() -> None:
     _, _, pair = decomposed_pair()
     assert len(pair.classes) == 1 + 3
     assert pair.class_of.size == 16 * 2 + 18 * 3
 
 
-def test_the_torn_stiffness_of_all_subdomains_is_that_of_the_whole() -> None:
+def test_the_assembled_torn_stiffness_is_that_of_the_undecomposed_body() -> None:
     bodies, _, pair = decomposed_pair()
     K = block_diag([pair.classes[k].K for k in pair.class_of])
     assembled = pair.spread.T @ K @ pair.spread
     assert abs(assembled - bodies.K).max() < 1e-12 * abs(bodies.K).max()
 
 
-def test_motions_of_the_kernel_are_orthonormal_and_cost_no_energy() -> None:
+def test_motions_of_the_kernel_are_orthonormal_and_have_no_energy() -> None:
     for kind in decomposed_pair()[2].classes:
         assert_allclose(kind.R.T @ kind.R, np.eye(3), atol=1e-14)
         assert abs(kind.K @ kind.R).max() < 1e-13 * abs(kind.K).max()
@@ -227,7 +227,7 @@ def test_the_load_is_that_of_the_whole(rows: str) -> None:
     assert_allclose(pair.spread.T @ pair.f, -primal.q, atol=1e-15)
 
 
-def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
+def test_orthonormal_rows_are_orthonormal_and_of_full_rank() -> None:
     _, _, pair = decomposed_pair()
     E = pair.equalities
     root_E = np.linalg.norm(pair.B.toarray(), axis=1)

@@ -187,13 +187,22 @@ def changed(**arrays):
             local_arrays(np.diag([1.0, -0.1, 1]), np.ones(3), np.ones(1)),
             "W has the negative eigenvalue -0.1",
         ),
-        (changed(vectors__mu_r=np.ones(1)), "rolling friction is not built; expected"),
-        ({"fclib_rolling/spacedim": np.array([5])}, "rolling friction is not built"),
+        (
+            changed(vectors__mu_r=np.ones(1)),
+            "rolling friction is not supported; expected",
+        ),
+        (
+            {"fclib_rolling/spacedim": np.array([5])},
+            "rolling friction is not supported",
+        ),
         ({"solution/r": np.ones(3)}, "no FCLIB problem; expected one group"),
         (changed(spacedim=np.array([4])), "spacedim is 4; expected 2 or 3"),
-        (changed(vectors__mu=-np.ones(1)), "vectors/mu holds -1; expected no negative"),
+        (
+            changed(vectors__mu=-np.ones(1)),
+            "vectors/mu contains -1; expected only numbers",
+        ),
         (changed(vectors__q=np.ones(4)), "vectors/q has 4 entries; expected 3"),
-        (changed(vectors__q=np.array([np.nan, 0, 0])), "vectors/q holds NaN or inf"),
+        (changed(vectors__q=np.array([np.nan, 0, 0])), "vectors/q contains NaN or inf"),
         (changed(W__m=np.array([4])), r"W has shape \(4, 3\); expected \(3, 3\)"),
         (changed(W__i=np.array([0, 1, 7])), "W is not a matrix: its p, i and x do not"),
         (
@@ -201,7 +210,7 @@ def changed(**arrays):
             "W is not a matrix: its p, i and x do not fit 3",
         ),
         (changed(W__nz=np.array([-7])), "W is not a matrix"),
-        (changed(vectors__q=np.array(b"text")), "vectors/q holds no numbers"),
+        (changed(vectors__q=np.array(b"text")), "vectors/q is not numeric"),
     ],
 )
 def test_problems_that_are_not_convex_are_refused(tmp_path, arrays, message):
@@ -230,7 +239,7 @@ def test_a_file_that_is_not_hdf5_is_refused(tmp_path, monkeypatch):
         case_of(tmp_path / "large.hdf5")
 
 
-def test_a_loop_that_is_none_is_refused(tmp_path):
+def test_an_unknown_loop_is_refused(tmp_path):
     write_boxes(tmp_path / "boxes.hdf5")
     with pytest.raises(InputError, match="unknown loop 'newton'"):
         case_of(tmp_path / "boxes.hdf5", "loop=newton")

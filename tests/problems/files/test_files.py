@@ -111,7 +111,7 @@ def assert_same(one, two):
 # QPS
 
 
-def test_a_qps_text_holds_the_qp_that_its_sections_say():
+def test_a_qps_text_defines_the_qp_of_its_sections():
     given, sign = parse_qps(QPS)
 
     assert sign == 1
@@ -385,7 +385,7 @@ def test_identity_rows_at_the_end_are_the_bounds(written):
     np.testing.assert_array_equal(qp.ub, [1, np.inf, np.inf, 2])
 
 
-def test_the_older_names_of_p_and_q_are_known(written):
+def test_older_names_of_p_and_q_are_accepted(written):
     older = {"Q": MAT["P"], "c": MAT["q"]} | {
         k: v for k, v in MAT.items() if k not in ("P", "q", "r", "n", "m")
     }
@@ -409,7 +409,7 @@ def test_the_older_names_of_p_and_q_are_known(written):
         ({"G": np.eye(4)}, "h is missing"),
     ],
 )
-def test_a_bad_mat_file_is_named_with_what_is_wrong(written, changes, message):
+def test_an_invalid_mat_file_is_named_with_the_error(written, changes, message):
     content = {k: v for k, v in (MAT | changes).items() if v is not None}
     with pytest.raises(InputError) as e:
         build(written(content, "a.mat"))
@@ -457,7 +457,7 @@ def test_a_qp_that_is_not_convex_is_refused(written, P, message):
         [[1, 0.333333], [0.333333, 0.111111]],  # rank one, to six digits
     ],
 )
-def test_rounding_of_a_semidefinite_p_is_none_of_convexity(written, P):
+def test_rounding_does_not_make_a_semidefinite_p_non_convex(written, P):
     n = len(P)
     free = {"A": eye_array(n), "l": -np.ones(n), "u": np.ones(n), "q": np.ones(n)}
 
@@ -549,7 +549,7 @@ def test_an_exported_qp_comes_back_exactly(written, command, form, suffix):
     assert back.quantities(s)["value"] == pytest.approx(energy, rel=1e-6)
 
 
-def test_a_mat_file_holds_sparse_matrices_under_the_names_of_the_npz(written, command):
+def test_a_mat_file_contains_sparse_matrices_named_as_in_npz(written, command):
     command("export", f"{SMALL}/primal", "a.mat")
     stored = loadmat("a.mat")
 
@@ -560,7 +560,7 @@ def test_a_mat_file_holds_sparse_matrices_under_the_names_of_the_npz(written, co
 
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_the_dual_s_matrices_obey_the_paper(written, command, form):
+def test_the_dual_s_matrices_satisfy_the_formulas_of_the_paper(written, command, form):
     command("export", f"{SMALL}/primal", "p.mat")
     command("export", f"{SMALL}/{form}", "a.mat")
     p, a = loadmat("p.mat"), loadmat("a.mat")
@@ -594,9 +594,7 @@ def test_the_dual_s_matrices_obey_the_paper(written, command, form):
         assert R.shape == (f.size, 0)
 
 
-def test_unknown_formats_of_an_export_are_refused_with_those_there_are(
-    written, command
-):
+def test_unknown_export_formats_are_refused_with_the_available_ones(written, command):
     code, _, err = command("export", f"{SMALL}/primal", "a.csv")
 
     assert code == 2
@@ -628,7 +626,7 @@ def test_a_file_can_be_solved_by_name(written, command):
     assert record["quantities"]["value"] == pytest.approx(record["objective"] + 4)
 
 
-def test_a_run_does_not_go_on_with_a_file_that_has_changed(written, command, tmp_path):
+def test_a_run_does_not_continue_with_a_changed_file(written, command, tmp_path):
     written(QPS, "a.qps")
     suite = tmp_path / "s.toml"
     suite.write_text(

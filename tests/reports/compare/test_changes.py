@@ -572,7 +572,7 @@ def test_a_qp_in_two_files_is_one_case(folders, changed):
     assert other.pairs == ()
 
 
-def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
+def test_a_worse_verdict_fails_even_if_times_cannot_be_compared(folders):
     slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     worse = [
         r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r

@@ -164,18 +164,18 @@ def rows_of(path):
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_is_there_and_not_blank(folder, name):
+def test_every_figure_exists_and_is_not_blank(folder, name):
     assert elements(folder / "figures" / f"{name}.svg") > 30
 
 
 @pytest.mark.parametrize("name", SORTS)
-def test_a_figure_of_each_sort_is_there_in_three_formats(sorts, name):
+def test_a_figure_of_each_type_exists_in_three_formats(sorts, name):
     assert_three_formats(sorts / "figures", name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_is_there_in_three_formats(all_formats, name):
+def test_every_figure_exists_in_three_formats(all_formats, name):
     assert_three_formats(all_formats / "figures", name)
 
 

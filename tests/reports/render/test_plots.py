@@ -234,7 +234,7 @@ def test_the_outline_of_a_stepped_band_encloses_its_area():
     assert abs(u @ np.roll(v, 1) - v @ np.roll(u, 1)) / 2 == pytest.approx(4)
 
 
-def test_segments_rules_and_texts_are_where_they_are():
+def test_segments_rules_and_texts_have_their_positions():
     strokes = Segments(ends=((1, 0, 1, 2),), colour="#112233", runs=(("r1",),))
     rule = Rule(axis="y", at=10.0, look=Look(colour="#112233", dash=(4, 2), width=0.5))
     text = Text(

@@ -40,7 +40,7 @@ def test_a_power_law_without_noise_is_recovered():
     assert fit.high == pytest.approx(1.4)
 
 
-def test_sizes_that_hardly_differ_give_a_law_with_infinite_factor():
+def test_nearly_equal_sizes_yield_a_law_with_infinite_factor():
     """Values grow by a factor e while sizes grow by 0.01 %: p = 10⁴, c = e^−138155."""
     n = 1e6 * np.array([1, 1 + 5e-5, 1 + 1e-4])
     for sign in (1, -1):

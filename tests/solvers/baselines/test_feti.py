@@ -101,7 +101,7 @@ def test_counts_of_a_clamped_beam(subdomains, n, glue, kind, steps):
 @pytest.mark.parametrize(
     ("jump", "identity", "weighted"), [(1e-2, 15, 8), (1e-3, 18, 9), (1e-5, 32, 9)]
 )
-def test_counts_where_stiffnesses_jump(jump, identity, weighted):
+def test_counts_for_jumping_stiffnesses(jump, identity, weighted):
     """The counts exceed those of MSolve at 1e-5 by at most two steps."""
     qp = plate(pattern="column", jump=jump, **PLATE)
     most = {"identity": identity, "preconditioner": weighted}

@@ -36,7 +36,7 @@ def solve(qp, tol=1e-9):
     return PDAS().prepare(qp, tol)()
 
 
-#: the plain method visits three active sets in turn, for ever
+#: the plain method cycles through three active sets
 CYCLES = {
     "n = 3": ([[13, 11, -9], [11, 11, -6], [-9, -6, 10]], [4, 1, -5]),
     "n = 4": (
@@ -84,7 +84,7 @@ def test_separate_variables_settle_after_one_change_each():
     assert s.counts["factorisations"] == 2
 
 
-def test_contact_rows_join_where_they_are_violated():
+def test_violated_contact_rows_are_added():
     """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, the first iterate has no active
     row, the second one the first row.
     """
@@ -115,7 +115,7 @@ def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
     assert s.y == pytest.approx([-1e8])
 
 
-def test_a_cycle_is_left_by_single_exchanges(cycling):
+def test_single_exchanges_break_a_cycle(cycling):
     s = solve(cycling)
     exact = reference_solution(cycling)
 
@@ -180,9 +180,9 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
         (dict(P=np.eye(3), q=np.zeros(3), lb=[1.0, -1, -np.inf]), [1, 0, 0]),
         (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, -9], ub=[2.0, 9]), [2, 1]),
         (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, 3], ub=[2.0, 3]), [2, 3]),
-        # more active bounds than the row leaves room for, on the way
+        # an iterate has more active bounds than the row permits
         (dict(P=np.eye(2), q=[1.0, 1], A=[[1, 1]], b=[4.0], lb=0.0), [2, 2]),
-        # singular P: the row and the bound decide on x₂
+        # singular P: the row and the bound determine x₂
         (dict(P=[[1, 0], [0, 0]], q=[-1.0, 1], lb=[-np.inf, -3]), [1, -3]),
         (dict(P=np.zeros((2, 2)), q=[1.0, 2], A=[[1, 1]], b=[1.0], lb=0.0), [1, 0]),
     ],
@@ -267,7 +267,7 @@ def test_a_sequence_starts_from_the_last_active_set():
     assert kkt_residuals(replace(qp, q=1.0001 * qp.q), warm).worst <= 5e-9
 
 
-def test_a_sequence_goes_on_after_a_problem_of_another_size():
+def test_a_sequence_continues_after_a_problem_of_another_size():
     prepare = PDAS().chain(1e-9)
     for n in (30, 20, 30):
         assert prepare(dual(271828, n))().status is Status.SOLVED

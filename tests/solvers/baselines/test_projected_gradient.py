@@ -115,7 +115,7 @@ def test_every_product_is_counted_and_one_per_step():
     assert s.counts["P_products"] == s.iterations + 4
 
 
-def test_operators_are_taken_and_rows_are_not(manufactured):
+def test_operators_are_accepted_and_rows_are_declined(manufactured):
     qp = random(161803)
     as_operator = solve(replace(qp, P=aslinearoperator(csr_array(qp.P))))
 

@@ -131,7 +131,7 @@ def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense, seeds):
     ],
     ids=["singular P", "singular P, repeated rows", "no P", "no P, repeated rows"],
 )
-def test_where_there_are_many_solutions_one_of_them_is_found(kind, dense, seeds):
+def test_one_of_many_solutions_is_found(kind, dense, seeds):
     for seed in seeds:
         qp, x, _ = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
@@ -237,7 +237,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel
         # half the work of the pressure p = 1 MPa at the displacement (1 − ν²)p/E
         ("contact-patch", {}, "primal", -0.5 * 1e6 * 1e6 * 0.91 / 10e6),
         ("contact-patch", {}, "dual", -0.5 * 1e6 * 1e6 * 0.91 / 10e6),
-        # of the interpolant of the exact height, which the string is at its nodes
+        # energy of the nodal interpolant of the exact height
         ("obstacle", dict(dim=1, n=12), "primal", 1 / 3 + 0.25**2 / 6),
         ("obstacle", dict(dim=1, n=12), "dual-bounds", 1 / 3 + 0.25**2 / 6),
     ],
@@ -439,7 +439,7 @@ FOREIGN = {
 }  # fmt: skip
 
 
-def test_no_solver_under_test_and_no_foreign_one_takes_part():
+def test_the_reference_uses_no_other_solver():
     folder = sys.modules["mortarbench.solvers"].__path__[0]
     run = subprocess.run(
         [sys.executable, "-c", ALONE, folder], capture_output=True, text=True

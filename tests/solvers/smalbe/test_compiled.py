@@ -130,7 +130,7 @@ def prepared_problem(qp, steps):
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_preparation_is_as_it_is_written(seed):
+def test_compiled_preparation_agrees_with_the_textbook(seed):
     qp = random_qp(seed)
     fast = prepared_problem(qp, 12)
     slow = projected_problem(qp, partial(by_lanczos, steps=12))
@@ -176,7 +176,7 @@ def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(k, kind):
         assert vectors @ T == pytest.approx(values[:, None] * vectors, abs=1e-13 * most)
 
 
-def test_eigenpairs_of_zero_and_of_no_numbers_end():
+def test_eigenpairs_of_zero_and_nan_matrices_terminate():
     assert (compiled.eigenpairs(np.zeros(3), np.zeros(2))[0] == 0).all()
     assert not np.isfinite(compiled.eigenpairs([1.0, np.nan], [1.0])[0]).all()
 
@@ -184,7 +184,7 @@ def test_eigenpairs_of_zero_and_of_no_numbers_end():
 @pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("seed", range(12))
-def test_the_steps_are_those_that_are_written(seed, name, kind):
+def test_compiled_steps_agree_with_the_textbook(seed, name, kind):
     """The kinds of the first 25 steps agree; later steps of long runs differ by
     rounding.
     """
@@ -192,7 +192,7 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
+def test_a_penalty_below_the_tail_is_omitted_as_in_the_textbook(seed):
     """The first rows of the model are those of the penalty."""
     they_agree(random_qp(seed), replace(SOLVERS["smalbe"], max_steps=25, rho=1e-3))
 
@@ -200,7 +200,7 @@ def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
 @pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
 @pytest.mark.parametrize("rows", ["sparse", "dense", "none"])
 @pytest.mark.parametrize("seed", range(6))
-def test_other_rows_and_preconditioners_take_the_steps_that_are_written(
+def test_steps_with_other_rows_and_preconditioners_agree_with_the_textbook(
     seed, rows, preconditioner, monkeypatch
 ):
     """Rows are given by a sparse factor, and faces are preconditioned by a matrix M or
@@ -272,7 +272,7 @@ def tight_box(seed):
     )  # fmt: skip
 
 
-def test_steps_beyond_the_box_are_those_that_are_written():
+def test_steps_beyond_the_box_agree_with_the_textbook():
     """The spectra are flat, and some expansions end as gradient projections."""
     letters = ""
     for qp in (string(100), *map(tight_box, range(40))):
@@ -296,7 +296,7 @@ def test_steps_beyond_the_box_are_those_that_are_written():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypatch):
+def test_products_on_contact_agree_with_the_textbook(contact, name, monkeypatch):
     """Without a preconditioner, rounding errors may cause a few additional products."""
     fast = SOLVERS[name].prepare(contact, 1e-6)()
     monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
@@ -311,7 +311,7 @@ def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypa
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_the_way_back_is_as_it_is_written(seed):
+def test_recovery_agrees_with_the_textbook(seed):
     qp, options = random_qp(seed), SOLVERS["smalbe"]
     problem = prepared_problem(qp, 12)
     run = outer_loop(problem, qp, options)
@@ -358,7 +358,7 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
                 worst = kkt_residuals(qp, point).worst
                 assert bound >= worst * (1 - 1e-9), seed
-                if size >= 1e-6:  # beside which rounding is nothing
+                if size >= 1e-6:  # large compared with rounding errors
                     assert bound == pytest.approx(worst, rel=1e-6), seed
 
 
@@ -377,7 +377,7 @@ def disturbed(qp, solution, size, rng):
 
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-permon"])
 @pytest.mark.parametrize("stored", ["integers", "with gaps"])
-def test_any_storage_of_vectors_is_taken(name, stored):
+def test_any_storage_of_vectors_is_accepted(name, stored):
     """The problem is to minimise Σ i xᵢ² + qᵀx over Σ xᵢ = 2, 0 ≤ x ≤ 5."""
     P, q, A = 2 * np.diag([1, 2, 3, 4]), np.array([-1, -2, 3, -4]), np.ones((1, 4), int)
     b, lb, ub = np.array([2]), np.zeros(4, int), np.full(4, 5)

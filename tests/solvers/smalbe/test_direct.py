@@ -147,7 +147,7 @@ def test_no_success_is_claimed_without_a_minimum():
     assert DIRECT.prepare(saddle, 1e-8)().status is Status.FAILED
 
 
-def test_it_stops_after_the_solves_that_it_may_make():
+def test_the_solver_stops_after_the_allowed_number_of_solves():
     qp, _ = with_solution(3, 40, 0, rank=45)
     s = type(DIRECT)(max_solves=1).prepare(qp, 1e-8)()
 
@@ -155,7 +155,7 @@ def test_it_stops_after_the_solves_that_it_may_make():
     assert s.message == "step limit"
 
 
-def test_it_says_what_it_declines():
+def test_the_reason_for_declining_is_returned():
     n = MAX_UNKNOWNS + 1
     large = box_qp(csr_array((n, n)).toarray(), np.zeros(n), 0)
     rows = QP(

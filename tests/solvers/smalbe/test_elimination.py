@@ -36,7 +36,7 @@ def dual():
 
 @pytest.mark.parametrize("seed", [271828, 314159])
 @pytest.mark.parametrize(("r", "apart"), [(0, 0), (3, 0), (3, 1), (3, 3)])
-def test_the_way_back_leads_to_a_kkt_point(dual, seed, r, apart):
+def test_recovery_yields_a_kkt_point(dual, seed, r, apart):
     qp = dual(seed, r=r, apart=apart)
     small = eliminate_free(qp)
     solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
@@ -47,7 +47,7 @@ def test_the_way_back_leads_to_a_kkt_point(dual, seed, r, apart):
     assert kkt_residuals(qp, solution).worst <= 1e-9
 
 
-def test_bounds_from_above_are_those_of_the_variables_that_are_left(dual):
+def test_upper_bounds_are_those_of_the_remaining_variables(dual):
     qp = dual(271828)
     tight = replace(
         qp, ub=np.where(np.isinf(qp.lb), np.inf, 0.1 + 0.01 * np.arange(24))
@@ -118,7 +118,7 @@ def test_the_factor_is_used_again_only_for_the_same_block(dual):
 @pytest.mark.parametrize(
     "why", ["no free", "all free", "singular", "rows", "inequalities", "operator"]
 )
-def test_what_cannot_be_eliminated_is_left(dual, why):
+def test_variables_that_cannot_be_eliminated_remain(dual, why):
     qp = dual(271828)
     inf = np.full(24, np.inf)
     changed = {
@@ -133,7 +133,7 @@ def test_what_cannot_be_eliminated_is_left(dual, why):
     assert eliminate_free(replace(qp, **changed[why])) is None
 
 
-def test_the_solver_takes_either_way_to_the_same_point(dual):
+def test_elimination_does_not_change_the_solution(dual):
     qp = dual(314159, apart=1)
     plain, small = (
         SMALBE(eliminate=e).prepare(qp, 1e-10)() for e in ("never", "always")
@@ -166,7 +166,7 @@ def test_factorised_columns_count_as_products(dual):
 
 
 @pytest.mark.parametrize("store", [coo_array, dia_array, bsr_array])
-def test_any_storage_of_P_is_taken(dual, store):
+def test_any_storage_of_P_is_accepted(dual, store):
     qp = dual(271828)
     s = SMALBE(eliminate="always").prepare(replace(qp, P=store(qp.P)), 1e-8)()
 
@@ -174,7 +174,7 @@ def test_any_storage_of_P_is_taken(dual, store):
     assert s.counts["factorised_columns"] == 12
 
 
-def test_rows_that_hardly_meet_the_free_variables_are_not_eliminated(dual):
+def test_rows_nearly_independent_of_free_variables_are_not_eliminated(dual):
     qp = dual(271828)
     A = qp.A.copy()
     A[0, :12] *= 1e-5

@@ -77,11 +77,11 @@ def test_the_inverse_as_preconditioner_needs_one_cg_step():
     )()
 
     assert s.status is Status.SOLVED
-    assert s.counts["cg"] <= 2  # the second, where rounding left something
+    assert s.counts["cg"] <= 2  # a second step may remove rounding errors
     assert plain.counts["cg"] > 10
 
 
-def test_one_like_a_built_in_one_takes_the_same_steps():
+def test_a_copy_of_a_built_in_preconditioner_takes_the_same_steps():
     qp, _ = qp_with_solution(30, 2)
     ours = SMALBE(preconditioner="diagonal", **PLAIN).prepare(qp, 1e-8)()
     own = WithM(inverse=lambda qp, v: 1 / qp.P.diagonal() * v, **PLAIN).prepare(
@@ -92,7 +92,7 @@ def test_one_like_a_built_in_one_takes_the_same_steps():
     assert (own.x == ours.x).all()
 
 
-def test_a_rule_sees_the_problem_in_its_own_units():
+def test_a_step_rule_receives_the_problem_in_its_original_units():
     """The rule receives g = Px + q, both step lengths as defined, and p, a direction in
     which the cost increases.
     """
@@ -148,7 +148,7 @@ RULES = {
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_no_rule_spoils_an_answer_or_lets_the_cost_rise(name):
+def test_no_step_rule_affects_accuracy_or_increases_the_cost(name):
     """Bad rules cost products. The cost decreases in every step, and the planted
     solutions are found.
     """
@@ -165,7 +165,7 @@ def test_no_rule_spoils_an_answer_or_lets_the_cost_rise(name):
         assert (fall <= 1e-9 * abs(cost).max()).all()
 
 
-def test_rules_that_only_waste_a_product_are_replaced_by_the_standard_expansion():
+def test_useless_step_rules_are_replaced_by_the_standard_expansion():
     qp, _ = qp_with_solution(25, 4)
     std = SMALBE(preconditioner="none", **PLAIN).prepare(qp, 1e-8)()
     options = {**PLAIN, "preconditioner": "none"}
@@ -184,7 +184,7 @@ def test_rules_that_only_waste_a_product_are_replaced_by_the_standard_expansion(
         (lambda qp, v: v[:-1], r"returned shape \(24,\); expected \(25,\)"),
     ],
 )
-def test_a_preconditioner_that_cannot_be_one_is_refused(M, message):
+def test_an_invalid_preconditioner_is_refused(M, message):
     qp, _ = qp_with_solution(25, 5)
     with pytest.raises(ValueError, match=message):
         WithM(inverse=M).prepare(qp, 1e-8)()
@@ -203,7 +203,7 @@ def test_a_rule_that_returns_no_point_is_refused(rule, message):
         WithRule(rule=rule).prepare(qp, 1e-8)()
 
 
-def test_in_a_sequence_the_functions_meet_every_variable():
+def test_in_a_sequence_the_functions_receive_every_variable():
     """Without user functions, free variables are eliminated from the second QP on."""
     n, sizes = 30, []
     lb = np.where(np.arange(n) < 10, -np.inf, 0.0)
@@ -223,7 +223,7 @@ def test_in_a_sequence_the_functions_meet_every_variable():
 
 
 @pytest.mark.parametrize("kind", [WithM, WithRule])
-def test_incomplete_factors_are_refused_rather_than_left_out(kind):
+def test_incomplete_factors_are_refused_not_ignored(kind):
     """Incomplete factors scale the variables. With `auto`, another preconditioner is
     used instead.
     """
@@ -233,7 +233,7 @@ def test_incomplete_factors_are_refused_rather_than_left_out(kind):
         kind(preconditioner="incomplete")
 
 
-def test_a_rule_meets_a_sparse_qp_in_its_own_variables():
+def test_a_step_rule_receives_a_sparse_qp_in_its_original_variables():
     """`auto` would scale the variables; the rule receives x and the bounds in the
     user's variables.
     """

@@ -41,7 +41,7 @@ def products(solutions):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
+def test_friction_takes_fewer_products_than_published_rules(name):
     qp, exact = emitted(name), reference_solution(emitted(name))
     found = {s: SOLVERS[s].prepare(qp, TOL)() for s in ("smalbe", *PRESETS)}
 
@@ -59,7 +59,7 @@ def test_it_is_solved_with_fewer_products_than_by_published_rules(name):
     ("solver", "recycle", "steps"),
     [("smalbe", False, 25), ("smalbe", True, 18), ("smalbe-permon", False, 25)],
 )
-def test_compiled_and_written_steps_are_the_same(
+def test_compiled_steps_and_textbook_steps_are_the_same(
     name, solver, recycle, steps, monkeypatch
 ):
     """The first steps agree. Rounding errors change later steps, earlier if directions
@@ -78,7 +78,7 @@ def test_compiled_and_written_steps_are_the_same(
     assert runs[0].x == pytest.approx(runs[1].x, abs=1e-6 * abs(runs[1].x).max())
 
 
-def test_all_that_slipped_slips_back():
+def test_all_slipping_rows_slip_back():
     """Warm-started steps go from one bound to the opposite one and back: peak, −peak,
     peak.
     """
@@ -96,7 +96,7 @@ def test_all_that_slipped_slips_back():
     assert products([s for _, s in found]) <= 1.2 * products(cold)
 
 
-def test_bounds_that_close_and_open_again_are_followed():
+def test_bounds_that_become_active_and_inactive_again_are_tracked():
     """Without friction, both bounds of every tangential multiplier are zero."""
     with_friction = emitted("greco/n=16/dual-bounds")
     without = emitted("greco/n=16/iterate=1/dual-bounds")
@@ -131,11 +131,11 @@ def test_the_history_ends_with_the_rows_that_slip():
 
 
 def fixed_point(qp, mu, solve, enough, tighten=0.0):
-    """Solve Coulomb's law on a dual with bounds only; all solutions in turn.
+    """Solve Coulomb's law on a dual with bounds only; return all solutions in order.
 
-    tighten : the part of the last residual that a solve is to reach, never looser than
-        the one before; 0: always TOL. A warm solver may leave a loosely solved problem
-        where it was: a residual below the tolerance says nothing
+    tighten : tolerance of a solve, relative to the last residual of Coulomb's law;
+        tolerances never increase. 0: always TOL. A residual below a loose tolerance
+        does not stop the iteration, because a warm solver may return its starting point
     """
     m = qp.q.size // 2
     bound, found, tol = np.zeros(m), [], 1e-2 if tighten else TOL
@@ -163,7 +163,7 @@ def test_a_warm_fixed_point_takes_less_than_half_the_products_of_a_cold_one(name
     exact = reference_solution(qp)
 
     assert left <= enough
-    assert abs(len(warm) - len(cold)) <= 1  # what is left of each differs by rounding
+    assert abs(len(warm) - len(cold)) <= 1  # residuals differ by rounding
     assert products(warm) <= 0.5 * products(cold)
     assert warm[-1].x == pytest.approx(exact.x, abs=1e-5 * abs(exact.x).max())
 
@@ -182,7 +182,7 @@ def test_inner_tolerances_that_tighten_save_products_at_an_equal_residual():
     assert found[-1].x == pytest.approx(exact.x, abs=1e-5 * abs(exact.x).max())
 
 
-def test_an_emitted_problem_says_how_far_from_the_fixed_point_it_is():
+def test_an_emitted_problem_states_its_fixed_point_residual():
     """‖g − mu·λ_n‖/‖g‖ of the solution of the QP is the relative change of the next
     friction bound.
     """
@@ -198,7 +198,7 @@ def test_an_emitted_problem_says_how_far_from_the_fixed_point_it_is():
     assert last.unsettled == 0
 
 
-def test_an_emitted_sequence_is_cheaper_still_where_its_tolerances_tighten():
+def test_tightening_tolerances_make_an_emitted_sequence_cheaper():
     names = "greco/n=16/iterate={}/dual"
     cases = [parse(names.format(i), PROBLEMS).build(reference_solution)
              for i in range(1, 13)]  # fmt: skip
@@ -212,7 +212,7 @@ def test_an_emitted_sequence_is_cheaper_still_where_its_tolerances_tighten():
     assert products(found) <= 0.75 * products(full)
 
 
-def test_the_emitted_sequence_is_cheaper_warm_where_rows_are_equations_too():
+def test_warm_starts_save_products_with_equality_rows():
     names = f"beam-ring/Nr=4/Nh=3/steps=1/{COULOMB}/iterate={{}}/dual"
     qps = [emitted(names.format(i)) for i in range(1, 7)]
     prepare = SOLVERS["smalbe"].chain(TOL)
@@ -224,7 +224,7 @@ def test_the_emitted_sequence_is_cheaper_warm_where_rows_are_equations_too():
     assert products(warm) <= 0.5 * products(cold)
 
 
-def test_a_sequence_with_one_equation_goes_on_with_the_spectrum_of_before():
+def test_a_sequence_with_one_equation_reuses_the_previous_spectrum():
     """The arrays that are passed to the next QP have the layout that the compiled code
     requires.
     """

@@ -1,4 +1,4 @@
-"""Search for QPs on which SMALBE makes a false claim or gives up."""
+"""Search for QPs on which SMALBE makes a false claim or stops without a solution."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def hostile(seed):
 
 
 def ends(name, seeds):
-    """Return the number of runs that gave up, the number of all runs, and the false
+    """Return the numbers of runs without a solution and of all runs, and the false
     claims.
     """
     given_up, runs, wrong = 0, 0, []
@@ -67,7 +67,7 @@ def ends(name, seeds):
 
 
 @pytest.mark.parametrize("name", ["smalbe", "smalbe-condensed", "smalbe-direct"])
-def test_nothing_is_claimed_wrongly(name):
+def test_no_claim_is_wrong(name):
     given_up, runs, wrong = ends(name, range(1000, 1060))
 
     assert wrong == []
@@ -92,7 +92,7 @@ def test_without_a_cost_any_feasible_point_is_found_optimal(name, seed):
 
 
 @pytest.mark.slow
-def test_of_2100_runs_one_in_two_hundred_gives_up_at_most():
+def test_at_most_one_of_two_hundred_runs_fails():
     given_up, runs, wrong = ends("smalbe", range(700))
 
     assert runs == 2100

@@ -73,7 +73,7 @@ def test_on_a_tridiagonal_matrix_the_factor_is_the_one_of_cholesky(n):
 
 @pytest.mark.parametrize("kind", ["five-point", "nine-point", "line", "graph", "wide"])
 @pytest.mark.parametrize("seed", range(10))
-def test_the_factor_is_the_one_that_is_written(seed, kind):
+def test_the_factor_agrees_with_the_textbook(seed, kind):
     """Factors by diagonals and by columns, from one end or from both, agree with the
     textbook on every face.
     """
@@ -109,7 +109,7 @@ def test_the_factor_is_the_one_that_is_written(seed, kind):
     assert F.shift == 0
 
 
-def test_a_five_point_grid_loses_what_its_factor_drops_but_for_a_twentieth():
+def test_a_five_point_grid_compensates_a_twentieth_of_dropped_entries():
     """Row sums of M equal those of P plus the uncompensated share of each
     dropped entry.
     """
@@ -127,7 +127,7 @@ def test_a_five_point_grid_loses_what_its_factor_drops_but_for_a_twentieth():
     assert lost <= 0.1 * lost_by_plain
 
 
-def test_where_pivots_fail_the_diagonal_is_shifted():
+def test_the_diagonal_is_shifted_if_pivots_fail():
     """The incomplete factorisation of Kershaw's matrix (J. Comput. Phys. 26, 1978) has
     a negative pivot.
     """
@@ -165,7 +165,7 @@ def test_the_inverse_is_positive_definite_on_every_face(seed):
 # --- when it is used ----------------------------------------------------------------
 
 
-def test_a_sparse_p_with_bounds_has_one():
+def test_a_sparse_p_with_bounds_has_an_incomplete_factor():
     assert has_sparse_factor(primal("journal-bearing/n=5"))
     assert has_sparse_factor(
         boxed(csr_array([[2.0]]), np.ones(1), np.zeros(1), np.ones(1))
@@ -175,7 +175,7 @@ def test_a_sparse_p_with_bounds_has_one():
 @pytest.mark.parametrize(
     "reason", ["dense", "operator", "rows", "diagonal", "full", "nothing"]
 )
-def test_where_a_factor_would_not_do_there_is_none(reason):
+def test_unsuitable_matrices_have_no_incomplete_factor(reason):
     qp = primal("journal-bearing/n=9")
     n, one = 81, np.ones((1, 81))
     if reason == "dense":
@@ -225,7 +225,7 @@ def test_trilinear_elements_are_scaled_without_a_factor():
     assert s.counts["P_products"] <= 200
 
 
-def test_who_asks_for_a_factor_that_is_not_there_is_told_why():
+def test_requesting_an_unavailable_factor_is_refused_with_the_reason():
     solver = replace(SOLVERS["smalbe"], preconditioner="incomplete")
     qp = primal("journal-bearing/n=5")
 
@@ -259,7 +259,7 @@ def test_sparsity_by_hand():
         ("string/n=50", False),
     ],
 )
-def test_a_factor_is_used_where_it_saves_time(case, pays):
+def test_a_factor_is_used_if_it_saves_time(case, pays):
     qp = primal(case)
     s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
 
@@ -308,7 +308,7 @@ def test_a_search_finds_no_sparse_qp_that_it_does_not_solve(seeds, tol, solver):
 
 @pytest.mark.parametrize("seed", range(30))
 @pytest.mark.parametrize("expansion", ["model", "std", "mixed"])
-def test_every_step_is_feasible_and_lessens_the_cost(seed, expansion):
+def test_every_step_is_feasible_and_decreases_the_cost(seed, expansion):
     qp, _ = qp_with_minimum(seed)
     solver = replace(
         SOLVERS["smalbe"],
@@ -353,7 +353,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
         ("obstacle/dim=1/n=64", 20),
     ],
 )
-def test_on_the_named_families_it_takes_few_products(case, most):
+def test_on_the_named_families_few_products_are_needed(case, most):
     """PERMON's unmerged branch takes 74 and 105 on the first two."""
     qp = primal(case)
     s = FACTORS.prepare(qp, 1e-6)()
@@ -363,7 +363,7 @@ def test_on_the_named_families_it_takes_few_products(case, most):
     assert s.counts["P_products"] <= most
 
 
-def test_half_a_string_takes_a_tenth_of_the_products_of_a_face_after_the_other():
+def test_half_a_string_takes_a_tenth_of_the_products_of_successive_faces():
     """PERMON's unmerged branch takes 224 products, about one for each
     intermediate face.
     """
@@ -380,7 +380,7 @@ def test_half_a_string_takes_a_tenth_of_the_products_of_a_face_after_the_other()
     [("journal-bearing/n=200/eccentricity=0.9", 60), ("string/n=10000", 120),
      ("journal-bearing/n=300", 160), ("obstacle/dim=2/n=257/shape=hemisphere", 100)],
 )  # fmt: skip
-def test_on_large_ones_as_well(case, most):
+def test_on_large_families_few_products_are_needed(case, most):
     qp = primal(case)
     s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
 
@@ -388,7 +388,7 @@ def test_on_large_ones_as_well(case, most):
     assert s.counts["P_products"] <= most
 
 
-def test_it_stops_where_the_residual_is_what_was_asked_for():
+def test_the_solver_stops_at_the_requested_residual():
     """Since steps are cheap, the final residual is not far below the tolerance, at
     least one twentieth of it.
     """
@@ -401,7 +401,7 @@ def test_it_stops_where_the_residual_is_what_was_asked_for():
             assert 0.05 * tol <= residual <= tol
 
 
-def test_all_at_their_bounds_from_the_start():
+def test_all_variables_start_at_their_bounds():
     """No component is free, so the first face is empty."""
     qp = boxed(grid(6), np.ones(36), np.zeros(36), np.ones(36))
     s = FACTORS.prepare(qp, 1e-8)()
@@ -431,7 +431,7 @@ def test_a_floating_membrane_on_an_obstacle():
     assert kkt_residuals(qp, s).worst <= 1e-8
 
 
-def test_a_sequence_begins_where_the_last_one_ended():
+def test_a_sequence_starts_from_the_previous_solution():
     qp = primal("journal-bearing/n=40/eccentricity=0.9")
     prepare = FACTORS.chain(1e-8)
     first = prepare(qp)()

@@ -1,4 +1,4 @@
-"""Steps of MPRGP, which tests of its solution cannot check."""
+"""Steps of MPRGP, which cannot be checked by solutions alone."""
 
 import re
 from collections import Counter
@@ -249,7 +249,7 @@ def test_the_split_gradient_adds_up_and_its_parts_are_admissible():
     face = split(at, bounds)
 
     assert face.phi.tolist() == [0, 0, 3, 0, 0, -4]
-    assert face.beta.tolist() == [0, -2, 0, 2, 0, 0]  # only what leads inside
+    assert face.beta.tolist() == [0, -2, 0, 2, 0, 0]  # only components that lead inside
     assert kernels.reduced(x, face.phi, 0.5, *bounds) == pytest.approx(
         [0, 0, 1, 0, 0, -1.4]
     )
@@ -272,7 +272,7 @@ def string():
     ("expansion", "iterations", "products", "cg", "expansions", "proportionings"),
     [("std", 181, 200, 156, 18, 7), ("projcg", 160, 175, 134, 14, 12)],
 )
-def test_permons_rules_take_permons_steps(
+def test_the_rules_of_permon_take_the_steps_of_permon(
     minimise, expansion, iterations, products, cg, expansions, proportionings
 ):
     """Counters that PERMON 3.25 prints for this problem at rtol = 1e-5."""
@@ -285,7 +285,7 @@ def test_permons_rules_take_permons_steps(
 
     steps = [run.trace.count(letter) for letter in "cep"]
     assert len(run.trace) == iterations
-    assert 1 + counted == products  # one for the gradient at the start
+    assert 1 + counted == products  # one product for the gradient at the start
     assert steps == [cg, expansions, proportionings]
 
 
@@ -328,7 +328,7 @@ def test_the_inverse_in_a_face_inverts_the_block_of_the_model():
     assert (z[~free] == 0).all()
 
 
-def test_a_model_is_raised_to_what_a_product_shows():
+def test_a_model_is_increased_to_the_curvature_of_a_product():
     """Afterwards sᵀBs = sᵀHs, and the model is unchanged along U."""
     rng = np.random.default_rng(271828)
     U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
@@ -486,7 +486,7 @@ def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise)
     assert products <= 267  # of PERMON's rules
 
 
-def test_every_step_by_the_model_lessens_the_cost(minimise):
+def test_every_model_step_decreases_the_cost(minimise):
     for expansion in ("model", "std"):
         steps, _ = model_run(minimise, string(), Rules(expansion=expansion))
         costs = [cost for _, _, cost in steps]
@@ -510,7 +510,7 @@ def string_and_boxes():
     return [(A, b, lower, np.full(b.size, np.inf)), *map(tight_box, range(60))]
 
 
-def test_no_more_steps_beyond_the_box_than_inside(minimise):
+def test_there_are_at_most_as_many_steps_beyond_the_box_as_inside(minimise):
     """There may be one such step if there are no steps inside; hence the products are
     at most doubled.
     """
@@ -537,7 +537,7 @@ def watched(seen, letter, at, face):
     seen.append(at)
 
 
-def test_each_step_gains_what_the_rate_of_the_book_needs(minimise):
+def test_each_step_achieves_the_decrease_of_the_convergence_theory(minimise):
     """Each step decreases f by at least G/4τ, with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖
     and Γ = 1. Hence f − f* decreases by at least the factor 1 − λ_min/4‖H‖, which the
     book proves for steps of length 1/‖H‖.
@@ -624,7 +624,7 @@ def test_directions_that_span_the_face_solve_for_another_right_hand_side():
     assert not cut.directions.free[11]
 
 
-def test_directions_of_another_face_are_forgotten():
+def test_directions_of_another_face_are_discarded():
     A, x, b = ill_conditioned(20)
     lower = np.where(np.arange(20) < 5, 0.0, -np.inf)
     start = np.where(np.arange(20) < 5, 0.0, x)

@@ -74,7 +74,7 @@ def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, 
     assert errors[1] < errors[0] / 2
 
 
-def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts(outer_loop):
+def test_the_accuracy_of_an_answer_does_not_depend_on_the_starting_point(outer_loop):
     """The tolerance is relative to b and not to the initial gradient, which is already
     small here.
     """
@@ -98,7 +98,7 @@ def test_steps_and_outer_iterations_end_at_their_limit(outer_loop, most):
     assert len(found.steps) + len(found.outer) <= most + 1
 
 
-def test_a_run_that_goes_on_has_what_is_left_of_the_limit(outer_loop):
+def test_a_continued_run_has_the_remaining_step_limit(outer_loop):
     problem = problem_of(drawn(271828))
     at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=10)
     again = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=15, at=at)
@@ -122,7 +122,7 @@ def test_the_lagrangian_is_that_of_the_point(outer_loop, most):
     assert at.outer[-1].lagrangian == pytest.approx(L, rel=1e-10)
 
 
-def test_of_a_stall_with_rows_that_are_met_the_gradient_is_asked_for_more():
+def test_a_stall_with_satisfied_rows_tightens_the_gradient_tolerance():
     problem = problem_of(drawn(271828))
     zero = np.zeros(60)
     at = Iterate(nu=zero, g=zero, mu=np.zeros(2), M=1.0, rho=3.0)
@@ -131,7 +131,7 @@ def test_of_a_stall_with_rows_that_are_met_the_gradient_is_asked_for_more():
     assert (stricter.M, stricter.rho) == (0.1, 3.0)
 
 
-def test_of_a_stall_with_rows_that_are_not_met_the_penalty_grows():
+def test_a_stall_with_violated_rows_increases_the_penalty():
     problem = problem_of(drawn(271828))
     nu = np.linspace(0, 1, 60)
     at = Iterate(nu=nu, g=problem.H(nu, 3.0), mu=np.zeros(2), M=1.0, rho=3.0)
@@ -144,7 +144,7 @@ def test_of_a_stall_with_rows_that_are_not_met_the_penalty_grows():
 
 @pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, unit):
+def test_infeasible_boxes_are_detected_beyond_rounding_in_every_unit(seed, unit):
     """The constraints are x ≥ lb and a positive row whose right-hand side is attained
     only at x = lb, or not at all.
     """
@@ -161,7 +161,7 @@ def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, un
 
 
 @pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
-def test_a_far_feasible_point_is_seen_in_every_unit(unit):
+def test_a_distant_feasible_point_is_detected_in_every_unit(unit):
     """(2, −1000) satisfies x₁ + x₂/1000 = 1; x₂ has no bound."""
     rows = orthonormal_rows(np.array([[1.0, 1e-3]]), np.array([unit]))
     bounds = (unit * np.array([2.0, -np.inf]) - rows.x_tilde, np.full(2, np.inf))

@@ -90,7 +90,7 @@ def test_diagonal_divides_by_the_diagonal(whole, gap):
 
 
 @pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
-def test_held_components_stay_out(whole, kind):
+def test_fixed_components_are_excluded(whole, kind):
     """A chain with a fixed interior node consists of two chains."""
     K, B = chain(9), np.eye(9)[[1, 3, 6, 8]]
     free = np.arange(9) != 4
@@ -117,7 +117,7 @@ def test_a_masked_preconditioner_stays_in_the_face(in_face, gap):
 
 
 @pytest.mark.parametrize("kind", ["dirichlet", "lumped"])
-def test_structural_ones_are_declined_without_structure(gap, kind):
+def test_structural_preconditioners_are_declined_without_structure(gap, kind):
     solver = SMALBE(preconditioner=kind)
 
     assert "structure" in solver.declines(replace(gap, structure=None))
@@ -126,7 +126,7 @@ def test_structural_ones_are_declined_without_structure(gap, kind):
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 @pytest.mark.parametrize("kind", ["dirichlet", "lumped", "diagonal"])
-def test_they_lead_to_the_solution_and_are_counted(form, kind):
+def test_preconditioned_solves_converge_and_applications_are_counted(form, kind):
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=3))
     qp = family.build(form, params, reference_solution).qp
@@ -147,7 +147,7 @@ def test_structure_survives_the_file(gap, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_the_matrix_of_a_dual_is_what_its_structure_says(form):
+def test_the_matrix_of_a_dual_agrees_with_its_structure(form):
     """P = BK⁺Bᵀ on self-equilibrated λ, for any generalised inverse."""
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=4, Nh=3))

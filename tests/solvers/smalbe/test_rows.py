@@ -63,7 +63,7 @@ def columns(apply, n):
     return np.column_stack([apply(v) for v in np.eye(n)])
 
 
-def test_the_rows_are_orthonormal_and_span_those_given(pair):
+def test_the_rows_are_orthonormal_and_span_the_original_rows(pair):
     sparse, dense = pair
     C = columns(lambda v: sparse.C @ v, 40)
 
@@ -75,7 +75,7 @@ def test_the_rows_are_orthonormal_and_span_those_given(pair):
     assert sparse.x_tilde == pytest.approx(dense.x_tilde, rel=1e-9, abs=1e-10)
 
 
-def test_multipliers_belong_to_the_rows_as_given(pair, G):
+def test_multipliers_belong_to_the_original_rows(pair, G):
     a = np.arange(1.0, 10.0)
 
     for rows in pair:
@@ -108,7 +108,9 @@ def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
 
 
 @pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
-def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch):
+def test_a_model_of_the_penalty_is_the_same_preconditioner(
+    G, e, face, rho, monkeypatch
+):
     """For P = I, whose model has no Ritz vectors, results with a factor, with an array
     and by hand agree.
     """
@@ -136,7 +138,7 @@ def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch
         assert sparse == pytest.approx(inverse, abs=1e-9)
 
 
-def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
+def test_dependent_rows_are_treated_as_dense(G, e, monkeypatch):
     monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     twice = csr_array(np.vstack([G.toarray(), G.toarray()[3:4]]))
 
@@ -146,7 +148,7 @@ def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
     assert len(rows.C) == 9
 
 
-def test_of_dependent_rows_that_are_too_many_some_stand_for_all(G, e, monkeypatch):
+def test_an_independent_subset_replaces_too_many_dependent_rows(G, e, monkeypatch):
     monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     monkeypatch.setattr(module, "too_large", lambda n, copies: "too large")
     dependent = np.vstack(
@@ -185,9 +187,7 @@ def test_a_qp_with_dependent_sparse_rows_is_solved(G, e, monkeypatch):
 
 @pytest.mark.parametrize("border", [True, False], ids=["border", "whole"])
 @pytest.mark.parametrize("shift", [1e-6, 1e-10, 1e-14])
-def test_a_motion_that_held_components_alone_feel_leaves_a_factor(
-    monkeypatch, border, shift
-):
+def test_a_motion_of_fixed_components_only_leaves_a_factor(monkeypatch, border, shift):
     """On the free components, the rows consist of integers and one row is the sum of
     two others.
 
@@ -236,7 +236,7 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
     assert sparse.x == pytest.approx(dense.x, abs=1e-6)
 
 
-def test_a_right_hand_side_of_rounding_is_none(G):
+def test_a_right_hand_side_of_rounding_size_counts_as_zero(G):
     """A right-hand side of 1e-18 is a rounding error and does not set a scale for
     residuals.
     """

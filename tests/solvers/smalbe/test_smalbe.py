@@ -71,7 +71,7 @@ def dual():
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 @pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-10])
 @pytest.mark.parametrize("name", INHOUSE)
-def test_what_is_claimed_is_true(dual, name, seed, tol):
+def test_claims_are_true(dual, name, seed, tol):
     qp = dual(seed)
     s = SOLVERS[name].prepare(qp, tol)()
 
@@ -163,13 +163,13 @@ def test_nearly_parallel_rows_are_independent():
 
 
 @pytest.mark.parametrize("off", [1e-6, -1e-3])
-def test_a_repeated_row_must_ask_for_the_same(off):
+def test_repeated_rows_need_equal_right_hand_sides(off):
     rows = orthonormal_rows(np.ones((2, 3)), np.array([1.0, 1.0 + off]))
 
     assert not rows.consistent
 
 
-def test_a_stalled_multiplier_is_helped_by_a_larger_penalty():
+def test_a_stalled_multiplier_increases_the_penalty():
     """Because of fixed variables, the free ones have little effect on one row. With
     constant ρ, more than ten thousand outer iterations were needed.
     """
@@ -196,7 +196,7 @@ def test_the_gradient_projection_step_is_shorter_than_two_over_the_norm(dual, rh
     assert 1.8 <= alpha * np.linalg.norm(H, 2) < 2
 
 
-def test_the_model_knows_what_the_lanczos_process_and_the_rows_tell(dual):
+def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     """The model is ρ on C, and the Ritz value plus its residual on a Ritz vector.
     Elsewhere it is far below the norm, because the spectrum decays like 1/k².
     """
@@ -351,9 +351,7 @@ def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed)
     assert False in cut
 
 
-def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(
-    outer_loop, dual
-):
+def test_the_penalty_grows_if_the_lagrangian_does_not(outer_loop, dual):
     """The penalty is multiplied by `rho_growth` when M is reduced, and by 10 when the
     loop stalls.
     """
@@ -443,7 +441,7 @@ def test_the_power_method_stops_at_its_tolerance():
     assert 5 <= len(products) <= 10
 
 
-def test_inequality_rows_are_declined_with_a_way_out(manufactured):
+def test_inequality_rows_are_declined_with_an_alternative(manufactured):
     qp, _ = manufactured("inequalities")
 
     assert "no inequality rows" in SMALBE().declines(qp)
@@ -524,7 +522,7 @@ def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
 
 
 @pytest.mark.slow
-def test_few_products_with_bounds_alone():
+def test_few_products_suffice_with_bounds_only():
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=30, Nh=15, step=5))
     qp = family.build("dual-bounds", params, reference_solution).qp
@@ -540,7 +538,7 @@ def test_few_products_with_bounds_alone():
     [range(2000, 2020), pytest.param(range(2020, 2060), marks=pytest.mark.slow)],
     ids=["20", "40 more"],
 )
-def test_a_claim_keeps_half_of_what_the_harness_allows(dual, tol, seeds):
+def test_a_claim_uses_at_most_half_of_the_allowed_residual(dual, tol, seeds):
     """The residuals of the original QP decide, not those of the projected problem."""
     for seed in seeds:
         qp = dual(seed)
@@ -601,7 +599,7 @@ def mixed(P, q, lb, ub, A, b):
     ids=["x = 0 is the answer", "x = 0, positive row", "a first residual of 1e-2",
          "an entry of 1e-6 for the free variable", "as many rows as variables"],
 )  # fmt: skip
-def test_what_once_failed(qp, name):
+def test_earlier_failures_do_not_recur(qp, name):
     s = SOLVERS[name].prepare(qp, 1e-6)()
 
     assert s.status is Status.SOLVED

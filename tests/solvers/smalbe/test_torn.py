@@ -44,7 +44,7 @@ def test_products_do_not_grow_with_the_mesh(answers):
     assert all(s.counts["outer"] <= 3 for _, s in solved)
 
 
-def test_they_are_solved_and_the_preconditioner_is_counted(answers):
+def test_torn_problems_are_solved_and_the_preconditioner_is_counted(answers):
     tol, solved = answers
 
     for qp, s in solved:
@@ -53,7 +53,7 @@ def test_they_are_solved_and_the_preconditioner_is_counted(answers):
         assert s.counts["preconditioner_applies"] <= s.counts["P_products"]
 
 
-def test_their_rows_are_sparse_and_their_spectrum_flat(answers):
+def test_rows_of_torn_problems_are_sparse_with_a_flat_spectrum(answers):
     _, solved = answers
     qp, s = solved[-1]
 
@@ -62,7 +62,7 @@ def test_their_rows_are_sparse_and_their_spectrum_flat(answers):
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
-def test_the_displacement_is_that_of_the_whole(glue):
+def test_the_displacement_is_that_of_the_undecomposed_body(glue):
     pieces, whole = torn(8, glue=glue), case(Nr=8, Nh=4, steps=1)
     u = pieces.recover(SMALBE().prepare(pieces.qp, 1e-9)())
     v = whole.recover(SMALBE().prepare(whole.qp, 1e-9)())
@@ -81,8 +81,8 @@ def test_the_displacement_is_that_of_the_whole(glue):
     ],
 )
 def test_calls_of_python_take_the_same_steps(name, tol, monkeypatch):
-    """On ranks, the table of operations contains Python functions; here it does so in
-    one process.
+    """As on ranks, the table of operations contains Python functions, but in one
+    process.
     """
     qp = build(f"{name}/dual").qp
     compiled = SMALBE().prepare(qp, tol)()
@@ -118,7 +118,9 @@ def test_a_sequence_is_warm():
 
 @pytest.mark.parametrize("basis", ["standard", "dual"])
 @pytest.mark.parametrize("parts", [4, 20])
-def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
+def test_a_disc_whose_rotation_only_fixed_rows_prevent_is_solved(
+    basis, parts, monkeypatch
+):
     """With sparse rows, as on ranks, one eigenvalue of G_F G_Fᵀ is a rounding error."""
     monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
     qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
@@ -129,7 +131,7 @@ def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypa
 
 
 @pytest.mark.parametrize(("jump", "tol"), [(1e8, 1e-9), (1e10, 1e-14)])
-def test_a_solve_that_rounding_stops_ends(jump, tol):
+def test_a_solve_stalled_by_rounding_ends(jump, tol):
     """The moduli are far apart, and CG cannot find further directions that are
     conjugate to earlier ones.
     """
@@ -146,7 +148,7 @@ def test_a_solve_that_rounding_stops_ends(jump, tol):
 
 @pytest.mark.parametrize("jump", [1e2, 1e4, 1e6, 1e8])
 @pytest.mark.parametrize("tol", [1e-8, 1e-10])
-def test_rounding_along_directions_that_were_taken_is_taken_out(jump, tol):
+def test_rounding_along_previous_directions_is_removed(jump, tol):
     """Without this correction, the solve took at least 209 products: as many as
     directions are stored, and then further ones.
     """

@@ -166,7 +166,7 @@ class Progress(NamedTuple):
         return self._replace(least=min(self.least, square))
 
     def stagnates(self, cost: float, terms: float) -> bool:
-        """Return whether neither the gradient nor the cost has decreased enough.
+        """Return True if neither the gradient nor the cost has decreased enough.
 
         cost : twice the cost
         terms : sum of the absolute values of the terms of the cost
@@ -207,7 +207,7 @@ class _Line(NamedTuple):
 
 
 class _Stay(NamedTuple):
-    """The CG steps on one face."""
+    """CG steps on one face."""
 
     inside: int  #: number of CG steps on the face
     began: float  #: ‖φ‖² at the first of these steps

@@ -28,7 +28,7 @@ NO_SHIFT = 1e-13  #: ratio ‖x̃‖/‖ν‖ up to which x̃ is attributed to r
 
 
 def met(rows: Rows, nu: Vector, tol: float, least: float) -> bool:
-    """Return whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
+    """Return True if ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
 
     If e = 0, or if x̃ is within the rounding error of ν, the criterion is
     ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
