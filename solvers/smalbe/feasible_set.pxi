@@ -65,7 +65,9 @@ cdef class FeasibleSet:
         cdef Py_ssize_t[::1] ranges
         cdef Py_ssize_t i
         cdef double square
-        sizes = [one.index.shape[1] for one in sets for _ in one.radius]
+        sizes = np.concatenate([
+            np.full(len(one.radius), one.index.shape[1]) for one in sets
+        ])
         starts = np.concatenate([[0], np.cumsum(sizes)])
         start = starts.astype(np.int32)
         indices = np.concatenate([one.index.ravel() for one in sets])
@@ -80,7 +82,7 @@ cdef class FeasibleSet:
         self.D.count, self.D.ranges = len(sizes), ranges.size // 2
         self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
         self.D.slack, self.D.centre = &slack[0], shift
-        self.D.dim = sizes[0] if len(set(sizes)) == 1 else 0
+        self.D.dim = sizes[0] if len(sizes) and (sizes == sizes[0]).all() else 0
         if ranges.size:
             self.D.range = &ranges[0]
         for i in range(self.D.count):
