@@ -97,6 +97,9 @@ cdef extern from "vectors.h" nogil:
                      double *y, Py_ssize_t k, Py_ssize_t n)
     void add_combination(double s, const double *U, const double *c, double *y,
                          Py_ssize_t k, Py_ssize_t n)
+    double next_direction(double gamma, const double *x, const double *g,
+                          const double *lower, const double *upper, double *p,
+                          Py_ssize_t n, double *result)
     double first_bound(const double *x, const double *p, const double *lower,
                        const double *upper, Py_ssize_t n)
     void lengths(const double *x, const double *g, const double *p, const double *Hp,
@@ -209,6 +212,9 @@ cdef extern from "discs.h" nogil:
         const Py_ssize_t *range
     void project_discs(const discs *D, double *y)
     double first_disc(const discs *D, const double *x, const double *p, double least)
+    double next_on_discs(const discs *D, double gamma, const double *x,
+                         const double *g, double *p, double least, double *result)
+    bint leaves_discs(const discs *D, const double *x, const double *g, double length)
     void split_discs(const discs *D, const double *x, const double *g, double tau,
                      double *phi, double *free, double *result)
     void advance_discs(const discs *D, double alpha, double *x, double *g,

@@ -128,29 +128,31 @@ static void project_discs(const discs *D, double *y)
     WITH_DIMENSION(D, project_each, y);
 }
 
+/* Return the α at which x − αp leaves the disc, or `least` if that is smaller;
+   square = ‖x + c‖². */
+INLINE double first_of_disc(const discs *D, int d, Py_ssize_t i, const double *x,
+                            const double *p, double square, double least)
+{
+    double a = 0, b = 0, c = square, r = D->radius[i];
+    FOR_VARIABLES(D, i, d, j) {
+        a += p[j] * p[j];
+        b += about_centre(D, x, j) * p[j];
+    }
+    /* a α² − 2bα + c − r² ≤ 0 in the disc: convex, and true at α = 0 */
+    if (a == 0 || (least < INFINITY && (a * least - 2 * b) * least + c < r * r))
+        return least;
+    c = (sqrt(c) - r) * (sqrt(c) + r); /* without cancellation */
+    c = c < 0 ? c : 0;
+    double root = sqrt(b * b - a * c);
+    double to = b >= 0 ? (b + root) / a : -c / (root - b);
+    return to < least ? to : least;
+}
+
 INLINE double first_of_each(const discs *D, int d, const double *x, const double *p,
                             double least)
 {
-    for (Py_ssize_t i = 0; i < D->count; i++) {
-        double a = 0, b = 0, c = 0, r = D->radius[i];
-        FOR_VARIABLES(D, i, d, j)
-            a += p[j] * p[j];
-        if (a == 0)
-            continue;
-        FOR_VARIABLES(D, i, d, j) {
-            double u = about_centre(D, x, j);
-            b += u * p[j];
-            c += u * u;
-        }
-        /* in the disc, a α² − 2bα + c − r² ≤ 0; this is convex, and true for α = 0 */
-        if (least < INFINITY && (a * least - 2 * b) * least + c < r * r)
-            continue;
-        c = (sqrt(c) - r) * (sqrt(c) + r); /* without cancellation */
-        c = c < 0 ? c : 0;
-        double root = sqrt(b * b - a * c);
-        double to = b >= 0 ? (b + root) / a : -c / (root - b);
-        least = to < least ? to : least;
-    }
+    for (Py_ssize_t i = 0; i < D->count; i++)
+        least = first_of_disc(D, d, i, x, p, square_of_disc(D, d, i, x), least);
     return least;
 }
 
@@ -158,6 +160,50 @@ INLINE double first_of_each(const discs *D, int d, const double *x, const double
 static double first_disc(const discs *D, const double *x, const double *p, double least)
 {
     return WITH_DIMENSION(D, first_of_each, x, p, least);
+}
+
+INLINE double next_on_each(const discs *D, int d, double gamma, const double *x,
+                           const double *g, double *p, double least, double *result)
+{
+    double slope = 0, size = 0;
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double square = square_of_disc(D, d, i, x);
+        int inside = is_inside(D, i, square);
+        FOR_VARIABLES(D, i, d, j) {
+            double to = (inside ? g[j] : 0) - gamma * p[j];
+            slope += g[j] * to;
+            size += to * to;
+            p[j] = to;
+        }
+        least = first_of_disc(D, d, i, x, p, square, least);
+    }
+    result[0] += slope;
+    result[1] += size;
+    return least;
+}
+
+/* p = φ − γp on discs; add gᵀp and ‖p‖² to result. Return the smallest α at which
+   x − αp leaves a disc, at most `least`. */
+static double next_on_discs(const discs *D, double gamma, const double *x,
+                            const double *g, double *p, double least, double *result)
+{
+    return WITH_DIMENSION(D, next_on_each, gamma, x, g, p, least, result);
+}
+
+INLINE int leaves_each(const discs *D, int d, const double *x, const double *g,
+                       double length)
+{
+    for (Py_ssize_t i = 0; i < D->count; i++)
+        if (projected_factor(D, d, i, x, g, length) < 1
+            && is_inside(D, i, square_of_disc(D, d, i, x)))
+            return 1;
+    return 0;
+}
+
+/* Return 1 if x − φ·length is outside any disc, else 0. */
+static int leaves_discs(const discs *D, const double *x, const double *g, double length)
+{
+    return WITH_DIMENSION(D, leaves_each, x, g, length);
 }
 
 INLINE void split_each(const discs *D, int d, const double *x, const double *g,
@@ -256,18 +302,24 @@ static void step_on_discs(const discs *D, const double *x, const double *g,
         WITH_DIMENSION(D, step_on_each, x, g, length, 0, s, result);
 }
 
-/* free = 1 on discs with x off the boundary, else 0; return 1 if any entry changed. */
-static int mark_discs(const discs *D, const double *x, double *free)
+INLINE int mark_each(const discs *D, int d, const double *x, double *free)
 {
     int changed = 0;
     for (Py_ssize_t i = 0; i < D->count; i++) {
-        double inside = is_inside(D, i, square_of_disc(D, 0, i, x));
-        FOR_VARIABLES(D, i, 0, j) {
-            changed |= free[j] != inside;
-            free[j] = inside;
-        }
+        double inside = is_inside(D, i, square_of_disc(D, d, i, x));
+        FOR_VARIABLES(D, i, d, j)
+            if (free[j] != inside) { /* few: memory is written only where needed */
+                changed = 1;
+                free[j] = inside;
+            }
     }
     return changed;
+}
+
+/* free = 1 on discs with x off the boundary, else 0; return 1 if any entry changed. */
+static int mark_discs(const discs *D, const double *x, double *free)
+{
+    return WITH_DIMENSION(D, mark_each, x, free);
 }
 
 /* w = T(w + κv) on discs with x on the boundary and nᵀg < 0. T removes the component

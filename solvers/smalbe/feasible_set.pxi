@@ -65,7 +65,9 @@ cdef class FeasibleSet:
         cdef Py_ssize_t[::1] ranges
         cdef Py_ssize_t i
         cdef double square
-        sizes = [one.index.shape[1] for one in sets for _ in one.radius]
+        sizes = np.concatenate([
+            np.full(len(one.radius), one.index.shape[1]) for one in sets
+        ])
         starts = np.concatenate([[0], np.cumsum(sizes)])
         start = starts.astype(np.int32)
         indices = np.concatenate([one.index.ravel() for one in sets])
@@ -80,7 +82,7 @@ cdef class FeasibleSet:
         self.D.count, self.D.ranges = len(sizes), ranges.size // 2
         self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
         self.D.slack, self.D.centre = &slack[0], shift
-        self.D.dim = sizes[0] if len(set(sizes)) == 1 else 0
+        self.D.dim = sizes[0] if len(sizes) and (sizes == sizes[0]).all() else 0
         if ranges.size:
             self.D.range = &ranges[0]
         for i in range(self.D.count):
@@ -127,6 +129,43 @@ cdef class FeasibleSet:
             least = fmin(least, first_bound(x + o, p + o, self.lower + o,
                                             self.upper + o, size))
         return first_disc(&self.D, x, p, least)
+
+    cdef double next_direction(
+        self, double gamma, const double *x, const double *g, double *p, double *result
+    ) noexcept:
+        """p ← φ − γp, in one pass; result ← local parts of gᵀp and ‖p‖².
+
+        Returns the largest α for which the local part of x − αp is in the set. Only for
+        sets with discs.
+        """
+        cdef double least = INFINITY
+        cdef double sums[2]
+        cdef Py_ssize_t i, o, size
+        result[0] = result[1] = 0.0
+        for i in range(self.D.ranges):
+            o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
+            least = fmin(least, next_direction(
+                gamma, x + o, g + o, self.lower + o, self.upper + o, p + o, size, sums
+            ))
+            result[0] += sums[0]
+            result[1] += sums[1]
+        return next_on_discs(&self.D, gamma, x, g, p, least, result)
+
+    cdef bint leaves(self, const double *x, const double *g, double length) noexcept:
+        """Return True if the local part of x − φ·length is outside the set.
+
+        Only for sets with discs.
+        """
+        cdef Py_ssize_t i, j
+        cdef double to
+        for i in range(self.D.ranges):
+            for j in range(self.D.range[2 * i], self.D.range[2 * i + 1]):
+                to = x[j] - length * g[j]
+                if self.lower[j] < x[j] < self.upper[j] and not (
+                    self.lower[j] <= to <= self.upper[j]
+                ):
+                    return True
+        return leaves_discs(&self.D, x, g, length)
 
     cdef void product_and_lengths(
         self, const sparse *F, double s, const double *x, const double *g, double *p,
@@ -211,14 +250,18 @@ cdef class FeasibleSet:
 
     cdef bint marks(self, const double *x, double *free) noexcept:
         """free ← 1 off the boundary, else 0; return True if any entry changed."""
-        cdef Py_ssize_t i
+        cdef Py_ssize_t i, j, first, last
         cdef double inside
         cdef bint changed = False
-        for i in range(self.n):
-            if self.has_bound(i):
-                inside = self.lower[i] < x[i] < self.upper[i]
-                changed = changed or free[i] != inside
-                free[i] = inside
+        for i in range(self.D.ranges if self.has_discs else 1):
+            first, last = 0, self.n
+            if self.has_discs:
+                first, last = self.D.range[2 * i], self.D.range[2 * i + 1]
+            for j in range(first, last):
+                if self.has_bound(j):
+                    inside = self.lower[j] < x[j] < self.upper[j]
+                    changed = changed or free[j] != inside
+                    free[j] = inside
         return mark_discs(&self.D, x, free) or changed
 
     cdef void follow(

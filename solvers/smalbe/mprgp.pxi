@@ -258,7 +258,9 @@ cdef class MPRGP:
     cdef double alpha, Gamma_square
     cdef bint reduced, proportions_by_model
     cdef int expansion
-    cdef bint in_two  # CG passes over memory twice; φ and `free` are not stored
+    # CG passes over memory twice, and on sets with discs once more for an F that is not
+    # sparse; φ and `free` are not stored
+    cdef bint in_two
     cdef Room room  # memory of all vectors
     cdef double *rhs  # b of the inner problem
     cdef double *x
@@ -303,6 +305,7 @@ cdef class MPRGP:
     cdef long settled  # number of steps on an unchanged face since that check
     cdef long patience  # number of steps before the next Newton step
     cdef double spectral_length  # α of the last step; 0 before the first one
+    cdef double p_square  # ‖p‖² on sets with discs, if `in_two`
     cdef double cost_now  # cost relative to the cost at the start of the run
     cdef double costs[MEMORY]  # last values of `cost_now`
     cdef long n_costs
@@ -346,9 +349,10 @@ cdef class MPRGP:
         cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
         cdef double weight, began, gamma = 0.0  # γ of the deferred update p ← φ − γp
-        self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
-            not self.is_preconditioned()
-        ) and not self.set.has_discs and self.expansion != SPECTRAL
+        self.in_two = not self.rows.exist and not self.is_preconditioned() and (
+            self.set.has_discs
+            or (self.F.rows.data != NULL and self.expansion != SPECTRAL)
+        )
         self.cost_now, self.n_costs = 0.0, 0
         self.settled = 0
         self.record_cost(0.0)
@@ -602,11 +606,17 @@ cdef class MPRGP:
 
         begun : false if CG does not yet have a first direction on this face
         """
+        cdef bint is_tested = self.expansion == SPECTRAL and self.spectral_length > 0
+        if self.in_two and is_tested and self.over.any(
+            self.set.leaves(self.x, self.g, self.spectral_length)  # p will be φ
+        ):
+            return True
         if not begun:
-            self.split()
-            self.directions.begin(self.free)
+            if not self.in_two:
+                self.split()
+                self.directions.begin(self.free)
             self.first_direction()
-        return self.expansion == SPECTRAL and self.spectral_length > 0 and (
+        return not self.in_two and is_tested and (
             self.over.least(self.set.feasible_length(self.x, self.p))
             < self.spectral_length
         )
@@ -763,12 +773,30 @@ cdef class MPRGP:
 
     cdef int lengths_of_next(self, double gamma) except -1:
         """p ← φ − γp, then `lengths_along` p; one product."""
+        cdef Line *line = &self.line
+        cdef double sums[3]
+        if self.set.has_discs:
+            line.feasible = self.set.next_direction(
+                gamma, self.x, self.g, self.p, sums
+            )
+            self.H(self.p, self.Hp)
+            sums[2] = dot(self.p, self.Hp, self.n)
+            self.over.add(sums, 3, &line.feasible)
+            line.slope, self.p_square, line.curvature = sums[0], sums[1], sums[2]
+            line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
+            return 0
         self.F.count += 1
         self.set.next_product_and_lengths(
             &self.F.rows, self.inverse_norm, gamma, self.x, self.g, self.p, self.Hp,
             &self.line,
         )
         return 0
+
+    cdef double square_of_p(self) except? -1:
+        """Return ‖p‖² of the direction of a spectral method."""
+        return self.p_square if self.in_two else (
+            self.over.total(dot(self.p, self.p, self.n))
+        )
 
     # 5. The conjugate gradient step
 
@@ -792,9 +820,7 @@ cdef class MPRGP:
         )
         self.record_cost(change_along(&self.line, length))
         if self.expansion == SPECTRAL:
-            self.spectral_length = rounded(
-                self.over.total(dot(self.p, self.p, self.n)) / curvature
-            )
+            self.spectral_length = rounded(self.square_of_p() / curvature)
         if drifts and self.line.slope <= 0:
             length = 0.0
         elif not self.in_two:
@@ -882,9 +908,7 @@ cdef class MPRGP:
         """Step to the boundary; add a spectral step unless the step is long enough."""
         cdef double feasible = (1 + TIE) * self.line.feasible, cg = self.line.cg
         if self.line.curvature > NOISE * self.line.slope:
-            self.spectral_length = rounded(
-                self.over.total(dot(self.p, self.p, self.n)) / self.line.curvature
-            )
+            self.spectral_length = rounded(self.square_of_p() / self.line.curvature)
         self.record_cost(change_along(&self.line, feasible))
         self.to(feasible, self.p, self.Hp, False)
         return feasible > LONG_STEP * cg or self.step_spectrally()

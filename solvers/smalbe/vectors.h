@@ -562,6 +562,22 @@ TWICE static void sparse_update_direction(const sparse *F, double s, double gamm
         find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, result);
 }
 
+/* p = φ − γp with the free gradient φ at x; result = gᵀp, ‖p‖². Return the α at which
+   x - αp reaches its first bound; inf if it reaches none. */
+TWICE static double next_direction(double gamma, in x, in g, in lower, in upper, out p,
+                                   Py_ssize_t n, out result)
+{
+    double slope = 0, size = 0;
+    update_direction_at(x, g, lower, upper, gamma, p, n);
+    for (Py_ssize_t i = 0; i < n; i++) {
+        slope += g[i] * p[i];
+        size += p[i] * p[i];
+    }
+    result[0] = slope;
+    result[1] = size;
+    return first_of_blocks(x, p, lower, upper, INFINITY, n);
+}
+
 /* Return x - step, or a bound if x - step is within rounding of this bound. */
 INLINE double moved(double x, double step, double lower, double upper)
 {
