@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,17 +38,29 @@ MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
 ROUNDING = 1e-4
 
 
-@pytest.fixture(
-    scope="module",
-    params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
+#: cases that take several seconds on two ranks
+LONG = (HELD[5], HERTZ, MINDLIN)
+QUICK = tuple(
+    case
+    for case in (*HELD, HELD_BY_CONTACT, ELIMINATED, REDUNDANT, PATCH)
+    if case not in LONG
 )
-def found(request):
+
+
+def marked(*cases):
+    """Mark the long ones among the cases as slow."""
+    return [
+        pytest.param(case, marks=[pytest.mark.slow] * (case in LONG)) for case in cases
+    ]
+
+
+@cache
+def evaluated(ranks, cases):
     """Return evaluations of the same answers on several ranks and in one process."""
     done = subprocess.run(
         [
-            mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "evaluated_on_ranks.py"),
-            *HELD, HELD_BY_CONTACT, ELIMINATED, REDUNDANT, PATCH, HERTZ, MINDLIN,
+            mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
+            str(SUPPORT / "evaluated_on_ranks.py"), *cases,
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
@@ -55,25 +68,39 @@ def found(request):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, HERTZ, MINDLIN])
+@pytest.fixture(params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
+def ranks(request):
+    """Return the number of ranks."""
+    return request.param
+
+
+@pytest.fixture
+def found(ranks):
+    """Return a function that evaluates the answers to a case on several ranks."""
+    return lambda case: evaluated(ranks, LONG if case in LONG else QUICK)[case]
+
+
+@pytest.mark.parametrize(
+    "case", marked(*HELD, HELD_BY_CONTACT, ELIMINATED, HERTZ, MINDLIN)
+)
 def test_residuals_by_ranks_are_those_of_one_process(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         one = answer["by_one"]["values"]
 
         assert answer["by_ranks"]["values"] == pytest.approx(one, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, PATCH])
+@pytest.mark.parametrize("case", marked(*HELD, HELD_BY_CONTACT, PATCH))
 def test_a_wrong_answer_is_refuted_by_ranks(found, case):
-    *sound, wrong = (answer["by_ranks"]["values"] for answer in found[case])
+    *sound, wrong = (answer["by_ranks"]["values"] for answer in found(case))
 
     assert max(wrong["primal"], wrong["dual"]) > 1e-4
     assert max(sound[-1]["primal"], sound[-1]["dual"]) < 1e-5
 
 
-@pytest.mark.parametrize("case", HELD)
+@pytest.mark.parametrize("case", marked(*HELD))
 def test_certificates_by_ranks_are_those_of_one_process(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
@@ -86,9 +113,9 @@ def test_certificates_by_ranks_are_those_of_one_process(found, case):
         )
 
 
-@pytest.mark.parametrize("case", [HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN])
+@pytest.mark.parametrize("case", marked(HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN))
 def test_certificates_of_bodies_held_by_contact_are_those_of_one_process(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         bounds, one = answer["by_ranks"]["bounds"], answer["by_one"]
 
         assert answer["same"]
@@ -103,7 +130,7 @@ def test_certificates_of_bodies_held_by_contact_are_those_of_one_process(found, 
 
 
 def test_eliminated_supports_are_certified_in_floating_subdomains(found):
-    for answer in found[ELIMINATED]:
+    for answer in found(ELIMINATED):
         # one process finds the nearest u_λ of the whole body
         bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
 
@@ -113,10 +140,10 @@ def test_eliminated_supports_are_certified_in_floating_subdomains(found):
 
 
 @pytest.mark.parametrize(
-    "case", [*HELD[:2], *HELD[3:], HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN]
+    "case", marked(*HELD[:2], *HELD[3:], HELD_BY_CONTACT, PATCH, HERTZ, MINDLIN)
 )
 def test_quantities_by_ranks_are_those_of_one_process(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         by_ranks, by_one = quantities_of_both(answer)
 
         assert list(by_ranks) == list(by_one)
@@ -128,7 +155,7 @@ def test_quantities_by_ranks_are_those_of_one_process(found, case):
 
 @pytest.mark.parametrize("case", [HELD[2], ELIMINATED, REDUNDANT])
 def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         by_ranks, by_one = quantities_of_both(answer)
 
         assert list(by_ranks) == list(by_one)
@@ -142,7 +169,7 @@ def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
 
 def test_an_exact_solution_is_recovered_across_subdomains(found):
     """In the patch test, stress is uniaxial, and no rank has an entire body."""
-    answer = found[PATCH][-2]["by_ranks"]["quantities"]
+    answer = found(PATCH)[-2]["by_ranks"]["quantities"]
     # plane strain, ν = 0.3: σ_z = −0.3p, and σ_vM = √(1 − ν + ν²)·p
     exact = (1 - 0.3 + 0.3**2) ** 0.5 * 1e6
 
@@ -151,17 +178,19 @@ def test_an_exact_solution_is_recovered_across_subdomains(found):
         assert largest == pytest.approx(exact, rel=1e-5)
 
 
-@pytest.mark.parametrize("case", [*HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ])
+@pytest.mark.parametrize(
+    "case", marked(*HELD, HELD_BY_CONTACT, ELIMINATED, PATCH, HERTZ)
+)
 def test_sizes_are_those_of_the_whole(found, case):
-    for answer in found[case]:
+    for answer in found(case):
         assert answer["sizes"][0] == answer["sizes"][1]
 
 
-def test_digests_depend_on_the_qp_and_not_on_the_number_of_ranks(found):
-    digests = [answers[0]["digests"] for answers in found.values()]
+def test_digests_depend_on_the_qp_and_not_on_the_number_of_ranks(ranks):
+    digests = [answers[0]["digests"] for answers in evaluated(ranks, QUICK).values()]
 
     assert all(by_ranks == by_one for by_ranks, by_one in digests)
-    assert len({digest for digest, _ in digests}) == len(found)
+    assert len({digest for digest, _ in digests}) == len(QUICK)
     assert all(digest.startswith(DISTRIBUTED_DIGEST) for digest, _ in digests)
 
 

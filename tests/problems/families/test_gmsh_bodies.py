@@ -653,7 +653,7 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
         (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
-        (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "the nodes"),
+        (lambda p, c: (p + [[0, 0, 1]] * (p[:, :1] > 1), {"a": c}, {}, {}), "same z"),
         (lambda p, c: (bent(p), {"a": c}, {}, {}), "the cell around ("),
     ],
 )  # fmt: skip
