@@ -115,7 +115,7 @@ class Blocks(ABC):
 
 def norms(blocks: NDArray[Any]) -> NDArray[Any]:
     """Return the Euclidean norms (k,) of rows (k, d), without a change of precision."""
-    return np.asarray(np.sqrt(np.einsum("ij,ij->i", blocks, blocks)))
+    return np.asarray(np.linalg.norm(blocks, axis=1))
 
 
 def _numbers(one: Blocks, name: str) -> NDArray[Any]:
