@@ -28,6 +28,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from mortarbench.harness import QP, Discs, Solution, Status, kkt_residuals
 from mortarbench.harness.operators import assembled
+from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import DELTA, interior_point
@@ -143,10 +144,16 @@ def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
 
 
 def _projection_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points of a QP over arbitrary sets until the residual is small."""
+    """Yield points of a QP over arbitrary sets until the residual is small.
+
+    The QP is scaled if its sets consist of blocks: with a single penalty for all
+    variables, the method does not converge if their curvatures differ by 1e7.
+    """
+    has_blocks = all(isinstance(one, Blocks) for one in qp.sets[1:])
+    scaled = equilibrate(qp) if has_blocks else None
     residuals = list[float]()
-    for point in projection_iterates(qp):
-        yield point
+    for iterate in projection_iterates(scaled.qp if scaled else qp):
+        yield (point := scaled.recover(iterate) if scaled else iterate)
         residuals.append(_residual(qp, point))
         best = int(np.argmin(residuals))
         is_settled = best < len(residuals) - MAX_IDLE_ROUNDS
