@@ -28,7 +28,7 @@ class Camera(NamedTuple):
     towards: Vector  #: direction from the bodies to the camera
 
     def project(self, points: Points) -> NDArray[np.float64]:
-        """Return positions in the picture (…, 2)."""
+        """Return the positions (…, 2) of points in the picture."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 

@@ -267,7 +267,7 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             f"Growth with Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
             "repeats. (c): the condensed curve includes the factorisation, which "
-            "dominates its time; the other curve does not. (d): complete analysis. "
+            "dominates its time; the other curve excludes it. (d): complete analysis. "
             f"Star and cross: published values for Nr = 30 ({published.MACHINE}).",
         ),
     )

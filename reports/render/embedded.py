@@ -48,8 +48,8 @@ def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
 def details(records: Sequence[Record]) -> str:
     """Serialise every field of every measurement: columns, JSON, gzip, base64.
 
-    A column is a list of values or, if few values are distinct, a list of these and
-    their indices.
+    A column is a list of values or, if few values are distinct, the list of distinct
+    values and a list of indices.
     """
     lines = [_as_journalled(r) for r in records]
     columns = {name: [getattr(r, f.name) for r in lines] for name, f in JOURNAL.items()}

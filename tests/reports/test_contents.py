@@ -239,7 +239,7 @@ def test_declined_cases_do_not_count_as_measurements(measured, page):
     ]
     made = section(page(records, suite={"repeats": 3}), "summary")
     assert made.prose[0].startswith(
-        "3 measurements of the 6 that the suite asks for on these cases (3 were "
+        "3 measurements of the 6 that the suite requests on these cases (3 were "
         "declined by a solver): 2 solvers"
     )
     shy = rows(made.tables[0])[1]

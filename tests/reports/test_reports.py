@@ -520,8 +520,8 @@ def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_pa
     pictures = [p for s in page.sections if s.name == "deformed" for p in s.pictures]
 
     assert [p.name for p in pictures] == ["deformed", "deformed-in-space"]
-    assert "the largest verified case in the plane" in pictures[0].caption
-    assert "the largest verified case in space" in pictures[1].caption
+    assert "the largest verified plane case" in pictures[0].caption
+    assert "the largest verified three-dimensional case" in pictures[1].caption
     assert [len(p.figure.panels) for p in pictures] == [1, 1]
 
 
