@@ -66,7 +66,7 @@ class Pair:
     def ratio(self) -> Ratio | None:
         """Time after / time before with Welch's interval.
 
-        None if fewer than two times are known before or after.
+        None if the times cannot be compared, or one sample has fewer than two times.
         """
         # A bootstrap over three to ten repeats would report a spurious change three to
         # five times as often as at the nominal rate of one in twenty.

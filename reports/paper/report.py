@@ -264,7 +264,7 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             "figure6",
             "Scaling",
             scaling_figure(six),
-            f"Growth with Nr at Nh = {six[0]['Nh']}, "
+            f"Problem sizes and times against Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
             "repeats. (c): the condensed curve includes the factorisation, which "
             "dominates its time; the other curve excludes it. (d): complete analysis. "

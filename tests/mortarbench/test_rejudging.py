@@ -112,7 +112,7 @@ def judge(folder, factor):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A result folder with one answer whose largest residual is 4·tol."""
+    """Return a result folder with one answer whose largest residual is 4·tol."""
     stored = record(Status.SOLVED, Residuals(1e-9, 4e-6, 0, 1e-9), 1e-6)
     with Journal(tmp_path, "test") as journal:
         journal.append(stored)

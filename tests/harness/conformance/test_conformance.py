@@ -37,7 +37,7 @@ from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 
-#: backends that represent the wildcard entries of the registry; the others are slow
+#: backends that represent the wildcard entries of the registry; other backends are slow
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
     "cvxpy:*": ("CLARABEL", "HIGHS"),
@@ -76,7 +76,7 @@ WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 @pytest.fixture(autouse=True, scope="module")
 def loaded_once():
-    """Exclude loaded libraries from the collection before every measurement."""
+    """Exclude loaded libraries from the garbage collection before every measurement."""
     import cvxpy  # noqa: F401
     import qpsolvers  # noqa: F401
 
@@ -169,13 +169,13 @@ def weaknesses(solver):
         pytest.param(
             name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
         )
-        # other solvers pass the same QPs to the libraries of these
+        # the other solvers pass the same QPs to the libraries of these solvers
         for name in CONCRETE
     ],
 )
 def test_weaknesses_are_documented(name):
-    """The page, written by `make weaknesses`, may also list weaknesses that
-    are gone.
+    """The page, written by `make weaknesses`, may also list weaknesses that no longer
+    exist.
     """
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
@@ -515,7 +515,9 @@ def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
     page = capsys.readouterr().out
     (sound,) = (x for x in page.splitlines() if x.startswith("| `sound` |"))
     (minds,) = (x for x in page.splitlines() if x.startswith("| `minds` |"))
-    assert sound.count(" | ") == len(CHANGES)  # name, forms, all changes but none
+    assert sound.count(" | ") == len(
+        CHANGES
+    )  # name, forms, and all changes except "none"
     assert "**" not in sound
     assert minds.split(" | ")[2].startswith("**primal**")
     assert page.count("×49") == 1  # forces of 1e8 N, not a displacement, not 1e5 N/mm

@@ -120,7 +120,9 @@ def grid(cells):
 
 @pytest.fixture(params=["array", "library"])
 def way(request, monkeypatch):
-    """Factorise small matrices by compiled code, or by the library like large ones."""
+    """Factorise small matrices by compiled code, or by the library used for
+    large ones.
+    """
     if request.param == "library":
         monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
 

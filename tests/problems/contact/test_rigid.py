@@ -1,4 +1,4 @@
-"""Contact with rigid bodies (gaps, normals, derivatives), and surfaces in space."""
+"""Contact with rigid bodies: gaps, normals, derivatives, three-dimensional surfaces."""
 
 import numpy as np
 import pytest

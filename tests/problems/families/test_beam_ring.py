@@ -327,7 +327,9 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
 
 
 def in_space(form="dual", tol=1e-11, **keys):
-    """Return the quantities of a coarse benchmark, in space if `depth` is positive."""
+    """Return the quantities of a coarse benchmark, three-dimensional if `depth` is
+    positive.
+    """
     keys = dict(Nr=2, Nh=2, steps=2) | keys
     params = FAMILY.complete(keys)
     FAMILY.check(params)

@@ -337,7 +337,7 @@ master = "table"
 
 @pytest.fixture
 def sheared_blocks(described):
-    """Two squares of side 2 in a state of constant pressure and shear stress.
+    """Return two squares of side 2 in a state of constant pressure and shear stress.
 
     Poisson's ratio is zero, so that the common side stays straight and every load step
     has the same contact rows. Friction alone supports the upper square horizontally.

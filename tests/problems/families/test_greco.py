@@ -17,7 +17,7 @@ pytestmark = pytest.mark.together
 
 FAMILY = Greco()
 
-#: by cells per side: u_x at 0, 1.25, 5, 7.5, 11.25 mm, normal force at 38.75 mm
+#: cells per side → u_x at 0, 1.25, 5, 7.5, 11.25 mm, and normal force at 38.75 mm
 PROTOTYPE = {
     32: ([2.85944, 2.72168, 2.28500, 1.97963, 1.54056], 1.04823e5),
     128: ([2.86022, 2.72250, 2.28669, 1.98067, 1.54134], 2.62061e4),

@@ -16,7 +16,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = PROBLEMS["membranes"]
-#: by (1/H, H/h): torn unknowns, multipliers, contact rows, subdomains
+#: (1/H, H/h) → numbers of torn unknowns, multipliers, contact rows and subdomains
 TABLE = {
     (1, 8): (162, 18, 9, 2), (2, 4): (200, 56, 9, 8), (2, 8): (648, 104, 17, 8),
     (2, 16): (2312, 200, 33, 8), (4, 4): (800, 256, 17, 32),

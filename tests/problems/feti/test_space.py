@@ -53,7 +53,7 @@ def torn(
 
 
 def stored(own: LocalSubdomains) -> csr_array:
-    """TᵀK_T T."""
+    """Return the matrix TᵀK_T T."""
     T, domains = own.spread, own.domains
     blocks = [domains.classes[k].K @ T[a:b] for k, a, b in zip(
         domains.class_of, domains.start[:-1], domains.start[1:], strict=True

@@ -225,8 +225,9 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
 def test_errors_of_ritz_values_are_bounded_by_residuals(
     sign: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The residual norm of a Ritz vector is the norm of the next Lanczos vector times
-    the last entry in magnitude."""
+    """The residual norm of a Ritz vector is the last off-diagonal entry times the
+    magnitude of the last coefficient.
+    """
     rng, solve = np.random.default_rng(0), module.eigh_tridiagonal
 
     def turned(*args: Any, **how: Any) -> Any:

@@ -363,7 +363,9 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
 
 def disturbed(qp, solution, size, rng):
-    """A point at a small or moderate distance from a solution, within its bounds."""
+    """Return a point at a small or moderate distance from a solution,
+    within its bounds.
+    """
 
     def noise(v):
         return v + size * (1 + np.abs(v)) * rng.standard_normal(v.size)

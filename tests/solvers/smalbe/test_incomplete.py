@@ -35,7 +35,9 @@ def primal(name):
 
 
 def half_string(n):
-    """A string over an obstacle that ends in the middle of the string."""
+    """Return the QP of a string over an obstacle that ends in the middle of
+    the string.
+    """
     qp = primal(f"string/n={n}")
     lb = qp.lb.copy()
     lb[n // 2 :] = -np.inf
@@ -162,7 +164,7 @@ def test_the_inverse_is_positive_definite_on_every_face(seed):
             assert np.linalg.eigvalsh(M[np.ix_(free, free)]).min() > 0
 
 
-# --- when it is used ----------------------------------------------------------------
+# --- use of the factor ---------------------------------------------------------------
 
 
 def test_a_sparse_p_with_bounds_has_an_incomplete_factor():

@@ -258,7 +258,10 @@ def test_the_split_gradient_adds_up_and_its_parts_are_admissible():
 
 
 def string():
-    """PERMON's first tutorial: a string of 100 points above a sine-shaped obstacle."""
+    """Return matrix, load and obstacle of the string of PERMON's first tutorial.
+
+    The string has 100 points and lies above a sine-shaped obstacle.
+    """
     n, h = 100, 1 / 99
     A = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     A[[0, -1]], A[:, [0, -1]] = 0, 0
@@ -357,7 +360,7 @@ def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
 
 
 def test_an_exact_model_finds_the_minimum_at_once(minimise):
-    """For B = H, the first step ends at the solution."""
+    """For B = H, the first step ends at the minimiser."""
     U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
     B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
     H = np.eye(20) + U.T @ np.diag(B.w) @ U

@@ -35,7 +35,9 @@ def drawn(seed, n=60, condition=1e3):
 
 @pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
 def outer_loop(request):
-    """Run from x with constants for which the penalty is far too small."""
+    """Return a function that runs the loop from x with a penalty that is
+    far too small.
+    """
 
     def run(problem, x, *, tol, max_steps=20_000, energy=0.0, at=None):
         options = SMALBE(
