@@ -177,7 +177,7 @@ def _logs(outcome: Outcome) -> Floats:
 
 
 def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
-    """Return, by block, log(time / geometric mean of the times of the others)."""
+    """Return, by block, log(time / geometric mean of the other times)."""
     times = [o.by_block for o in others]
     return np.array(
         [

@@ -160,7 +160,7 @@ class FieldFigure:
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows
-    #: common colour scale of all panels, shown as a bar beside them; None without one
+    #: common colour scale of all panels, shown as a bar beside the panels, or None
     scale: ColourScale | None = None
 
 

@@ -104,7 +104,7 @@ def forms(a: Analysis) -> Iterator[Part]:
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Return a sentence for use after a colon: lower case unless a name begins it."""
+    """Return a sentence for use after a colon, in lower case unless a name is first."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 

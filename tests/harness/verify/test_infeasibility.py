@@ -117,7 +117,9 @@ def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
 
 @pytest.mark.parametrize("z", [(1, 1 + 1e-9), (1e-30, 1e-30), (1e200, 1e200)])
 def test_the_ray_of_a_solver_is_corrected_before_its_check(z):
-    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so it must be corrected."""
+    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so the ray must
+    be corrected.
+    """
     assert margin(infeasible(), z=z) == 1
 
 

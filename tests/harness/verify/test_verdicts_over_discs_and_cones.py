@@ -299,7 +299,9 @@ def test_residuals_alone_yield_no_wrong_verdict_on_regular_points():
 
 @pytest.mark.parametrize("trap", ["", "tiny", "units"])
 def test_multipliers_of_the_wrong_sign_or_direction_are_refuted(trap):
-    """Test them unchanged, and with another q for which the point is stationary."""
+    """Test the multipliers unchanged, and with another q for which the point is
+    stationary.
+    """
     count = 0
     for seed in range(20):
         planted = ExactProblem({trap}, seed)

@@ -356,7 +356,9 @@ def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
     "cells", [(2, 4), pytest.param((4, 8), marks=pytest.mark.slow)]
 )
 def test_face_mortar_differs_from_the_plane_by_the_square_of_h(cells):
-    """Each face has a single normal, whereas normals in the plane are interpolated."""
+    """Each face has a single normal, whereas normals are interpolated in
+    two dimensions.
+    """
     gaps = []
     for n in cells:
         keys = dict(Nr=n, Nh=n, steps=1, contact="mortar", tol=1e-10)

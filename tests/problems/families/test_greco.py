@@ -139,7 +139,7 @@ def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
         states.append((side.friction, values))
         u.append(fields.displacement)
     (plane, ground), (space, layers) = points
-    # for each node in space, the node with equal x and y in the plane
+    # for each node of the 3D mesh, the node of the plane mesh with equal x and y
     below = np.array([np.abs(plane - x[:2]).sum(axis=1).argmin() for x in space])
 
     assert abs(u[1][:, :2] - u[0][below]).max() < 1e-8 * abs(u[0]).max()

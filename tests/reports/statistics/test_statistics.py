@@ -301,7 +301,7 @@ def test_a_data_profile_by_hand():
 
 
 def test_a_failure_never_counts_as_solved():
-    """With a finite charge of 1000 s, it would count from τ = 1000/0.1 on."""
+    """With a finite charge of 1000 s, a failure would count from τ = 1000/0.1 on."""
     times = np.array([[0.1, INF]] * 4 + [[0.1, 0.1]])
     ratios = performance_ratios(times)
     anywhere = np.concatenate([np.geomspace(1, 1e300, 50), [np.finfo(float).max]])

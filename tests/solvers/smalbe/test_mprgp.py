@@ -514,7 +514,7 @@ def string_and_boxes():
 
 
 def test_there_are_at_most_as_many_steps_beyond_the_box_as_inside(minimise):
-    """There may be one such step if there are no steps inside; hence the products are
+    """One step beyond the box is allowed without steps inside; hence the products are
     at most doubled.
     """
     most, steps = 0, 0
@@ -610,7 +610,7 @@ def test_directions_are_conjugate_and_the_last_ones_are_kept():
 
 
 def test_directions_that_span_the_face_solve_for_another_right_hand_side():
-    """The solve takes no product and ends at a bound if one is in the way."""
+    """The solve takes no product, and it ends at the first bound on its path."""
     a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
     p = np.diag(1 / np.sqrt(a))
     known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))

@@ -1,6 +1,6 @@
 """The vector operations of an MPRGP step.
 
-Few components of a dual have a bound, so bounds are evaluated for these only.
+Few components of a dual have bounds; bounds are evaluated for these components only.
 """
 
 from __future__ import annotations

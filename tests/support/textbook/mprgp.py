@@ -15,7 +15,7 @@ inside) and the projected gradient g^P = φ + β, each step is one of
 A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  where φ̃ is the reduced free gradient:
 a step of length ᾱ along −φ̃ does not leave the box.
 
-A run also ends if it *stagnates*. This is tested after `FIRST_LOOK` steps, and then
+A run also ends if it *stagnates*. Stagnation is tested after `FIRST_LOOK` steps, then
 each time the number of steps has doubled. A run stagnates if, since the previous test,
 the least ‖g^P‖ was not halved and the decrease of the cost is within the rounding error
 of its terms. Rounding then leaves no descent direction that is conjugate to the
