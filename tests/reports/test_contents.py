@@ -135,7 +135,7 @@ def energies(measured, *values, **changes):
         ([-333734.443434567 * (1 + 2e-6)], "-333734"),  # five digits agree
         ([-333734.443434567 * (1 + 2e-4)], "-3.337e5"),  # without insignificant zeros
         ([-333734.443434567], "-333734.443435"),  # at most twelve digits
-        ([], "-333734.443"),  # single answer: digits according to the tolerance 1e-8
+        ([], "-333734.443"),  # digits of a single answer follow from its tolerance 1e-8
     ],
 )
 def test_energies_have_one_more_digit_than_answers_agree_on(

@@ -130,7 +130,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
     assert errors == texts
     text = markdown(page)
     assert text.count(legend) == 3  # verdicts, refuted claims, errors
-    assert text.count("(⋆ in tables)") == 1  # the figure of accuracy
+    assert text.count("(⋆ in tables)") == 1  # in the caption of the figure of accuracy
     assert "or, for small QPs, on a proven optimum" in text
 
     page = compose(evidence(records[:2]))

@@ -63,7 +63,7 @@ def configured(backends):
 NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
 SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
-#: equivalent formulations are not a condition of conformance; they have their own test
+#: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: solvers that take seconds for all equivalent formulations
 REWRITTEN = {
@@ -456,7 +456,7 @@ def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
 def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
-    assert Grade.PASS in grades  # the check of options
+    assert Grade.PASS in grades  # of the check of options
     result = run_check("gives multipliers our signs", DeclinesAll())
     assert result == (Grade.DECLINE, "never on a Monday", None)
 

@@ -30,7 +30,7 @@ if find_spec("distributed") is None:
     pytest.skip("no distributed", allow_module_level=True)
 
 PLUGIN = load_plugin(TOY_PROBLEM)
-SOLVERS = 4  #: measurements per block
+SOLVERS = 4  #: number of measurements per block
 SUITE = """
 name = "toy_problem"
 repeats = {repeats}

@@ -65,6 +65,7 @@ PAID = replace(LONG, q=np.array([0.0, 1, -1]))  # x₁ = 1, ½, since x₂ = x�
 UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
 
 
+# comments: objective at the point, and f*
 @pytest.mark.parametrize(
     ("qp", "s"),
     [
@@ -465,7 +466,7 @@ def test_a_cancelling_objective_is_accurate_relative_to_its_terms():
     assert error == pytest.approx(1e-9, rel=3)
     further = at([1 + 4e-9, 1], [-1 - 4e-9], z_box=[0, 0.5])
     residuals = kkt_residuals(qp, further)
-    assert residuals.worst > 10 * TOL  # relative to f, so residuals do not decide
+    assert residuals.worst > 10 * TOL  # relative to f; hence the optimum decides
     error = decided(qp, further, residuals, TOL, proves(reference_solution))
     assert error == pytest.approx(4e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED

@@ -417,7 +417,7 @@ def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
 @pytest.mark.parametrize(
     ("length", "residual", "settled"),
     [
-        (1.0, 1.9e-9, True),  # 1e-9 is the tolerance, and 1e-9 the rounding
+        (1.0, 1.9e-9, True),  # tolerance 1e-9, and rounding 1e-9
         (1.0, 2.1e-9, False),
         (0.5, 0.0, False),
     ],

@@ -135,7 +135,7 @@ def test_a_model_of_the_penalty_is_the_same_preconditioner(
     assert sparse[np.ix_(face, face)] == pytest.approx(
         inverse[np.ix_(face, face)], abs=1e-9
     )
-    if rho > 1:  # else nothing is preconditioned
+    if rho > 1:  # otherwise, nothing is preconditioned
         assert sparse == pytest.approx(inverse, abs=1e-9)
 
 
