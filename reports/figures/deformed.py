@@ -443,7 +443,7 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Return factor and prefix of the unit in which `value` is from 1 to 1000."""
+    """Return factor and prefix of the unit in which `value` is between 1 and 1000."""
     prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 

@@ -76,7 +76,9 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
 
 
 def rivals(ranking: Ranking) -> list[int]:
-    """Select the solvers compared with the leader in pairs: the next ones by rank."""
+    """Select the solvers that are compared pairwise with the leader: the
+    next by rank.
+    """
     return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 

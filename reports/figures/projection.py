@@ -53,7 +53,7 @@ def camera_above(normal: Vector) -> Camera:
 
 
 def face_normals(points: Points, faces: Integers) -> Points:
-    """Return normals (k, 3) of faces (k, 4), whose lengths are twice the areas."""
+    """Return normals (k, 3) of faces (k, 4); the length of each is twice the area."""
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
     return np.asarray(np.cross(c - a, d - b))
 

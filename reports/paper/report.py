@@ -1,4 +1,6 @@
-"""Page with the paper's figures and tables, and further ones, from measured data."""
+"""Page with the figures and tables of the paper and further ones, from
+measured data.
+"""
 
 from __future__ import annotations
 
@@ -392,7 +394,9 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Return the sections on times of all solvers against m, and on primal and dual."""
+    """Return the sections on times of all solvers against m, and on primal and dual
+    forms.
+    """
     return (
         _section(
             "fleet",

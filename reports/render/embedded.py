@@ -160,7 +160,9 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Encode a column by distinct values if few; 1, 1.0 and True are distinct."""
+    """Encode a column by its distinct values if they are few; 1, 1.0 and
+    True differ.
+    """
     tables = {
         id(v): v for v in values if type(v) in (dict, list)
     }  # many records share one object

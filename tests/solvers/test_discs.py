@@ -1,4 +1,4 @@
-"""In-house solvers on discs and cones: planted solutions, hard radii, products."""
+"""In-house solvers on discs and cones: planted solutions, extreme radii, products."""
 
 from dataclasses import replace
 

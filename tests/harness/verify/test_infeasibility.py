@@ -205,7 +205,7 @@ def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
 
 
 def search(seeds):
-    """Count the proofs; assert that none is false and none is missing.
+    """Count the proofs; assert that no proof is false and that no proof is missing.
 
     A proof is required if the QP stays infeasible when right-hand sides and bounds are
     relaxed by 1e-11 of their size.

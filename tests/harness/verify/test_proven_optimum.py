@@ -1,4 +1,4 @@
-"""Verdicts by proven optima: no wrong answer is verified, no right answer refuted."""
+"""Verdicts by proven optima: no wrong answer is verified, no right one is refuted."""
 
 from dataclasses import replace
 from fractions import Fraction

@@ -57,7 +57,9 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
 )
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys, tol):
-    """Without projections at the end of a solve, the error was up to 3.2e-9."""
+    """Without projections at the end of a solve, the error of the balance was up to
+    3.2e-9.
+    """
     *_, found = solved(f"{keys}dual", tol=tol)
 
     assert abs(found["force_error"]) < 1e-9

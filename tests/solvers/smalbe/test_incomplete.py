@@ -391,8 +391,8 @@ def test_on_large_families_few_products_are_needed(case, most):
 
 
 def test_the_solver_stops_at_the_requested_residual():
-    """Since steps are cheap, the final residual is not far below the tolerance, at
-    least one twentieth of it.
+    """Since steps are cheap, the final residual is only slightly below the tolerance:
+    at least one twentieth of the tolerance.
     """
     for case in ("journal-bearing/n=50/eccentricity=0.9", "torsion/n=50",
                  "journal-bearing/n=50"):  # fmt: skip

@@ -332,7 +332,7 @@ def test_the_inverse_in_a_face_inverts_the_block_of_the_model():
 
 
 def test_a_model_is_increased_to_the_curvature_of_a_product():
-    """Afterwards sᵀBs = sᵀHs, and the model is unchanged along U."""
+    """After the increase, sᵀBs = sᵀHs, and the model is unchanged along U."""
     rng = np.random.default_rng(271828)
     U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
     B = Model(0.5, U, np.array([30.0, 20.0, 10.0]))

@@ -59,7 +59,7 @@ def problem_of(qp):
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, seed):
     """Since the estimate never falls below its limit, the solve takes a quarter more
-    products and those of the last inner run.
+    products, plus the products of the last inner run.
     """
     qp = drawn(seed)
     products, found = [], []

@@ -347,7 +347,7 @@ def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
 def _proportion(
     task: _Task, at: Point, face: Face, B: BoxModel, *, by_model: bool
 ) -> Step:
-    """Take a step that frees components, within the opposite bounds."""
+    """Take a step that frees components and respects the opposite bounds."""
     if by_model and task.rules.proportioning == "model":
         return _model_step(task, at, B)
     p = face.beta
