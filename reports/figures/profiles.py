@@ -76,9 +76,7 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
 
 
 def rivals(ranking: Ranking) -> list[int]:
-    """Select the solvers that are compared pairwise with the leader: the
-    next by rank.
-    """
+    """Select the solvers compared pairwise with the leader: the next by rank."""
     return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 

@@ -1,6 +1,4 @@
-"""Page with the figures and tables of the paper and further ones, from
-measured data.
-"""
+"""Page with the figures and tables of the paper, and further ones, from stored data."""
 
 from __future__ import annotations
 
@@ -394,9 +392,7 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Return the sections on times of all solvers against m, and on primal and dual
-    forms.
-    """
+    """Return the sections on times of all solvers, against m and by form."""
     return (
         _section(
             "fleet",

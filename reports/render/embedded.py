@@ -46,7 +46,7 @@ def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
 
 
 def details(records: Sequence[Record]) -> str:
-    """Serialise every field of every measurement: columns, JSON, gzip, base64.
+    """Serialise all fields of all measurements: columns as JSON, gzip and base64.
 
     A column is a list of values or, if few values are distinct, the list of distinct
     values and a list of indices.
@@ -160,9 +160,7 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Encode a column by its distinct values if they are few; 1, 1.0 and
-    True differ.
-    """
+    """Encode a column by distinct values if they are few; 1, 1.0 and True differ."""
     tables = {
         id(v): v for v in values if type(v) in (dict, list)
     }  # many records share one object

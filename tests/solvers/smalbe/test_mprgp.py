@@ -278,7 +278,9 @@ def string():
 def test_the_rules_of_permon_take_the_steps_of_permon(
     minimise, expansion, iterations, products, cg, expansions, proportionings
 ):
-    """Counters that PERMON 3.25 prints for this problem at rtol = 1e-5."""
+    """The expected numbers are the counters that PERMON 3.25 prints for this problem at
+    rtol = 1e-5.
+    """
     A, b, lower = string()
     norm = power_method(lambda v: A @ v, b.size)
     run, counted = minimise(
@@ -294,7 +296,9 @@ def test_the_rules_of_permon_take_the_steps_of_permon(
 
 @pytest.mark.parametrize("rounds", [30, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_model_step_minimises_the_model_over_the_box(rounds):
-    """KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u: exact after Newton's method."""
+    """After Newton's method, the KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u, hold
+    exactly.
+    """
     rng = np.random.default_rng(271828)
     for k, tau in rounds * ((5, 0.1), (5, 1e-5), (20, 0.01)):
         U = np.linalg.qr(rng.standard_normal((40, k)))[0].T
