@@ -73,7 +73,9 @@ def pytest_configure(config: pytest.Config) -> None:
     separate CPUs, all workers would measure on the same CPU.
     """
     os.environ.update(ONE_THREAD)  # as the command line does
-    os.environ["MPIR_CVAR_ENABLE_HEAVY_YIELD"] = "1"  # ranks of MPICH sleep in waits
+    os.environ["MPIR_CVAR_ENABLE_HEAVY_YIELD"] = (
+        "1"  # ranks of MPICH sleep while waiting
+    )
     worker = getattr(config, "workerinput", None)
     if worker is not None:
         cpus = sorted(os.sched_getaffinity(0))
@@ -123,7 +125,7 @@ def pytest_unconfigure() -> None:
 
 @pytest.fixture(scope="session")
 def forks():
-    """Fork server that starts the processes of runs with modules loaded."""
+    """Yield a fork server that starts the processes of runs with modules loaded."""
     forks = Forks()
     yield forks
     forks.close()

@@ -93,7 +93,7 @@ UNSAID = (
 
 
 def words(name):
-    """Split a name of a module, class or function into its words."""
+    """Split the name of a module, class or function into words."""
     return [w.lower() for w in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
 
 

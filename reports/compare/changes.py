@@ -24,7 +24,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
-_NEGLIGIBLE = 1e-12  #: differences of energies (of order 1) below it count as rounding
+_NEGLIGIBLE = 1e-12  #: smaller differences of energies of order 1 count as rounding
 
 #: case (for a QP from a file, its digest), tolerance, and solver with its mode
 Key = tuple[str, float, str]
@@ -64,7 +64,10 @@ class Pair:
 
     @cached_property
     def ratio(self) -> Ratio | None:
-        """Time after / time before, with Welch's interval; None below two repeats."""
+        """Time after / time before with Welch's interval.
+
+        None if the times cannot be compared, or one sample has fewer than two times.
+        """
         # A bootstrap over three to ten repeats would report a spurious change three to
         # five times as often as at the nominal rate of one in twenty.
         if self.log is None:
@@ -146,7 +149,7 @@ class Comparison:
 
     @property
     def solvers(self) -> tuple[str, ...]:
-        """Labels of the solvers in both folders, in the order of the later one."""
+        """Labels of the solvers in both folders, in the order of the later folder."""
         present = {p.after.solver for p in self.pairs}
         return tuple(s for s in self.after.solvers if s in present)
 
@@ -161,7 +164,7 @@ class Comparison:
 
 
 def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
-    """Pair the cells of two folders, in the order of the later one.
+    """Pair the cells of two folders, in the order of the later folder.
 
     folders : number of folders compared with `before`, including `after`
     """
@@ -192,10 +195,10 @@ def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
 
 
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
-    """Average the ratios of a solver relative to the ratios of the others.
+    """Average the ratios of a solver relative to the ratios of the other solvers.
 
     For each case and tolerance, the ratio of the solver is divided by the geometric
-    mean of the ratios of the others, which cancels a slowdown of the whole run. Return
+    mean of the other ratios, which cancels a slowdown of the whole run. Return
     None if no other solver has times.
     """
     competing = (p for p in c.pairs if p.after.solver != solver)

@@ -147,7 +147,7 @@ def _change(p: Pair) -> Cell:
 
 
 def time_cell(outcome: Outcome, *, voided: bool) -> Cell:
-    """Show a time, with the verdict if it is not verified."""
+    """Return a cell with a time, and with the verdict if the answer is not verified."""
     return Cell.number(
         outcome.seconds("total"),
         seconds,
@@ -222,7 +222,7 @@ _PAIR = answer_columns(lambda pair: pair.after)
 def _listed(
     caption: str, items: Sequence[Any], columns: Sequence[Column]
 ) -> Iterator[Table]:
-    """Yield a table of the items, if there are items."""
+    """Yield a table of the items; yield nothing without items."""
     if items:
         yield explained(Table.of(caption, items, columns, text_columns=2))
 

@@ -1,9 +1,10 @@
 """Solvers that became slower, with enough certainty to fail a CI job.
 
-Two runs of the same code differ, because the speed of the machine varies in time, and
-differently for each case. A slowdown is therefore reported only if two intervals lie
-entirely above 1: the interval of the ratio after / before, and the interval of this
-ratio relative to the other solvers in the same blocks, which cancels a common slowdown.
+Two runs of the same code yield different times, because the speed of the machine varies
+with time, and differently for each case. A slowdown is therefore reported only if two
+intervals lie entirely above 1: the interval of the ratio after / before, and the
+interval of this ratio relative to the other solvers in the same blocks, which cancels a
+common slowdown.
 Both intervals are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases (at least three), with Student's
@@ -42,7 +43,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 Floats = NDArray[np.float64]
 
 CELLS = 8  #: minimum number of cells for an estimate of their scatter
-_NORMAL = 1.4826  #: standard deviation / median distance from the mean, normal law
+_NORMAL = 1.4826  #: standard deviation / median distance from the mean of a normal law
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +53,7 @@ class Slower:
     solver: str
     case: str = ""  #: empty for a solver over its cases
     tol: float | None = None
-    ratio: Ratio  #: ratio of times, after over before, with a corrected interval
+    ratio: Ratio  #: ratio of times, after / before; interval corrected for multiplicity
     relative: Ratio  #: `ratio` divided by the ratio of the other solvers, by blocks
 
 
@@ -176,7 +177,7 @@ def _logs(outcome: Outcome) -> Floats:
 
 
 def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
-    """Return, by block, log(time / geometric mean of the times of the others)."""
+    """Return, by block, log(time / geometric mean of the other times)."""
     times = [o.by_block for o in others]
     return np.array(
         [
@@ -212,7 +213,7 @@ def _of_solver(
 def _of_cell(change: _Change, scatter: float, freedom: int, miss: float) -> Slower:
     after, before = map(np.exp, change.own)
     own = unpaired_ratio(after, before, 1 - miss)
-    assert own is not None  # there are two repeats of each
+    assert own is not None  # both samples have at least two repeats
     variances = (np.var(x, ddof=1) / len(x) for x in change.relative)
     error = max(scatter, float(np.sqrt(sum(variances))))
     half = float(stdtrit(freedom, 1 - miss / 2)) * error

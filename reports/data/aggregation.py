@@ -28,7 +28,7 @@ class Convention:
     penalty: float = 3.0  #: charge for an unsolved case, in multiples of the time limit
     #: accepted answers: "verified" ones, or all that the solver "claimed" to be solved
     gate: str = "verified"
-    common: bool = False  #: use only cases solved by all, see `common_cases`
+    common: bool = False  #: use only cases solved by all solvers, see `common_cases`
 
 
 USUAL = Convention()  #: convention used for tiers and ratios
@@ -106,7 +106,7 @@ class Ranking:
 
     @cached_property
     def order(self) -> NDArray[np.int64]:
-        """Indices of solvers by ascending mean; ties keep their order."""
+        """Indices of solvers by ascending mean; ties keep the order of the solvers."""
         return np.argsort(self.means, kind="stable")
 
     @property
@@ -188,7 +188,7 @@ class Changed(NamedTuple):
     """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) True if their order is reversed
+    turned: NDArray[np.bool_]  #: (solvers, solvers) True if the order is reversed
 
 
 class Panel(NamedTuple):
@@ -200,13 +200,13 @@ class Panel(NamedTuple):
 
     @property
     def turned(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) True if some convention reverses their usual order."""
+        """(solvers, solvers) True if some convention reverses the usual order."""
         changes = (*self.every, *self.single.values())
         return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
 
 
 def panel(group: ComparisonGroup) -> Panel:
-    """Rank under the usual convention, each single change, and all combinations."""
+    """Rank solvers under the usual convention, single changes and all combinations."""
     usual = geometric_means(group, USUAL)
 
     def changed(convention: Convention) -> Changed:
@@ -227,7 +227,7 @@ def ranks(means: Array) -> Array:
 
 
 def order_of(means: Array) -> NDArray[np.int64]:
-    """Compare means pairwise, (solvers, solvers): 1 if the row is slower, −1 faster."""
+    """Compare means pairwise, (solvers, solvers): 1: row slower, −1: row faster."""
     logs = np.log(means)
     gap = logs[:, None] - logs[None, :]
     return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)

@@ -21,7 +21,7 @@ def source(*outcomes: Outcome) -> str:
 
 
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
-    """Return a cell with a verdict; if repeats differ, add how many share it.
+    """Return a cell with a verdict; if repeats differ, add how many have this verdict.
 
     message : message of the solver, shown on hovering
     """

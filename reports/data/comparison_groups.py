@@ -79,8 +79,8 @@ class ComparisonGroup:
     times: Times  #: (cases, solvers) s; inf unless every repeat was verified
     claimed: Times  #: (cases, solvers) s; inf unless every repeat claimed success, or
     #: correctly claimed infeasibility
-    stopped: Times  #: (cases, solvers) s until the time limit; NaN for other endings
-    limit: float  #: s per measurement; without a limit, the longest measurement
+    stopped: Times  #: (cases, solvers) s, if ended by the time limit; otherwise NaN
+    limit: float  #: time limit per measurement, s; without one, the longest time
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of the cases
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
@@ -204,7 +204,7 @@ def all_groups(
     time_limit = evidence.suite.get("time_limit")
     if isinstance(time_limit, int | float) and time_limit > 0:
         limit = float(time_limit)
-    else:  # the longest measurement
+    else:  # the longest measured time
         every = (o for o in evidence.flat if not o.first.role)
         limit = max((t for t in map(_seconds, every) if t > 0), default=1.0)
     groups = [_group(key, of, evidence.solvers, limit) for key, of in cells.items()]

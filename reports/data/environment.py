@@ -12,7 +12,7 @@ QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 
 
 def busy_with(evidence: Evidence) -> float | None:
-    """Return the load average at the start of the run; None if small or unknown."""
+    """Return the load average at the start of the run; None if low or unknown."""
     state = evidence.environment.get("now")
     load = state.get("load") if isinstance(state, Mapping) else None
     return load if isinstance(load, int | float) and load > QUIET_LOAD else None

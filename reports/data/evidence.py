@@ -60,7 +60,7 @@ class Outcome:
     """All repeats of one solver on one case at one tolerance."""
 
     records: tuple[Record, ...]  #: records of all repeats; at least one
-    factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
+    factor: float = VERIFIED_FACTOR  #: residuals of verified answers are ≤ factor·tol
 
     @property
     def first(self) -> Record:
@@ -209,7 +209,7 @@ class Evidence:
     journal: tuple[Record, ...] = ()  #: all journal lines, with their stored verdicts
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
-    factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
+    factor: float = VERIFIED_FACTOR  #: residuals of verified answers are ≤ factor·tol
     faults: tuple[
         Fault, ...
     ] = ()  #: reasons for missing measurements that are not due to a solver

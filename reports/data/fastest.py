@@ -122,7 +122,7 @@ class FastestSolver:
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return, by case, the fastest solver and those not significantly slower."""
+        """Return, by case, the fastest solver and all solvers tied with it."""
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]

@@ -151,7 +151,7 @@ class Spread(NamedTuple):
     answers: tuple[Outcome, ...]  #: answers of every solver and form; at least one
     #: largest |E − E'|/max(|E|, |E'|) over pairs of energies; None for a single answer
     relative: float | None
-    pair: tuple[Outcome, Outcome] | None  #: answers with the largest difference
+    pair: tuple[Outcome, Outcome] | None  #: the two answers that differ most
 
     @property
     def best(self) -> Outcome:

@@ -46,7 +46,7 @@ class _Scaling:
     """Verified answers of one solver for several numbers of ranks."""
 
     solver: str  #: label of the solver on one rank
-    copies: Mapping[int, Outcome]  #: simultaneous independent solves, by their number
+    copies: Mapping[int, Outcome]  #: simultaneous solves, by number of solves
     cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:

@@ -39,12 +39,12 @@ class SizeSeries:
         ]
 
     def time_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit median total time ~ nᵖ or mᵖ; return None for fewer than three sizes."""
+        """Fit c·nᵖ or c·mᵖ to median total times; None for fewer than three sizes."""
         timed = ((s, o.seconds("total")) for s, o in self.curve(solver, against))
         return _law((s, t and t.value) for s, t in timed)
 
     def iteration_law(self, solver: str, against: str = "n") -> PowerLaw | None:
-        """Fit iterations ~ nᵖ or mᵖ; return None for fewer than three sizes.
+        """Fit c·nᵖ or c·mᵖ to iterations; return None for fewer than three sizes.
 
         If the repeats differ, the midpoint of their range is fitted.
         """
@@ -57,7 +57,7 @@ class SizeSeries:
         return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
 
     def count_law(self, solver: str, name: str) -> PowerLaw | None:
-        """Fit the mean of one count ~ nᵖ; return None for fewer than three sizes."""
+        """Fit c·nᵖ to the means of one count; None for fewer than three sizes."""
         return _law((n, o.counted(name)) for n, o in self.curve(solver))
 
 

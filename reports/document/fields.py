@@ -87,7 +87,7 @@ class Strokes:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Path:
-    """Points joined by a line, drawn as marks, or both."""
+    """Points connected by a line, drawn as marks, or both."""
 
     points: Points
     look: Look
@@ -95,7 +95,7 @@ class Path:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Vectors:
-    """Arrows of a vector field, whose lengths are in units of the axes."""
+    """Arrows of a vector field; their lengths are in units of the axes."""
 
     feet: Points
     vectors: Points
@@ -160,12 +160,12 @@ class FieldFigure:
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows
-    #: common colour scale of all panels, shown as a bar beside them; None without one
+    #: common colour scale of all panels, shown as a bar beside the panels, or None
     scale: ColourScale | None = None
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return lower left and upper right corners of a box around bodies, with margin."""
+    """Return lower left and upper right corners of a box around bodies with margin."""
     points = np.vstack(bodies)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (high - low)

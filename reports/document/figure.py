@@ -119,7 +119,7 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Text:
-    """A remark within a panel."""
+    """A text within a panel."""
 
     text: str  #: text, possibly with mathtext formulas of matplotlib: $n^2$
     place: tuple[float, float]
@@ -207,7 +207,7 @@ class Panel:
     legend: Legend | None = None
     bar: ColourBar | None = None
     grid: Literal["both", "x", "y", "none"] = "both"
-    span: int = 1  #: number of columns
+    span: int = 1  #: number of columns that the panel occupies
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +215,7 @@ class Row:
     """Panels side by side."""
 
     panels: tuple[Panel, ...]
-    height: float = 1.0  #: relative to the other rows
+    height: float = 1.0  #: height relative to the other rows
     legend: Legend | None = None
 
 
@@ -275,7 +275,7 @@ def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
     """Return the ends of an axis that panels share.
 
     Ends that are not prescribed lie just beyond the points. A single value is centred;
-    without values a default range is used.
+    without values, a default range is used.
     """
     axis: Axis = getattr(panels[0], direction)
     shown = [v for panel in panels for v in _values(panel, direction) if isfinite(v)]

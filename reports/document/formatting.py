@@ -159,7 +159,7 @@ def estimate(of: Sequence[float]) -> str:
 
 
 def fixed(of: Sequence[float], digits: int = 3) -> str:
-    """Format a value and its interval, the first three items, with `digits` places."""
+    """Format a value and its interval (first three items) with `digits` decimals."""
     value, low, high = (f"{v + 0.0:.{digits}f}" for v in of[:3])
     return f"{value} [{low}, {high}]"
 

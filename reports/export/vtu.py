@@ -33,7 +33,7 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     """Write a deformed state in SI units; return the .vtu and a CSV for each contact.
 
     The point data are displacement (m), contact_force (force of the contact on a slave
-    node, N/m in the plane, N in space), in_contact (0 or 1), pressure (Pa), gap (m) and
+    node, N/m in 2D, N in 3D), in_contact (0 or 1), pressure (Pa), gap (m) and
     the nodal fields. Forces and pressures are zero except on slave nodes. The gap is
     NaN, which ParaView leaves out, except on slave nodes that face a master. The cell
     data are the body and, for decomposed bodies, the subdomain; triangles come before
@@ -117,8 +117,8 @@ def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     """Write a CSV of one contact, with a row per node of the slave side.
 
-    In the plane, nodes are in the order of the side, and the first column is the arc
-    length along it; in space, node numbers are ascending.
+    In 2D, nodes are in the order of the side, and the first column is the arc length
+    along the side; in 3D, node numbers are ascending.
     """
     # names of pairs come from users: keep letters, digits and underscores
     name = "-".join(re.findall(r"\w+", side.name)) or "contact"

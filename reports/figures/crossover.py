@@ -144,7 +144,7 @@ def _short(route: Route) -> str:
 
 
 def _look(route: Route) -> Look:
-    """Return the look of a route's kind; dashed and hollow for several ranks."""
+    """Return the style of a route by its kind; dashed and hollow for several ranks."""
     i = _index(route)
     style = Look(colour=COLOURS[i], marker=MARKERS[i], width=1.3, size=4.2)
     if route.ranks == 1:

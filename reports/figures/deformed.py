@@ -44,7 +44,7 @@ SCALE = 1.0  #: factor of the displacement in figures drawn to scale
 #: Displacements below `SEEN` times the size of the bodies are not visible. They are
 #: magnified such that the largest is about `SHOWN` times that size.
 SEEN, SHOWN = 0.01, 0.05
-#: largest number of cells with mesh lines; more lines would hide the colours
+#: largest number of cells for which mesh lines are drawn; more would hide the colours
 _MESH_SHOWN = 6000
 _ACTIVE = (
     1e-6  #: fraction of the largest force above which a contact node counts as loaded
@@ -125,7 +125,7 @@ def automatic_scale(fields: Fields) -> float:
 def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     """Draw all bodies, and an enlargement of each contact under load.
 
-    In space, draw the surface of the bodies, and the pressure on each contact side.
+    In 3D, draw the surface of the bodies, and the pressure on each contact side.
 
     scale : magnification of the displacement; None: `automatic_scale`
 
@@ -443,7 +443,7 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Return factor and prefix of the unit in which `value` is from 1 to 1000."""
+    """Return factor and prefix of the unit in which `value` is between 1 and 1000."""
     prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 

@@ -76,7 +76,7 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
 
 
 def rivals(ranking: Ranking) -> list[int]:
-    """Select the solvers compared with the leader in pairs: the next ones by rank."""
+    """Select the solvers compared pairwise with the leader: the next by rank."""
     return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 
@@ -205,7 +205,7 @@ def _log(label: str, ends: Ends) -> Axis:
 
 
 def _factors(label: str, ends: Ends) -> Axis:
-    """Return a logarithmic axis of ratios from 1, with round ticks."""
+    """Return a logarithmic axis of ratios that starts at 1, with round ticks."""
     for last, ticks in _FACTORS.items():
         if ends[1] <= last:
             return replace(_log(label, ends), ticks=tuple((t, f"{t:g}") for t in ticks))

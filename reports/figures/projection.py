@@ -28,7 +28,7 @@ class Camera(NamedTuple):
     towards: Vector  #: direction from the bodies to the camera
 
     def project(self, points: Points) -> NDArray[np.float64]:
-        """Return positions in the picture (…, 2)."""
+        """Return the positions (…, 2) of points in the picture."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
@@ -53,7 +53,7 @@ def camera_above(normal: Vector) -> Camera:
 
 
 def face_normals(points: Points, faces: Integers) -> Points:
-    """Return normals (k, 3) of faces (k, 4), whose lengths are twice the areas."""
+    """Return normals (k, 3) of faces (k, 4); the length of each is twice the area."""
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
     return np.asarray(np.cross(c - a, d - b))
 

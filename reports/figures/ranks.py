@@ -50,7 +50,7 @@ _BEYOND = 1.5  #: largest factor by which intervals extend an axis beyond the va
 _REST = "#9aa2ad"  #: colour of the time outside the listed parts
 _ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 _MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
-#: boundary of measured and modelled speed-ups
+#: boundary between measured and modelled speed-ups
 _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 

@@ -53,7 +53,7 @@ class Place(NamedTuple):
 
     @property
     def time(self) -> Interval | None:
-        """Median time; if sizes are in dofs, it includes any dualisation."""
+        """Median time, including any dualisation if the size is n (dofs)."""
         dualised = self.outcome.with_dualising if self.dofs else None
         return dualised or self.outcome.seconds("total")
 

@@ -1,4 +1,4 @@
-"""Page with the paper's figures and tables, and further ones, from measured data."""
+"""Page with the figures and tables of the paper, and further ones, from stored data."""
 
 from __future__ import annotations
 
@@ -264,10 +264,10 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             "figure6",
             "Scaling",
             scaling_figure(six),
-            f"Growth with Nr at Nh = {six[0]['Nh']}, "
+            f"Problem sizes and times against Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
             "repeats. (c): the condensed curve includes the factorisation, which "
-            "dominates its time; the other curve does not. (d): complete analysis. "
+            "dominates its time; the other curve excludes it. (d): complete analysis. "
             f"Star and cross: published values for Nr = 30 ({published.MACHINE}).",
         ),
     )
@@ -392,7 +392,7 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Return the sections on times of all solvers against m, and on primal and dual."""
+    """Return the sections on times of all solvers, against m and by form."""
     return (
         _section(
             "fleet",

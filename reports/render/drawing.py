@@ -94,7 +94,7 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
 }
-_VAST = 100.0  #: number of decades of an axis, exceeded only if an answer diverged
+_VAST = 100.0  #: number of decades that an axis exceeds only if an answer diverged
 #: distance between a legend and the curves below it, relative to the axes height
 _GAP = 0.03
 _FRONT = 2.0  #: zorder of the first mark; each further one is slightly higher

@@ -46,10 +46,10 @@ def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
 
 
 def details(records: Sequence[Record]) -> str:
-    """Serialise every field of every measurement: columns, JSON, gzip, base64.
+    """Serialise all fields of all measurements: columns as JSON, gzip and base64.
 
-    A column is a list of values or, if few values are distinct, a list of these and
-    their indices.
+    A column is a list of values or, if few values are distinct, the list of distinct
+    values and a list of indices.
     """
     lines = [_as_journalled(r) for r in records]
     columns = {name: [getattr(r, f.name) for r in lines] for name, f in JOURNAL.items()}
@@ -160,7 +160,7 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Encode a column by distinct values if few; 1, 1.0 and True are distinct."""
+    """Encode a column by distinct values if they are few; 1, 1.0 and True differ."""
     tables = {
         id(v): v for v in values if type(v) in (dict, list)
     }  # many records share one object

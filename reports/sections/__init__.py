@@ -1,8 +1,8 @@
 """Sections of a report, each registered with its position by a decorator.
 
-A module NAME.py contains related sections, and NAME.j2 contains their sentences. A new
-section is a generator of paragraphs, tables and pictures in any module of this package,
-decorated with `@section`.
+A module NAME.py contains related sections, and NAME.j2 contains their sentences. To add
+a section, write a generator of paragraphs, tables and pictures in any module of this
+package, and decorate it with `@section`.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def section(
 
 
 def sections(analysis: Analysis) -> Iterator[Section]:
-    """Compose all sections; before the appendix, list those without measurements."""
+    """Compose all sections; list those without measurements before the appendix."""
     missing: list[str] = []
     for entry in _entries():
         if entry.place >= APPENDIX and missing:

@@ -53,10 +53,10 @@ REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
 MOST_SERIES = 4  #: largest number of size series that are described by a sentence each
 _FROM_MESH = "From the mesh to a verified answer, including dualisation: "
 _TRENDS = {
-    Trend.FLAT: "stay flat",
-    Trend.GROWS: "grow",
-    Trend.FALLS: "fall",
-    Trend.UNDECIDED: "show no clear trend",
+    Trend.FLAT: "stays flat",
+    Trend.GROWS: "grows",
+    Trend.FALLS: "falls",
+    Trend.UNDECIDED: "shows no clear trend",
 }
 
 
@@ -95,7 +95,7 @@ def answer(a: Analysis) -> Iterator[Part]:
 
 @section(2, "forms", "Solver times for each form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare solvers within each form, unless the first section already does."""
+    """Compare solvers within each form, unless the first section contains this."""
     if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED
@@ -104,7 +104,7 @@ def forms(a: Analysis) -> Iterator[Part]:
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Return a sentence for use after a colon: lower case unless a name begins it."""
+    """Return a sentence for use after a colon, in lower case unless a name is first."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
@@ -216,7 +216,7 @@ def _name(c: Competitor) -> str:
 
 
 def _named(competitors: Iterable[Competitor], most: int = 4) -> str:
-    """Enumerate the names in words, at most `most` of them."""
+    """Enumerate at most `most` names and count the others."""
     names = list(map(_name, competitors))
     if len(names) > most:
         return listing(names, most)
@@ -328,7 +328,7 @@ def _reason(one: Unverified) -> str:
 
 
 def _reservations(found: Sequence[FastestSolver]) -> list[str]:
-    """List the limitations of the claims on one form."""
+    """List the limitations of the claims about one form."""
     named = (Finding.FASTEST, Finding.TIE, Finding.DIVIDED)
     few = any(f.finding in named and not f.over_cases for f in found)
     unsolved = max((f.unsolved for f in found if f.cases), default=0)

@@ -143,7 +143,7 @@ def _quantities(
     "Deformed bodies: no verified answer has bodies to draw.",
 )
 def deformed(a: Analysis) -> Iterator[Part]:
-    """Draw the largest verified cases in the plane and in space, if there are any."""
+    """Draw the largest verified 2D and 3D cases, if there are any."""
     directory = a.evidence.directory
     largest = [
         max(mine, key=_importance)

@@ -119,7 +119,7 @@ def iterations(a: Analysis) -> Iterator[Part]:
         if names := dict.fromkeys(k for o in mine for k in o.first.counts):
             heads = (clean(name.replace("_", " "), 40) for name in names)
             yield Table(
-                caption=f"Counts of {clean(solver, 40)}, first repeat.",
+                caption=f"Counts of {clean(solver, 40)} in the first repeat.",
                 columns=("case", "tol", *heads),
                 rows=tuple((*case_cells(o), *_counts(o, names)) for o in mine),
                 solver=solver,

@@ -39,7 +39,7 @@ TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
     60,
     "scaling",
     "Scaling",
-    "Scaling: no cases differ in size only, with three or more sizes (see "
+    "Scaling: no cases that differ only in size have three or more sizes (see "
     "suites/scaling.toml).",
 )
 def scaling(a: Analysis) -> Iterator[Part]:
@@ -184,8 +184,9 @@ def per_decade(fit: Growth) -> str:
 @section(
     64,
     "steps",
-    "Steps of each kind against size",
-    "Steps of each kind against size: no solver reports counts on three or more sizes.",
+    "Number of steps by type against size",
+    "Number of steps by type against size: no solver reports counts on three or more "
+    "sizes.",
 )
 def steps(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw the counts that solvers report, against n and H/h."""

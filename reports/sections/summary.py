@@ -128,7 +128,7 @@ def _cells(evidence: Evidence) -> int:
 
 
 def sentences(evidence: Evidence, solver: str) -> list[str]:
-    """Return one sentence per tolerance on the cases that a solver did not solve."""
+    """Return one sentence per tolerance on the verdicts of a solver."""
     mine = [o for o in evidence.flat if o.solver == solver]
     tols = sorted({o.tol for o in mine}, reverse=True)
     return [_sentence(solver, tol, [o for o in mine if o.tol == tol]) for tol in tols]

@@ -147,7 +147,7 @@ def ratios(a: Analysis) -> Iterator[Part]:
         )
 
     yield from TEXT.parts("ratios", apart)
-    yield grid(a.evidence, "Ratio to the fastest, within blocks.", ratio)
+    yield grid(a.evidence, "Total time relative to the fastest, within blocks.", ratio)
 
 
 def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:

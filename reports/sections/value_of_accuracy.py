@@ -1,4 +1,4 @@
-"""Cost of accuracy: solver errors beside the discretisation errors of the meshes."""
+"""Cost of accuracy: solver errors compared with discretisation errors."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Tabulate the number of answers of each solver that stand out, and the worst."""
+    """Count the answers of each solver that stand out, and tabulate the worst one."""
     grouped: dict[str, list[Data]] = {}
     for d in data["remarks"]:
         grouped.setdefault(d["solver"], []).append(d)

@@ -46,7 +46,7 @@ def _found():
 
 @pytest.fixture
 def environment(_found):
-    """A constant description of this machine, which a test may change."""
+    """Return a constant description of this machine, which a test may change."""
     before = dict(_found["machine"])
     yield _found
     _found["machine"] = before
@@ -66,7 +66,9 @@ def measure(tmp_path):
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """The two folders of a campaign after their runs."""
+    """Run two suites; return the folder that contains their result folders
+    `a` and `b`.
+    """
     where = tmp_path_factory.mktemp("made")
     for name, depths in (("a", "1"), ("b", "2")):
         (where / f"{name}.toml").write_text(suite(depths=depths))
@@ -76,7 +78,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def stored(made, tmp_path):
-    """A copy of the two folders of the campaign."""
+    """Return copies of the two result folders of `made`."""
     for name in "ab":
         shutil.copytree(made / name, tmp_path / name)
     return tmp_path / "a", tmp_path / "b"
@@ -92,8 +94,10 @@ GROWN = {
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    """The folder `before`, and a copy named `grown` whose suite has
-    additional cases.
+    """Return a folder with the results `before` and their continuation `grown`.
+
+    `grown` is a copy of `before`, continued with a suite that has additional cases,
+    solvers and tolerances.
     """
     where = tmp_path_factory.mktemp("campaign")
     for name, asked in (("before", {"repeats": 2}), ("grown", GROWN)):
@@ -185,7 +189,7 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
             for depth in (1, 2)
         ],
     }  # fmt: skip
-    measure("all", depths="1, 2", solvers='"exact", "lax", "liar"')  # it goes on
+    measure("all", depths="1, 2", solvers='"exact", "lax", "liar"')  # continues the run
     assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
 
 

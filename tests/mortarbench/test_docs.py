@@ -199,7 +199,9 @@ def test_every_page_has_a_place_on_the_site():
 
 
 def workflow():
-    """The commands of the CI workflow, with the variables of its header filled in."""
+    """Yield the commands of the CI workflow, with the variables of its
+    header filled in.
+    """
     whole = yaml.safe_load((ROOT / "docs/ci/mortarbench.yml").read_text("utf-8"))
     steps = [step for job in whole["jobs"].values() for step in job["steps"]]
     for text in (step["run"] for step in steps if "run" in step):

@@ -223,7 +223,7 @@ def test_a_block_that_shows_a_command_is_one_that_is_run():
 
 @pytest.fixture
 def execute(tmp_path, monkeypatch, capsys):
-    """Run one command in a folder that contains the suites, as a reader would."""
+    """Run one command in a folder that contains the suites, as a user would."""
     (tmp_path / "suites").symlink_to(ROOT / "suites")
     monkeypatch.chdir(tmp_path)
 

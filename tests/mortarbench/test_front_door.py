@@ -31,7 +31,7 @@ def answer():
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """A run of the solvers of a plug-in on its family."""
+    """Run the solvers of a plug-in on its family."""
     folder = tmp_path_factory.mktemp("results")
     (folder / "s.toml").write_text(
         'name = "s"\nsolvers = ["exact", "picky"]\nrepeats = 2\n'
@@ -42,7 +42,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def smoke(tmp_path_factory):
-    """A run of two built-in solvers on a built-in case."""
+    """Run two built-in solvers on a built-in case."""
     out = tmp_path_factory.mktemp("smoke")
     return mb.run("smoke", out=out, cases=["*/dual"], solvers=["smalbe", "clarabel"])
 

@@ -67,7 +67,7 @@ def test_a_smaller_factor_never_verifies_more(claimed, found, tol, factors):
         (5e-6, 1e-7, Verdict.WRONG),  # beyond √(1e-13) = 3e-7
         (5e-4, 10, Verdict.INACCURATE),
         (5e-4, 1000, Verdict.VERIFIED),
-        (0.5, 1e9, Verdict.WRONG),  # above 0.1 nothing is verified
+        (0.5, 1e9, Verdict.WRONG),  # residuals above 0.1 are never verified
     ],
 )
 def test_the_verdict_is_that_of_the_residuals_at_the_factor(worst, factor, expected):
@@ -112,7 +112,7 @@ def judge(folder, factor):
 
 @pytest.fixture
 def folder(tmp_path):
-    """A result folder with one answer whose largest residual is 4·tol."""
+    """Return a result folder with one answer whose largest residual is 4·tol."""
     stored = record(Status.SOLVED, Residuals(1e-9, 4e-6, 0, 1e-9), 1e-6)
     with Journal(tmp_path, "test") as journal:
         journal.append(stored)

@@ -39,7 +39,7 @@ Loader.add_multi_constructor("", lambda *_: None)
 
 
 def rendered(text):
-    """HTML of a page before the hooks of mkdocs."""
+    """Return the HTML of a page before the hooks of mkdocs."""
     options = yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), Loader)
     named = [
         next(iter(e.items())) if isinstance(e, dict) else (e, {})
@@ -51,7 +51,7 @@ def rendered(text):
 
 
 def formulas(source):
-    """LaTeX between dollar signs, extracted without Markdown."""
+    """Return the LaTeX code between dollar signs, extracted without Markdown."""
     prose = CODE.sub("", source)
     found = re.findall(
         r"\$\$(.+?)\$\$|(?<![\\$])\$(?!\s)([^$]+?)(?<!\s)\$", prose, re.S

@@ -18,7 +18,7 @@ from mortarbench.problems.experiments.scaling_model import (
 )
 from tests.support import ROOT
 
-#: √m times ms per product of a prototype, by cores, for m = 1, 2, 4, 8
+#: cores → √m times the time per product of a prototype in ms, for m = 1, 2, 4, 8
 PROTOTYPE = {
     128: (15,), 1024: (18, 21), 10240: (92, 27, 29), 102400: (1835, 168, 41.5, 41.1),
 }  # fmt: skip

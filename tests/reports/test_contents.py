@@ -135,7 +135,7 @@ def energies(measured, *values, **changes):
         ([-333734.443434567 * (1 + 2e-6)], "-333734"),  # five digits agree
         ([-333734.443434567 * (1 + 2e-4)], "-3.337e5"),  # without insignificant zeros
         ([-333734.443434567], "-333734.443435"),  # at most twelve digits
-        ([], "-333734.443"),  # single answer: digits according to the tolerance 1e-8
+        ([], "-333734.443"),  # digits of a single answer follow from its tolerance 1e-8
     ],
 )
 def test_energies_have_one_more_digit_than_answers_agree_on(
@@ -239,7 +239,7 @@ def test_declined_cases_do_not_count_as_measurements(measured, page):
     ]
     made = section(page(records, suite={"repeats": 3}), "summary")
     assert made.prose[0].startswith(
-        "3 measurements of the 6 that the suite asks for on these cases (3 were "
+        "3 measurements of the 6 that the suite requests on these cases (3 were "
         "declined by a solver): 2 solvers"
     )
     shy = rows(made.tables[0])[1]

@@ -208,7 +208,7 @@ def test_runs_of_very_different_length_have_a_logarithmic_axis(folder):
         out = folder(("a", KNOWN, {}), ("b", longer, {}))
         return convergence_figure(comparison(out)).axes[0].get_xscale()
 
-    assert scale(70) == "linear"  # ten times 7
+    assert scale(70) == "linear"  # 70 is ten times 7
     assert scale(71) == "log"
 
 

@@ -262,7 +262,7 @@ def test_the_verdict_filter_shows_exactly_the_matching_cases(visit, folder, reco
     assert set(found) == {
         (r.case, r.solver) for r in records if r.verdict is Verdict.WRONG
     }
-    toggle(page, "solver-a")  # rows are hidden with their wrong answers
+    toggle(page, "solver-a")  # rows with wrong answers of a are hidden
     wanted = {
         r.case
         for r in records

@@ -130,7 +130,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
     assert errors == texts
     text = markdown(page)
     assert text.count(legend) == 3  # verdicts, refuted claims, errors
-    assert text.count("(⋆ in tables)") == 1  # the figure of accuracy
+    assert text.count("(⋆ in tables)") == 1  # in the caption of the figure of accuracy
     assert "or, for small QPs, on a proven optimum" in text
 
     page = compose(evidence(records[:2]))
@@ -520,8 +520,8 @@ def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_pa
     pictures = [p for s in page.sections if s.name == "deformed" for p in s.pictures]
 
     assert [p.name for p in pictures] == ["deformed", "deformed-in-space"]
-    assert "the largest verified case in the plane" in pictures[0].caption
-    assert "the largest verified case in space" in pictures[1].caption
+    assert "the largest verified plane case" in pictures[0].caption
+    assert "the largest verified three-dimensional case" in pictures[1].caption
     assert [len(p.figure.panels) for p in pictures] == [1, 1]
 
 

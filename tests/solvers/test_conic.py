@@ -81,8 +81,8 @@ def conic_qp(seed):
 
 #: largest error in x at tol 1e-8
 ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
-#: the same for other solvers: interior-point methods stop at a gap of tol, which
-#: permits an angle of √tol between x and z of a disc
+#: largest error in x of all other solvers: interior-point methods stop at a gap of
+#: tol, which permits an angle of √tol between x and z of a disc
 OTHER_ERROR = 5e-4
 RESIDUAL = {"ecos": 3e-7}  #: residuals exceed 1e-7 for 7 of 500 QPs, without a claim
 

@@ -1,4 +1,4 @@
-"""In-house solvers on discs and cones: planted solutions, hard radii, products."""
+"""In-house solvers on discs and cones: planted solutions, extreme radii, products."""
 
 from dataclasses import replace
 
@@ -171,7 +171,8 @@ def test_the_history_counts_discs_that_slip():
     assert gradient[-1] < 1e-8 * gradient[0]
 
 
-#: products of prototypes to a natural map of 1e-8, ν = 0.3, by Q/μP and discs
+#: number of products of prototypes until the natural map is 1e-8, for ν = 0.3, by Q/μP
+#: and number of discs
 PRODUCTS = {
     "projected-gradient": {
         0.3: {88: 31, 376: 45, 820: 62, 1468: 74},
@@ -190,7 +191,8 @@ PRODUCTS = {
         0.9: {88: 67, 376: 122, 820: 164, 1468: 222},
     },
 }
-#: products of the norm, the start and the claimed residuals, not in the prototypes
+#: number of products for the norm, the start and the claimed residuals, which the
+#: prototypes do not count
 OF_CLAIM = {"projected-gradient": 3, "apgd": 3, "smalbe": 3, "smalbe-paper": 14}
 
 

@@ -65,8 +65,8 @@ def solve(name, qp, tol=1e-9):
 
 @pytest.fixture
 def membrane():
-    """Discrete membrane over a flat obstacle, fixed at one side and pulled at another
-    one.
+    """Return a discrete membrane over a flat obstacle, fixed at one side and pulled at
+    another one.
     """
     k = 45
     end = np.eye(k)[:, [0, -1]].sum(axis=1)

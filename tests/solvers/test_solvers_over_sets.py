@@ -34,11 +34,12 @@ ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
 
 
 def faults(name, shape, seeds):
-    """List the seeds for which f is off by more than 1e-8 or x by more than 1e-6.
+    """List the seeds for which the error of f exceeds 1e-8 or the error of x exceeds
+    1e-6.
 
-    The error of f is relative to |qᵀx*|, since f* may cancel: for one seed, 0.001
-    remains of 4. If an error is too large at `TOL`, the smaller error at `TIGHT`
-    counts, whatever the solver claims.
+    The error of f is relative to |qᵀx*|, since f* may cancel: for one seed, terms of
+    size 4 cancel to 0.001. If an error is too large at `TOL`, the smaller error at
+    `TIGHT` counts, whatever the solver claims.
     """
     wrong, declined = [], []
     limits = np.array([1e-8, ENDS_OFF_PATH.get(name, 1e-6)])

@@ -44,7 +44,9 @@ def processes(of_run):
 
 
 class Witness(Honest):
-    """Solver that fails if another process of the run can run, except sub-reapers."""
+    """Solver that fails if a process of the run, other than a sub-reaper,
+    is runnable.
+    """
 
     def act(self, qp):
         mine = {os.getppid(), *descendants(os.getppid())}
@@ -163,7 +165,7 @@ class HoardsInShm(Honest):
 
 
 class SharesPages(Honest):
-    """Solver with four processes that share 150 MiB, to be counted once."""
+    """Solver whose four processes share 150 MiB, which must be counted once."""
 
     def act(self, qp):
         hoard = np.ones(150 * 2**17)
@@ -279,7 +281,7 @@ class ClosesAll(Honest):
 
 
 def unsolved(qp):
-    """Raise: there is no reference solver here, so residuals decide."""
+    """Raise ArithmeticError: without a reference solution, residuals decide."""
     raise ArithmeticError("no reference solve")
 
 

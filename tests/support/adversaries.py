@@ -1,8 +1,10 @@
 """Plug-in with a family of tiny QPs, a correct solver, and misbehaving solvers.
 
+The QPs are
+
     min x₁² + ½x₂² − 4x₁ + 3x₂   s.t.   x₁ ≤ h,  x ≥ 0
 
-has, for h ≤ 2, the solution x = (h, 0) with multipliers z = 4 − 2h and z_box = (0, −3).
+For h ≤ 2, the solution is x = (h, 0) with multipliers z = 4 − 2h and z_box = (0, −3).
 
 If the module is run as a program with the name of a solver and two file descriptors, it
 acts as a worker.
@@ -96,7 +98,9 @@ class Sized:
 
 
 def at_the_row(qp):
-    """Return the point with x₁ = h; its only residual, for h > 2, is the sign of z."""
+    """Return the point with x₁ = h; for h > 2, only the sign of its
+    multiplier is wrong.
+    """
     h = qp.h[0]
     return Solution(
         status=Status.SOLVED, x=np.array([h, 0.0]), y=np.zeros(0),
@@ -106,7 +110,9 @@ def at_the_row(qp):
 
 @dataclass(frozen=True)
 class Honest:
-    """Correct solver of the tiny QPs with h ≤ 2; subclasses misbehave only on these."""
+    """Correct solver of the tiny QPs with h ≤ 2; subclasses misbehave on
+    these QPs only.
+    """
 
     level: int = 3
 
@@ -422,7 +428,7 @@ class NumpyScalars(Honest):
 
 
 def unsolved(qp):
-    """Raise: there is no reference solver here, so residuals decide."""
+    """Raise ArithmeticError: without a reference solution, residuals decide."""
     raise ArithmeticError("no reference solve")
 
 

@@ -137,7 +137,7 @@ $EndElements
 
 
 def meshes(folder):
-    """Return the same mesh in format 4.1, as text and binary, written by meshio."""
+    """Yield a mesh in format 2.2, as text and as binary data, and in format 4.1."""
     import meshio
 
     (folder / "text.msh").write_bytes(msh_22())
@@ -225,7 +225,7 @@ def spliced(rng, data, at, others):
 
 
 def numbered(rng, data, at, others):
-    """Overwrite with an extreme integer, in a format of file headers."""
+    """Overwrite bytes with an extreme integer, in a format of file headers."""
     value = EXTREMES[rng.integers(0, len(EXTREMES))] % 2**64
     return over(data, at, struct.pack("<Q", value)[: (2, 4, 8)[rng.integers(0, 3)]])
 
@@ -254,7 +254,7 @@ def shortened(rng, data, at, others):
 
 
 def over(data, at, piece):
-    """Overwrite with `piece` at a position."""
+    """Overwrite the bytes at a position with `piece`."""
     return data[:at] + piece + data[at + len(piece) :]
 
 
@@ -273,7 +273,7 @@ def damaged(rng, data, others):
 
 
 def read(path):
-    """Read a file like a case; return True if it contains a valid QP."""
+    """Read a file as commands do; return True if it contains a valid QP."""
     try:
         if path.suffix in (".msh", ".inp", ".med"):
             mesh = read_msh(path)

@@ -36,7 +36,7 @@ def qp_on_discs(seed, *, rows=0, dim=2, spread=0.0, touching=False):
 
     rows : number of equality rows
     spread : radii differ by up to 10**spread
-    touching : include discs with x on the boundary without a multiplier
+    touching : include discs with x on the boundary and a zero multiplier
     """
     rng = np.random.default_rng(seed)
     k, others = int(rng.integers(2, 12)), int(rng.integers(0, 6))

@@ -74,7 +74,7 @@ DISTURBANCES = (noise, scaled, wrong_rows, infeasible, shifted)
 def disturbed(
     s: Solution, i: int, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Apply the disturbance i (modulo their number) with relative size 1e-13 to 2."""
+    """Apply disturbance number i (cyclically) with a relative size of 1e-13 to 2."""
     size = 10 ** rng.uniform(-13, 0.3)
     ways = len(DISTURBANCES) + 3
     match i % ways - len(DISTURBANCES):

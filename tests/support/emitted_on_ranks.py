@@ -1,4 +1,4 @@
-"""Compare distributed QPs with QPs of one process; print the differences as JSON.
+"""Compare distributed QPs with QPs of one process, and print differences as JSON.
 
 Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The local parts of
 the QP that the ranks emit are assembled and compared with the QP of one process.

@@ -1,6 +1,7 @@
-"""Program of tests/harness/verify/test_over_ranks.py on several ranks; prints JSON.
+"""Program that tests/harness/verify/test_over_ranks.py runs on several ranks.
 
-Run as ``mpiexec -n N python -m mpi4py evaluated_on_ranks.py CASE…``.
+Run as ``mpiexec -n N python -m mpi4py evaluated_on_ranks.py CASE…``. The program prints
+JSON.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Certify disturbed exact solutions on several ranks; prints JSON.
+"""Certify disturbed exact solutions on several ranks, and print the results as JSON.
 
 Run as ``mpiexec -n N python -m mpi4py exact_on_ranks.py COUNT CASE…``. The first rank
 builds the undivided problem and solves it exactly.

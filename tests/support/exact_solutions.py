@@ -139,8 +139,8 @@ class ExactSolution:
     def exceeded(self, found: Certificate, s: Solution, u: Any) -> tuple[float, float]:
         """Return the larger relative error of û (n,) and s, and its ratio to the bound.
 
-        The bound of the relative error may be infinite although the bound of the
-        absolute error is finite.
+        The bound of the relative error may be infinite while the bound of the absolute
+        error is finite.
         """
         error = max(self.error(s.x), self.error(u))
         within = min(found.error, found.bound * self.norm)
@@ -199,7 +199,7 @@ def _given(
 def _exchanged(
     mechanics: Mechanics, states: States, u: Integers, lam: Integers
 ) -> States:
-    """Return the states after exchanging the rows that violate a condition.
+    """Return the states after an exchange of the rows that violate a condition.
 
     Values below about 2^−FINE times the largest number count as zero.
     """

@@ -1,6 +1,7 @@
 """Plug-in with solvers that make false claims; two are real solvers, used wrongly.
 
-It contains two families without mechanics: a membrane, and  min ½(x + 1)²,  x ≤ 0.
+The plug-in contains two families without mechanics: a membrane, and
+min ½(x + 1)², x ≤ 0.
 """
 
 from dataclasses import dataclass, field, replace

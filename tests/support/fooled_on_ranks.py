@@ -1,4 +1,4 @@
-"""Search for answers whose error exceeds the bound that ranks prove; prints JSON.
+"""Search for answers whose error exceeds the bound that ranks prove; print JSON.
 
 Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. Errors are
 relative to the reference point of the undivided problem, which the first rank builds.
@@ -35,7 +35,7 @@ DISCS = {
     "sliding disc": {}, "disc under rollers": {"rollers": True},
     "tilted disc": {"tilt": 0.5}, "soft disc": {"E": (70e9, 70e3, 70e9)},
 }  # fmt: skip
-ROUNDED = 1 + 1e-9  #: allowed ratio of error to bound: local solves use doubles
+ROUNDED = 1 + 1e-9  #: allowed ratio of error to bound; local solves are rounded
 NOISE = 1e-7  #: smallest relative error for which the ratio bound / error is recorded
 
 

@@ -231,7 +231,7 @@ def serve(asked):
 
 
 def become(request, fds):
-    """Run the requested program, or the sub-reaper that starts it."""
+    """Run the requested program, or the sub-reaper that starts this program."""
     os.setsid()
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -276,7 +276,7 @@ def run(_, command):
             runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
         else:
             run_file(sys.argv[0])
-    except OSError:  # would be taken for one of execvp
+    except OSError:  # the caller would attribute the error to execvp
         traceback.print_exc()
         sys.exit(1)
     except SystemExit as end:
@@ -305,7 +305,9 @@ def compiled(path, *_):
 
 
 def end_well():
-    """Exit without destructors, which would write to shared pages and so copy them."""
+    """Exit without destructors, which would write to shared pages and thus
+    copy them.
+    """
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()

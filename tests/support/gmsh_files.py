@@ -89,7 +89,7 @@ master = "table"
 def stacked_mesh(gap=0.0, sag=0.0, **sides):
     """Return a mesh of two squares of side 2, one above the other.
 
-    sag : depth of the middle of the upper square's lower side below the ends of it
+    sag : depth of the middle of the upper square's lower side below its two ends
     sides : names and edges of further boundaries
     """
     (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0 + gap))

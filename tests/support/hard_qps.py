@@ -1,4 +1,4 @@
-"""QPs with misleading residuals, and their exact KKT point and optimal value.
+"""QPs with misleading residuals, each with an exact KKT point and its optimal value.
 
 All numbers are dyadic and have few digits, so that the planted point satisfies the KKT
 conditions of the stored QP without rounding errors.
@@ -17,7 +17,7 @@ from mortarbench.harness.solution import Solution, Status
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HardQP:
-    """A QP, a KKT point of it, and its optimal value."""
+    """A QP with one of its KKT points and its optimal value."""
 
     qp: QP
     solution: Solution

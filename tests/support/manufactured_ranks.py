@@ -24,7 +24,7 @@ SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}
 
 
 def sent_seconds(ranks: int) -> float:
-    """Return the time of communication, s.
+    """Return the time of communication in a solve, s.
 
     Reductions use a tree of ranks, and each rank has at most six neighbours.
     """
@@ -37,13 +37,13 @@ def sent_seconds(ranks: int) -> float:
 
 
 def solve_seconds(dofs: int, ranks: int) -> float:
-    """Return the time of a solve on ranks."""
+    """Return the time of a solve on `ranks` ranks, s."""
     slow = SLOWDOWN if ranks > 1 else 1.0
     return slow * (WORK * dofs / ranks + ALIKE) + sent_seconds(ranks)
 
 
 def copies_seconds(dofs: int) -> float:
-    """Return the time of simultaneous solves, one per rank."""
+    """Return the time of simultaneous solves, one per rank, s."""
     return SLOWDOWN * (WORK * dofs + ALIKE)
 
 

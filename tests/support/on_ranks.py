@@ -1,6 +1,6 @@
-"""Program of tests/harness/processes/test_ranks.py on several ranks; prints JSON.
+"""Program that tests/harness/processes/test_ranks.py runs on several ranks.
 
-Run as ``mpiexec -n N python -m mpi4py on_ranks.py CASE…``.
+Run as ``mpiexec -n N python -m mpi4py on_ranks.py CASE…``. The program prints JSON.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Two stacked blocks in space as a gmsh file and its description, for tests."""
+"""Two stacked three-dimensional blocks as a gmsh file and its description."""
 
 import numpy as np
 

@@ -166,7 +166,7 @@ PROBLEMS = {"well": Well()}
 
 
 def unsolved(qp):
-    """Raise: there is no reference solver here, so residuals decide."""
+    """Raise ArithmeticError: without a reference solution, residuals decide."""
     raise ArithmeticError("toy problems have no reference solve")
 
 

@@ -37,7 +37,7 @@ from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 
-#: backends that represent the wildcard entries of the registry; the others are slow
+#: backends that represent the wildcard entries of the registry; other backends are slow
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
     "cvxpy:*": ("CLARABEL", "HIGHS"),
@@ -63,7 +63,7 @@ def configured(backends):
 NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
 SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
-#: equivalent formulations are not a condition of conformance; they have their own test
+#: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: solvers that take seconds for all equivalent formulations
 REWRITTEN = {
@@ -76,7 +76,7 @@ WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 @pytest.fixture(autouse=True, scope="module")
 def loaded_once():
-    """Exclude loaded libraries from the collection before every measurement."""
+    """Exclude loaded libraries from the garbage collection before every measurement."""
     import cvxpy  # noqa: F401
     import qpsolvers  # noqa: F401
 
@@ -169,13 +169,13 @@ def weaknesses(solver):
         pytest.param(
             name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
         )
-        # other solvers pass the same QPs to the libraries of these
+        # the other solvers pass the same QPs to the libraries of these solvers
         for name in CONCRETE
     ],
 )
 def test_weaknesses_are_documented(name):
-    """The page, written by `make weaknesses`, may also list weaknesses that
-    are gone.
+    """The page, written by `make weaknesses`, may also list weaknesses that no longer
+    exist.
     """
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
@@ -456,7 +456,7 @@ def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
 def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
-    assert Grade.PASS in grades  # the check of options
+    assert Grade.PASS in grades  # of the check of options
     result = run_check("gives multipliers our signs", DeclinesAll())
     assert result == (Grade.DECLINE, "never on a Monday", None)
 
@@ -515,7 +515,9 @@ def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
     page = capsys.readouterr().out
     (sound,) = (x for x in page.splitlines() if x.startswith("| `sound` |"))
     (minds,) = (x for x in page.splitlines() if x.startswith("| `minds` |"))
-    assert sound.count(" | ") == len(CHANGES)  # name, forms, all changes but none
+    assert sound.count(" | ") == len(
+        CHANGES
+    )  # name, forms, and all changes except "none"
     assert "**" not in sound
     assert minds.split(" | ")[2].startswith("**primal**")
     assert page.count("×49") == 1  # forces of 1e8 N, not a displacement, not 1e5 N/mm

@@ -55,7 +55,7 @@ def test_points_planted_over_sets_are_strictly_complementary_solutions(shape):
 
 @dataclass(frozen=True)
 class Projections:
-    """The reference solver as a solver that accepts all sets."""
+    """Adapter of the reference solver that accepts all sets."""
 
     accepts: ClassVar = (Box, Discs, Cones)
 

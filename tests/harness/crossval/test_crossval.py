@@ -276,7 +276,7 @@ def stored_answer(case, label, s, tol=1e-8):
 
 @pytest.fixture
 def duplicate():
-    """Return two springs pushed by 2 against a wall at 1, with a duplicated
+    """Return two springs pressed by a force of 2 against a wall at 1, with a duplicate
     contact row.
     """
     K = np.array([[2.0, -1.0], [-1.0, 1.0]])

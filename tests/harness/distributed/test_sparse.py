@@ -120,7 +120,9 @@ def grid(cells):
 
 @pytest.fixture(params=["array", "library"])
 def way(request, monkeypatch):
-    """Factorise small matrices by compiled code, or by the library like large ones."""
+    """Factorise small matrices by compiled code, or by the library used for
+    large ones.
+    """
     if request.param == "library":
         monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
 
@@ -153,7 +155,7 @@ def test_a_factor_with_a_border_solves(last):
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("shift", [0.5, 1e-3, 1e-14])
 def test_changes_of_the_border_are_changes_of_the_matrix(shift):
-    """All of A on the two rows of the border is subtracted, so only the
+    """All entries of A in the two rows of the border are subtracted, so that only the
     shift remains.
     """
     rng = np.random.default_rng(SEED)

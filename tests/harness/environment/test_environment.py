@@ -126,7 +126,7 @@ def test_plugins_are_named_by_their_content(tmp_path):
     namesake.write_text("y = 3")
 
     assert plain["plugins"] == {"a.py": sha256(b"x = 1").hexdigest()[:12]}
-    assert both["plugins"] == plain["plugins"]  # it adds no plug-in
+    assert both["plugins"] == plain["plugins"]  # an empty namesake adds no plug-in
     assert changed_one["plugins"] != plain["plugins"]
     assert capture([file, namesake])["plugins"] != changed_one["plugins"]
     assert digest(changed_one) != digest(plain)

@@ -54,7 +54,7 @@ def test_equal_points_are_one_file_whenever_they_are_stored(tmp_path, solution):
 
     assert first == second
     (file,) = (tmp_path / "a" / "vectors").iterdir()
-    assert file.stat().st_mtime == 0  # it was not written again
+    assert file.stat().st_mtime == 0  # not written again
 
 
 def test_every_vector_its_name_and_its_shape_are_part_of_the_digest(tmp_path, solution):

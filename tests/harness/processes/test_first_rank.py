@@ -15,8 +15,8 @@ BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]:
 
 
 def wrong_names(tmp_path, count, trials, seed):
-    """Return the trials in which another rank was named; the output of
-    ranks is mixed.
+    """Return the trials in which a wrong rank was named; outputs of ranks are
+    interleaved.
     """
     command = [sys.executable, str(SUPPORT / "dying_ranks.py")]
     with (tmp_path / "out").open("w+b") as out:

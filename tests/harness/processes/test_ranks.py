@@ -415,7 +415,7 @@ LARGE = (
     .replace("ranks = [1, 2]", "ranks = [2]")
     .replace("membranes", "beam-ring")
 )
-WITH_A_SHARE = 110  #: MiB; a rank that waits for an order uses 90
+WITH_A_SHARE = 110  #: MiB; a rank that waits for instructions uses 90 MiB
 FAULTS = {
     "killed": (signal.SIGKILL, "", "crashed", r"rank 1 of 2 ranks ended: Killed"),
     "hung": (signal.SIGSTOP, "time_limit = 8", "time_limit", "killed after 8 s"),

@@ -1,4 +1,6 @@
-"""Times of dualising exclude effects of first calls, since a case is built twice."""
+"""Times of dualisation exclude effects of first calls, because a case is
+built twice.
+"""
 
 import time
 from dataclasses import dataclass, field

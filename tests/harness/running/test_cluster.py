@@ -30,7 +30,7 @@ if find_spec("distributed") is None:
     pytest.skip("no distributed", allow_module_level=True)
 
 PLUGIN = load_plugin(TOY_PROBLEM)
-SOLVERS = 4  #: measurements per block
+SOLVERS = 4  #: number of measurements per block
 SUITE = """
 name = "toy_problem"
 repeats = {repeats}
@@ -215,7 +215,7 @@ def test_results_of_a_lost_worker_are_kept_and_the_rest_is_a_new_block(
 
     def kill():
         assert soon(lambda: cut or cut.extend(partial_blocks("d")))
-        victim.kill()  # the turns that it has returned are in the journal
+        victim.kill()  # results that it has returned are in the journal
         cluster.join()
 
     with meanwhile(kill):

@@ -341,7 +341,7 @@ def test_answers_of_a_sweep_are_verified_at_one_accuracy(measure, tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.slow  # it sleeps
+@pytest.mark.slow  # the solver sleeps
 def test_the_exponent_of_a_solver_that_sleeps_by_a_power_law_is_found(
     measure, tmp_path
 ):

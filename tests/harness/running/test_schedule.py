@@ -145,7 +145,7 @@ def test_a_case_that_cannot_be_built_is_omitted_from_later_blocks():
     failed = next(blocks)
 
     assert schedule.give_up(failed)
-    assert not schedule.give_up(failed)  # it was marked before
+    assert not schedule.give_up(failed)  # the case was given up before
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 

@@ -43,7 +43,7 @@ def test_corrections_are_distributed_by_compliance():
 
 
 def test_rigid_motions_come_before_bending():
-    """Both rows are violated by 1, and a rigid motion by −1 satisfies them without
+    """Both rows are violated by 1, and a rigid motion by −1 satisfies both rows without
     bending.
     """
     found = moved(np.eye(2), [1, 1], [2, 2], R=[[1], [1]])

@@ -331,7 +331,9 @@ def test_a_body_may_have_slid_by_its_displacement_in_either_direction(far, monke
 
 
 def test_work_of_friction_has_its_own_part():
-    """A zero force on a slipping row has missing work, which the bound includes."""
+    """With a zero force on a slipping row, work of friction is missing; the bound
+    includes this work.
+    """
     problem = known("beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7")
     mechanics, s = problem.mechanics, problem.solution()
     slip = mechanics.friction.T @ s.x - mechanics.friction.start

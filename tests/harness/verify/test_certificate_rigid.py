@@ -502,7 +502,7 @@ def test_displacements_without_subdomain_energy_add_to_the_error(monkeypatch):
 
 
 def test_rounding_counts_as_far_as_the_answer_moves_rigidly(monkeypatch):
-    """The pair is at the solution (γ = 0), and the answer is far from it."""
+    """The pair is at the solution (γ = 0), and the answer is far from the solution."""
     mechanics = named("hertz-cylinder/n=2/m=2").mechanics
     point = reference_point(mechanics, reference_solution)
     R, far = mechanics.motions.constrained.toarray()[:, 0], 1e3 * np.abs(point.u).max()

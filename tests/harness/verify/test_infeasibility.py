@@ -117,7 +117,9 @@ def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
 
 @pytest.mark.parametrize("z", [(1, 1 + 1e-9), (1e-30, 1e-30), (1e200, 1e200)])
 def test_the_ray_of_a_solver_is_corrected_before_its_check(z):
-    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so it must be corrected."""
+    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so the ray must
+    be corrected.
+    """
     assert margin(infeasible(), z=z) == 1
 
 
@@ -203,7 +205,7 @@ def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
 
 
 def search(seeds):
-    """Count the proofs; assert that none is false and none is missing.
+    """Count the proofs; assert that no proof is false and that no proof is missing.
 
     A proof is required if the QP stays infeasible when right-hand sides and bounds are
     relaxed by 1e-11 of their size.

@@ -83,7 +83,7 @@ def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
 @pytest.mark.parametrize(
     ("broken", "expected"),
     [
-        # E = xᵀPx = 2: the energy changes by it over √(E/P₁₁) = √2, more than |x₁|
+        # E = xᵀPx = 2: the energy changes by E over the length √(E/P₁₁) = √2 > |x₁|
         (dict(A=np.ones((1, 2)), b=np.array([1.75])), 0.25 / (1.75 + 2 * 2**0.5)),
         (dict(A=np.ones((1, 2)), b=np.array([2.25])), 0.25 / (2.25 + 2 * 2**0.5)),
         (dict(G=np.ones((1, 2)), h=np.array([1.75])), 0.25 / (1.75 + 2 * 2**0.5)),

@@ -42,7 +42,7 @@ class ExactProblem:
             a, b, c = PAIRS[rng.integers(len(PAIRS))]
             unit = 2.0 ** (-8 if "tiny ball" in traps and i == 0 else 0)
             x[block], radius[i] = unit * np.array([a, b]), unit * c
-            if rng.random() < 0.7:  # active, else the ball is larger
+            if rng.random() < 0.7:  # active; otherwise, the ball is larger
                 z[block] = rng.integers(1, 9) * np.array([a, b])
             else:
                 radius[i] *= 2.0 ** (40 if "wide ball" in traps else 1)

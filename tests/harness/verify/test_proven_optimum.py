@@ -1,4 +1,4 @@
-"""Verdicts by proven optima: no wrong answer is verified, no right answer refuted."""
+"""Verdicts by proven optima: no wrong answer is verified, no right one is refuted."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -58,13 +58,14 @@ def judge(qp, s, tol=TOL):
 FAR = qp_of([1, 1], [-1, -1], A=[[1, 1]], b=[1], ub=1e7)  # x* = (½, ½), f* = −¾
 FLAT = qp_of([1e-9] * 5, [1, 2, 3, 4, 5], A=[[1] * 5], b=[1], lb=0)  # x* = e₁, f* = 1
 HIDDEN = qp_of([1, 1], [0, 0], G=[[0, 1e-12]], h=[1], lb=[1, -INF])  # (1, 0), ½
-AS_ROW = qp_of([1, 1], [0, 0], G=[[-1, 0], [0, 1e-12]], h=[-1, 1])  # the same
+AS_ROW = qp_of([1, 1], [0, 0], G=[[-1, 0], [0, 1e-12]], h=[-1, 1])  # (1, 0), ½
 COSTLY = qp_of([1, 1], [1e9, -1], lb=[0, -INF], ub=[1, INF])  # (0, 1), −½
 LONG = qp_of([1, 0, 0], [0, 0, 0], A=[[1, 1, -1], [0, 1, -1]], b=[1, 0])  # x₁ = 1, ½
-PAID = replace(LONG, q=np.array([0.0, 1, -1]))  # the same, since x₂ = x₃
+PAID = replace(LONG, q=np.array([0.0, 1, -1]))  # x₁ = 1, ½, since x₂ = x₃
 UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
 
 
+# comments: objective at the point, and f*
 @pytest.mark.parametrize(
     ("qp", "s"),
     [
@@ -465,7 +466,7 @@ def test_a_cancelling_objective_is_accurate_relative_to_its_terms():
     assert error == pytest.approx(1e-9, rel=3)
     further = at([1 + 4e-9, 1], [-1 - 4e-9], z_box=[0, 0.5])
     residuals = kkt_residuals(qp, further)
-    assert residuals.worst > 10 * TOL  # relative to f, so residuals do not decide
+    assert residuals.worst > 10 * TOL  # relative to f; hence the optimum decides
     error = decided(qp, further, residuals, TOL, proves(reference_solution))
     assert error == pytest.approx(4e-9, rel=3)
     assert judge(qp, at([1, 1], [-1], z_box=[0, 0.5])) is Verdict.VERIFIED
@@ -645,7 +646,7 @@ class Attack:
         match rng.integers(0, 7):
             case 0:  # one variable
                 x = x + size * unit * rng.standard_normal() * self.one(x.size)
-            case 1:  # all of them
+            case 1:  # all variables
                 x = x + size * unit * rng.standard_normal(x.size)
             case 2 | 3:  # along the rows that are active, also along free directions
                 x = x + size * self.along_rows(x, unit)

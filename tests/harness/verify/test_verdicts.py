@@ -210,7 +210,7 @@ class SerialComm:
 
 
 def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
-    """Evaluate a point of `QP_`, with the bound ¼ instead of the row."""
+    """Evaluate a point of `QP_`, whose row is replaced by the bound ¼."""
     ranks = Ranks(SerialComm())
 
     def slices(v):

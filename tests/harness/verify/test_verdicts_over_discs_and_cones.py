@@ -36,8 +36,11 @@ TRAPS = (
     "tiny", "wide", "point", "flat", "steep", "no friction", "apex", "degenerate",
     "touching", "singular", "cancelled", "weak", "units",
 )  # fmt: skip
-SMALL, LARGE = 2.0**-27, 2.0**27  #: about 1e∓8, together with discs of size one
-FLAT, STEEP = 2.0**-16, 2.0**16  #: slopes, with which all sums are exact
+SMALL, LARGE = (
+    2.0**-27,
+    2.0**27,
+)  #: radii of about 1e∓8, combined with radii of order one
+FLAT, STEEP = 2.0**-16, 2.0**16  #: slopes for which all sums are exact
 
 
 class ExactProblem:
@@ -299,7 +302,9 @@ def test_residuals_alone_yield_no_wrong_verdict_on_regular_points():
 
 @pytest.mark.parametrize("trap", ["", "tiny", "units"])
 def test_multipliers_of_the_wrong_sign_or_direction_are_refuted(trap):
-    """Test them unchanged, and with another q for which the point is stationary."""
+    """Test the multipliers unchanged, and with another q for which the point is
+    stationary.
+    """
     count = 0
     for seed in range(20):
         planted = ExactProblem({trap}, seed)
@@ -392,7 +397,7 @@ def test_distances_to_normal_cones_are_euclidean():
         (apex, [4, 3, 0], 5),
         (apex, [1, 0, 0], 1),
     ]:
-        # together with a longer block, which is the scale of the apex
+        # together with a longer block, which defines the scale of the apex
         both = Cones([[0, 1, 2], [3, 4, 5]], [0.75, 1])
         x, z = np.append(x, [9, 0, 0]), np.append(np.array(z, float), [0, 0, 0])
         assert both.normal_distances(x, z, 1e-9)[0] == pytest.approx(distance)

@@ -1,4 +1,4 @@
-"""Contact with rigid bodies (gaps, normals, derivatives), and surfaces in space."""
+"""Contact with rigid bodies: gaps, normals, derivatives, three-dimensional surfaces."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ BLOCK = box((0.0, 0.0, 0.0), (1.0, 1.5, 0.5), (2, 3, 1))
 
 
 def closest(body, x):
-    """Return the point on the surface of a rigid body that is closest to x."""
+    """Return the point of the surface of a rigid body that is closest to x."""
     if isinstance(body, RigidPlane):
         n = np.array(body.normal)
         return x - n * ((x - body.point) @ n)

@@ -140,8 +140,9 @@ def test_no_emitted_qp_has_negative_curvature(path):
 
 
 def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
-    """The tangent of compressed blocks is indefinite, because it does not include the
-    contact that prevents rotations."""
+    """The tangent of compressed blocks is indefinite, because it lacks the contact that
+    prevents rotations.
+    """
     clipped = [i.clipped for i in patch_path(stretch=0.6).iterations(1)]
 
     assert clipped[0] == 0
@@ -416,7 +417,7 @@ def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
 @pytest.mark.parametrize(
     ("length", "residual", "settled"),
     [
-        (1.0, 1.9e-9, True),  # 1e-9 is the tolerance, and 1e-9 the rounding
+        (1.0, 1.9e-9, True),  # tolerance 1e-9, and rounding 1e-9
         (1.0, 2.1e-9, False),
         (0.5, 0.0, False),
     ],
@@ -533,7 +534,9 @@ def test_the_qp_of_an_iteration_models_the_potential():
 
 
 def curved(path, size):
-    """Return the path with a contact stiffness `size` at two components, and these."""
+    """Return the path with a contact stiffness `size` at two components, and the
+    components.
+    """
     dofs = np.setdiff1d(np.arange(path.bodies.mesh.dofs), path.bodies.B_D.indices)
 
     def curvature(u, lam):
@@ -550,7 +553,8 @@ def test_contact_stiffness_that_leaves_the_tangent_definite_is_part_of_it():
     plain, _, clipped = path._convex(at, lam, None)
     assert clipped == 0
     unit = path.bodies.force / path.bodies.length  # stiffness 1 in Pa·m
-    # only the last one is indefinite; it is raised to a millionth of its magnitude
+    # for the last size, the tangent would be indefinite; the contact stiffness is then
+    # raised to a millionth of its magnitude
     for size, expected in ((-1e-3, -1e-3), (1.0, 1.0), (-1e9, 1e3)):
         bent, (i, j) = curved(path, size * unit)
         K, _, clipped = bent._convex(at, lam, bent.gaps.curvature)
@@ -653,7 +657,7 @@ def test_the_penalty_exceeds_every_previous_multiplier(monkeypatch):
         return move(self, at, posed, lam, weight, best)
 
     monkeypatch.setattr(newton.NewtonPath, "_line_search", spied)
-    hertz._newton_path.cache_clear()  # another test may have cached it
+    hertz._newton_path.cache_clear()  # another test may have cached the path
     plane_path().iterations(1)
     assert len(seen) >= 3
     largest = np.maximum.accumulate([most for most, _ in seen])

@@ -327,7 +327,9 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
 
 
 def in_space(form="dual", tol=1e-11, **keys):
-    """Return the quantities of a coarse benchmark, in space if `depth` is positive."""
+    """Return the quantities of a coarse benchmark, three-dimensional if `depth` is
+    positive.
+    """
     keys = dict(Nr=2, Nh=2, steps=2) | keys
     params = FAMILY.complete(keys)
     FAMILY.check(params)
@@ -354,7 +356,9 @@ def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
     "cells", [(2, 4), pytest.param((4, 8), marks=pytest.mark.slow)]
 )
 def test_face_mortar_differs_from_the_plane_by_the_square_of_h(cells):
-    """Each face has a single normal, whereas normals in the plane are interpolated."""
+    """Each face has a single normal, whereas normals are interpolated in
+    two dimensions.
+    """
     gaps = []
     for n in cells:
         keys = dict(Nr=n, Nh=n, steps=1, contact="mortar", tol=1e-10)

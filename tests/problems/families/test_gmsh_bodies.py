@@ -93,7 +93,7 @@ def msh41(points, quads, curves, spots):
             tag += 1
             groups += [f'{dimension} {tag} "{name}"'] if name else []
             box = "0 0 0" if dimension == 0 else "0 0 0 1 1 1"
-            of = f"1 {tag}" if name else "0"  # Mesh.SaveAll = 1 also writes these
+            of = f"1 {tag}" if name else "0"  # unnamed: by Mesh.SaveAll = 1
             entities.append(f"{tag} {box} {of}" + (" 0" if dimension else ""))
             blocks.append(f"{dimension} {tag} {kind} {len(cells)}")
             for cell in cells:
@@ -337,7 +337,7 @@ master = "table"
 
 @pytest.fixture
 def sheared_blocks(described):
-    """Two squares of side 2 in a state of constant pressure and shear stress.
+    """Return two squares of side 2 in a state of constant pressure and shear stress.
 
     Poisson's ratio is zero, so that the common side stays straight and every load step
     has the same contact rows. Friction alone supports the upper square horizontally.

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.together
 
 FAMILY = Greco()
 
-#: by cells per side: u_x at 0, 1.25, 5, 7.5, 11.25 mm, normal force at 38.75 mm
+#: cells per side → u_x at 0, 1.25, 5, 7.5, 11.25 mm, and normal force at 38.75 mm
 PROTOTYPE = {
     32: ([2.85944, 2.72168, 2.28500, 1.97963, 1.54056], 1.04823e5),
     128: ([2.86022, 2.72250, 2.28669, 1.98067, 1.54134], 2.62061e4),
@@ -139,7 +139,7 @@ def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
         states.append((side.friction, values))
         u.append(fields.displacement)
     (plane, ground), (space, layers) = points
-    # for each node in space, the node with equal x and y in the plane
+    # for each node of the 3D mesh, the node of the plane mesh with equal x and y
     below = np.array([np.abs(plane - x[:2]).sum(axis=1).argmin() for x in space])
 
     assert abs(u[1][:, :2] - u[0][below]).max() < 1e-8 * abs(u[0]).max()

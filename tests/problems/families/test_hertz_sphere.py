@@ -57,7 +57,9 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
 )
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys, tol):
-    """Without projections at the end of a solve, the error was up to 3.2e-9."""
+    """Without projections at the end of a solve, the error of the balance was up to
+    3.2e-9.
+    """
     *_, found = solved(f"{keys}dual", tol=tol)
 
     assert abs(found["force_error"]) < 1e-9
@@ -67,8 +69,9 @@ def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys
 MOOSE = "against=sphere/R=2/E=1.40625e7/nu=0.25/load=10000"
 
 
-#: a, p₀ and the approach of these spheres, and of two with the default keys: half the
-#: modulus and half the radius of the sphere on a plane, hence the same a and p₀
+#: a, p₀ and the approach of the spheres of MOOSE, and of two spheres with the default
+#: keys. In the latter case, the effective modulus and radius are half of those of the
+#: sphere on a plane, so that a and p₀ are equal to those of that problem
 OF_MOOSE, OF_TWO = (0.1, 15000 / np.pi / 0.01, 0.01), (0.648715, 11.345743, 0.105208)
 
 

@@ -16,13 +16,13 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = PROBLEMS["membranes"]
-#: by (1/H, H/h): torn unknowns, multipliers, contact rows, subdomains
+#: (1/H, H/h) → numbers of torn unknowns, multipliers, contact rows and subdomains
 TABLE = {
     (1, 8): (162, 18, 9, 2), (2, 4): (200, 56, 9, 8), (2, 8): (648, 104, 17, 8),
     (2, 16): (2312, 200, 33, 8), (4, 4): (800, 256, 17, 32),
     (4, 8): (2592, 480, 33, 32), (8, 4): (3200, 1088, 33, 128),
 }  # fmt: skip
-#: products with F for the best settings of PERMON 3.25, at its tolerance 1e-6
+#: number of products with F for the best settings of PERMON 3.25 at tolerance 1e-6
 PERMON = {
     (1, 8): 59, (2, 4): 56, (2, 8): 57, (2, 16): 66, (4, 4): 89,
     (4, 8): 97, (4, 16): 106, (8, 4): 90, (8, 8): 103, (12, 4): 100,

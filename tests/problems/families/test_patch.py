@@ -1,4 +1,4 @@
-"""Contact patch test: exact linear states, and methods that fail the test."""
+"""Contact patch test: exact linear states, and methods that fail this test."""
 
 import numpy as np
 import pytest

@@ -56,8 +56,8 @@ DISC = 'shape = "cylinder", centre = [0, -2], radius = 2'
 
 
 def block(folder, toml):
-    """Write a block of 1 m (in space 0.5 m deep) whose foot is at height zero, and a
-    TOML file; return the path of the TOML file.
+    """Write a block of 1 m (in 3D, 0.5 m deep) whose foot is at height zero, and a TOML
+    file; return the path of the TOML file.
     """
     if toml.count("traction = [0, -"):
         mesh = rectangle((0, 0), (1, 1), (CELLS[0], CELLS[2]))

@@ -128,7 +128,9 @@ def test_bodies_whose_nodes_are_not_numbered_body_by_body_are_refused():
 
 @pytest.fixture(params=["tests/data/press.msh", "suites/crossval/punch.msh"])
 def named(request):
-    """Mesh of several bodies with named sides, of triangles or quadrilaterals."""
+    """Return a mesh of several bodies with named sides, of triangles or
+    quadrilaterals.
+    """
     return read_msh(ROOT / request.param)
 
 

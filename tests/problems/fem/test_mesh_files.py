@@ -233,7 +233,7 @@ def med(tmp_path, change):
 
 
 def test_groups_of_nodes_are_boundaries_and_a_kind_may_have_no_families(tmp_path):
-    """meshio rejects files in which cells of some kind have no families."""
+    """meshio rejects files in which cells of some type have no families."""
 
     def change(file, step):
         del step["MAI/QU4/FAM"]

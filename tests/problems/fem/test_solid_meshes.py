@@ -1,4 +1,6 @@
-"""Meshes in space from gmsh files: cells, orientation, names, rejected files."""
+"""Three-dimensional meshes from gmsh files: cells, orientation, names,
+rejected files.
+"""
 
 import meshio
 import numpy as np
@@ -52,7 +54,7 @@ def write(path, bodies, version="2.2", binary=False):
 
 
 def cut(corners=None, shift=0.0):
-    """Return a cube of one kind of cells, with triangular or quadrilateral faces."""
+    """Return a cube of one type of cell, with triangular or quadrilateral faces."""
     mesh = Mesh(np.add(CUBE.points, [shift, 0, 0]), CUBE.cells, CUBE.boundaries)
     if corners is None:
         return mesh

@@ -64,7 +64,7 @@ PEERS = {
 
 
 def cube(kind, n=3, amplitude=0.05):
-    """Return the unit cube of one kind of cells, smoothly distorted."""
+    """Return the unit cube with cells of one type, smoothly distorted."""
     mesh = bent(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (n, n, n)), amplitude)
     corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
     return mesh if corners is None else divided(mesh, corners)

@@ -301,7 +301,7 @@ def test_subdomains_are_weighted_by_dense_blocks_and_connected_by_rows(
 
 
 def chain(size):
-    """A graph of subdomains in a row."""
+    """Return the graph of subdomains in a row."""
     beside = np.eye(size, k=1, dtype=np.int32)
     return csr_array(beside + beside.T + 5 * np.eye(size, dtype=np.int32))
 
@@ -370,8 +370,9 @@ def test_among_partitions_with_balanced_work_the_best_sizes_are_chosen(
 
 
 def test_weights_of_sizes_are_a_quarter_a_half_and_one(monkeypatch):
-    """One subdomain has 7.94 times the mean size, all others 0.008 times; the work of
-    all is equal."""
+    """One subdomain has 7.94 times the mean size, and all others have 0.008 times the
+    mean size; all have equal work.
+    """
     seen = set()
 
     def answer(graph, weight, ranks, seed=None):

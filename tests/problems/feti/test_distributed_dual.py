@@ -71,7 +71,7 @@ def emitted(ranks, cases):
 
 @pytest.fixture(scope="module")
 def described(tmp_path_factory):
-    """Names of cases of user-defined bodies in parts, by topic."""
+    """Return case names of user-defined bodies in subdomains, by topic."""
     path = press.described(tmp_path_factory.mktemp("press"))
     name = f"bodies:{path}/parts=8"
     return {
@@ -100,7 +100,9 @@ def test_ranks_iterate_coulomb_s_law_for_bodies_held_by_contact(described):
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request, described):
-    """Differences between the distributed QP and the QP of one process, by case."""
+    """Return the differences between distributed QPs and QPs of one
+    process, by case.
+    """
     bodies = described["first"], described["friction"]
     return emitted(request.param, [*CASES, *bodies])
 

@@ -1,4 +1,6 @@
-"""Parts of any mesh are connected by edges, within one body and nearly equal."""
+"""Parts of any mesh are connected by edges, lie within one body and have
+similar sizes.
+"""
 
 import numpy as np
 import pytest

@@ -53,7 +53,7 @@ def torn(
 
 
 def stored(own: LocalSubdomains) -> csr_array:
-    """TᵀK_T T."""
+    """Return the matrix TᵀK_T T."""
     T, domains = own.spread, own.domains
     blocks = [domains.classes[k].K @ T[a:b] for k, a, b in zip(
         domains.class_of, domains.start[:-1], domains.start[1:], strict=True
@@ -73,7 +73,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
     free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
     jumps = own.rows.B @ own.spread[:, free]
-    assert abs(jumps).max() <= 1e-15  # copies are equal
+    assert abs(jumps).max() <= 1e-15  # copies of a node are equal
 
 
 def test_a_floating_body_has_six_orthonormal_motions_without_energy():

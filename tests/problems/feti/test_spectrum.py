@@ -74,7 +74,7 @@ def test_the_error_bounds_hold_and_are_within_the_tolerance(crowded: str) -> Non
     assert abs(found.smallest - 1.0) <= found.smallest_error <= 1e-3
     assert abs(found.largest - 10.0) <= found.largest_error <= 1e-3 * 10.0
     slow = "smallest_error" if crowded == "below" else "largest_error"
-    assert getattr(found, slow) > 1e-8  # the other end converges long before
+    assert getattr(found, slow) > 1e-8  # the other eigenvalue converges long before
     assert abs(found.condition - 10.0) <= 1.001 * found.condition_error
 
 
@@ -225,8 +225,9 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
 def test_errors_of_ritz_values_are_bounded_by_residuals(
     sign: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The residual norm of a Ritz vector is the norm of the next Lanczos vector times
-    the last entry in magnitude."""
+    """The residual norm of a Ritz vector is the last off-diagonal entry times the
+    magnitude of the last coefficient.
+    """
     rng, solve = np.random.default_rng(0), module.eigh_tridiagonal
 
     def turned(*args: Any, **how: Any) -> Any:

@@ -20,7 +20,7 @@ GRIDS = (
 
 @pytest.fixture(scope="module", params=[1, 3, 4, 20])
 def torn(request):
-    """Layout of three grids in blocks, and their torn meshes."""
+    """Return the layout of three grids in blocks, and their torn meshes."""
     mesh, body = join(tuple(grid.mesh() for grid in GRIDS))
     label = structured_bodies([grid.divisions for grid in GRIDS], request.param)
     whole = decompose(mesh.points, mesh.cells, label, body)

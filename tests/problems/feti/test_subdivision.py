@@ -64,7 +64,7 @@ def mesh(most):
     params=[(how, n) for how in (grids, discs, mesh) for n in (1, 3, 20)],
 )
 def known(request):
-    """A subdivision, and the torn undivided mesh."""
+    """Return a subdivision and the torn undivided mesh."""
     how, most = request.param
     return how(most)
 

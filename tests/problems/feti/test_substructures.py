@@ -11,7 +11,7 @@ from tests.support.decomposed_bodies import decomposed_pair
 
 @pytest.fixture(scope="module")
 def parts() -> LocalProblems:
-    """Beam and ring of the benchmark in subdomains."""
+    """Return the local problems of beam and ring of the benchmark in subdomains."""
     return LocalProblems(decomposed_pair(most=8)[2])
 
 

@@ -136,7 +136,9 @@ def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats
 
 @pytest.mark.parametrize("cells", [4, 8, 30])
 def test_the_interval_over_cells_has_its_nominal_coverage(cells):
-    """Of 400 intervals, 20 should miss the truth, and 7 to 33 within three sigma."""
+    """Of 400 intervals, 20 should miss the true value; 7 to 33 are within
+    three sigma.
+    """
     rng = np.random.default_rng(cells)
     missed = sum(
         side(mean_of(rng.normal(0, 0.1, cells), [f"{i}-{n}" for n in range(cells)]))

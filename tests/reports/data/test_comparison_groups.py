@@ -62,7 +62,7 @@ def some_records(record, solvers, cases=6):
     ]
 
 
-# ---- what is compared
+# ---- groups that are compared
 
 
 OVER_CASES = ("means", "ranking", "profiles")
@@ -274,7 +274,7 @@ def test_one_time_limit_makes_a_cell_late(record, evidence):
     assert not np.isnan(found.stopped[2, 2])
 
 
-# ---- what is said
+# ---- tables and sentences
 
 
 def test_a_planted_ratio_is_in_the_table_of_means(record, evidence):
@@ -368,7 +368,7 @@ def test_the_sections_render(record, evidence):
         assert f"## {title}" in text
 
 
-# ---- pictures
+# ---- figures
 
 
 @pytest.mark.parametrize("count", [2, 7, 20, pytest.param(50, marks=pytest.mark.slow)])
@@ -555,7 +555,7 @@ def test_one_refuted_repeat_refutes_the_claim(record, evidence):
     assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
 
 
-# ---- the whole way
+# ---- complete reports
 
 
 def test_hostile_names_are_escaped_and_pages_are_reproducible(

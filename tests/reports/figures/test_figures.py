@@ -59,7 +59,9 @@ def series(figure):
 
 
 def told(figure):
-    """Map every point (solver, x, y) with measurements to their run ids."""
+    """Map every point (solver, x, y) with measurements to the run_ids
+    behind the point.
+    """
     return {
         (one.solver, x, y): runs
         for one in series(figure)

@@ -20,8 +20,8 @@ from mortarbench.reports.figures.style import COLOURS, look
 from mortarbench.reports.render.drawing import draw_curves
 from mortarbench.reports.render.plots import panels
 
-#: colour blindness: matrices on linear RGB of Machado, Oliveira, Fernandes 2009,
-#: severity 1
+#: normal vision and colour blindness as matrices on linear RGB (Machado, Oliveira,
+#: Fernandes 2009, severity 1)
 SIGHTS = {
     "normal": np.eye(3),
     "deuteranopia": np.array([[0.367322, 0.860646, -0.227968],

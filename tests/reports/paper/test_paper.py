@@ -519,7 +519,7 @@ def test_methods_are_interleaved_with_one_row_per_measurement():
     }
     rows = race(entrants, Rounds(most=3))
 
-    assert calls == list("abababab")  # the first two warm up
+    assert calls == list("abababab")  # the first two calls are a warm-up
     assert [(r["method"], r["repeat"]) for r in rows] == [
         (name, k) for k in range(3) for name in "ab"
     ]

@@ -35,10 +35,13 @@ def sized(record, iterations, solver="a", **changes):
 @pytest.mark.parametrize(
     ("iterations", "said"),
     [
-        ([22, 22, 22, 22, 22], "takes 22 iterations, which stay flat"),
-        ([20, 24, 29, 35, 42], "takes 20 to 42 iterations, which grow (+36 % ["),
-        ([42, 35, 29, 24, 20], "takes 20 to 42 iterations, which fall ("),
-        ([19, 22, 22, 22, 22], "which show no clear trend ("),
+        ([22, 22, 22, 22, 22], "takes 22 iterations; their number stays flat"),
+        (
+            [20, 24, 29, 35, 42],
+            "20 to 42 iterations; their number grows (+36 % [",
+        ),
+        ([42, 35, 29, 24, 20], "takes 20 to 42 iterations; their number falls ("),
+        ([19, 22, 22, 22, 22], "their number shows no clear trend ("),
     ],
 )
 def test_the_first_sentence_judges_the_growth_of_iterations(

@@ -301,7 +301,7 @@ def test_a_data_profile_by_hand():
 
 
 def test_a_failure_never_counts_as_solved():
-    """With a finite charge of 1000 s, it would count from τ = 1000/0.1 on."""
+    """With a finite charge of 1000 s, a failure would count from τ = 1000/0.1 on."""
     times = np.array([[0.1, INF]] * 4 + [[0.1, 0.1]])
     ratios = performance_ratios(times)
     anywhere = np.concatenate([np.geomspace(1, 1e300, 50), [np.finfo(float).max]])
@@ -373,7 +373,9 @@ def test_refuted_answers_count_as_unsolved_and_late_ones_as_censored():
     refuted = restricted_mean(times, np.full(5, nan), 10.0).mean.value
     late = restricted_mean(times, np.array([nan, nan, nan, 2, nan]), 10.0).mean.value
     assert refuted == pytest.approx((1 + 1 + 1 + 10 + 5) / 5)
-    assert late == pytest.approx(1 + 4 * 2 / 5)  # the last case takes the late weight
+    assert late == pytest.approx(
+        1 + 4 * 2 / 5
+    )  # the last case gets the weight of late times
 
 
 def test_the_restricted_mean_covers_the_truth_under_early_censoring():
@@ -455,7 +457,9 @@ def test_the_interval_of_growth_is_students_of_two_degrees_of_freedom():
 
     error = np.sqrt(4 * s**2 / 2 / 20)
     assert found.exponent == pytest.approx(0.5)
-    assert found.high == pytest.approx(0.5 + 4.302652730 * error)  # t of 97.5 %
+    assert found.high == pytest.approx(
+        0.5 + 4.302652730 * error
+    )  # 97.5 % quantile of t
     assert found.low == pytest.approx(0.5 - 4.302652730 * error)
     assert found.scatter == pytest.approx(np.sqrt(2) * s)
 

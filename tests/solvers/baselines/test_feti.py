@@ -13,7 +13,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 #: the clamped beam of 2 m × 0.25 m with a point load, in 8 × 1 and 16 × 2 subdomains
 BEAM = dict(width=2.0, height=0.25, load="point")
-#: the plate of MSolve's tests (Papagiannakis 2011), its left subdomains softer
+#: the plate of MSolve's tests (Papagiannakis 2011); the left subdomains are softer
 PLATE = dict(
     Sx=4, Sy=2, n=5, ny=10, width=3.0, height=1.5, plane="stress", load="nodal",
     supports="eliminated", glue="redundant",

@@ -52,8 +52,8 @@ def cycling(request):
 
 
 def dual(seed, n=30, r=3):
-    """Dual of a floating body: F of rank n − 2, λ ≥ 0 for half of the components, Gλ =
-    e.
+    """Draw the dual of a floating body: F of rank n − 2, λ ≥ 0 for half of the
+    components, Gλ = e.
     """
     rng = np.random.default_rng(seed)
     W = rng.standard_normal((n, n - 2))
@@ -85,8 +85,8 @@ def test_separate_variables_settle_after_one_change_each():
 
 
 def test_violated_contact_rows_are_added():
-    """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, the first iterate has no active
-    row, the second one the first row.
+    """For min ½‖x‖² − x₁ − 2x₂ with x₁ ≤ 0.5, x₂ ≤ 3, no row is active in the first
+    iterate, and the first row is active in the second iterate.
     """
     qp = quadratic(np.eye(2), [-1.0, -2], G=np.eye(2), h=[0.5, 3.0])
     s = solve(qp)

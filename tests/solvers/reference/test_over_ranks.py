@@ -32,7 +32,7 @@ class Identity:
 
 
 def balance(q, force, moment):
-    """Three contacts at −1, 0 and 1 support one body: min ½|x|² + qᵀx, x ≥ 0."""
+    """Return min ½|x|² + qᵀx, x ≥ 0, for a body on three contacts at −1, 0 and 1."""
     ranks = Ranks(mpi.COMM_SELF)
     G = csr_array([[1.0, 1.0, 1.0], [-1.0, 0.0, 1.0]])
     vectors = (distributed(np.array(v), ranks) for v in (q, 3 * [0.0], 3 * [np.inf]))

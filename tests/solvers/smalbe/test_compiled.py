@@ -185,7 +185,7 @@ def test_eigenpairs_of_zero_and_nan_matrices_terminate():
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("seed", range(12))
 def test_compiled_steps_agree_with_the_textbook(seed, name, kind):
-    """The kinds of the first 25 steps agree; later steps of long runs differ by
+    """The types of the first 25 steps agree; later steps of long runs differ by
     rounding.
     """
     they_agree(random_qp(seed, kind), replace(SOLVERS[name], max_steps=25))
@@ -363,7 +363,9 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
 
 def disturbed(qp, solution, size, rng):
-    """A point at a small or moderate distance from a solution, within its bounds."""
+    """Return a point at a small or moderate distance from a solution,
+    within its bounds.
+    """
 
     def noise(v):
         return v + size * (1 + np.abs(v)) * rng.standard_normal(v.size)

@@ -96,8 +96,8 @@ def test_components_with_one_gradient_are_released_together():
 
 
 def test_a_smaller_gradient_waits_for_the_larger_one():
-    """The component with gradient 4 is released first, those with 1 and 0.3 after the
-    share has been halved to 0.45.
+    """The component with gradient 4 is released first. The components with gradients 1
+    and 0.3 are released after the share has been halved to 0.45.
     """
     s = solved(box_qp(np.eye(3), [-4, -1, -0.3], 0), 1e-8)
 

@@ -62,8 +62,8 @@ def test_friction_takes_fewer_products_than_published_rules(name):
 def test_compiled_steps_and_textbook_steps_are_the_same(
     name, solver, recycle, steps, monkeypatch
 ):
-    """The first steps agree. Rounding errors change later steps, earlier if directions
-    are stored.
+    """The first steps agree. Rounding errors change later steps, and they do so earlier
+    if directions are stored.
     """
     qp, runs = emitted(name), []
     for compiled in (True, False):

@@ -35,7 +35,9 @@ def primal(name):
 
 
 def half_string(n):
-    """A string over an obstacle that ends in the middle of the string."""
+    """Return the QP of a string over an obstacle that ends in the middle of
+    the string.
+    """
     qp = primal(f"string/n={n}")
     lb = qp.lb.copy()
     lb[n // 2 :] = -np.inf
@@ -162,7 +164,7 @@ def test_the_inverse_is_positive_definite_on_every_face(seed):
             assert np.linalg.eigvalsh(M[np.ix_(free, free)]).min() > 0
 
 
-# --- when it is used ----------------------------------------------------------------
+# --- use of the factor ---------------------------------------------------------------
 
 
 def test_a_sparse_p_with_bounds_has_an_incomplete_factor():
@@ -389,8 +391,8 @@ def test_on_large_families_few_products_are_needed(case, most):
 
 
 def test_the_solver_stops_at_the_requested_residual():
-    """Since steps are cheap, the final residual is not far below the tolerance, at
-    least one twentieth of it.
+    """Since steps are cheap, the final residual is only slightly below the tolerance:
+    at least one twentieth of the tolerance.
     """
     for case in ("journal-bearing/n=50/eccentricity=0.9", "torsion/n=50",
                  "journal-bearing/n=50"):  # fmt: skip

@@ -258,7 +258,10 @@ def test_the_split_gradient_adds_up_and_its_parts_are_admissible():
 
 
 def string():
-    """PERMON's first tutorial: a string of 100 points above a sine-shaped obstacle."""
+    """Return matrix, load and obstacle of the string of PERMON's first tutorial.
+
+    The string has 100 points and lies above a sine-shaped obstacle.
+    """
     n, h = 100, 1 / 99
     A = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     A[[0, -1]], A[:, [0, -1]] = 0, 0
@@ -275,7 +278,9 @@ def string():
 def test_the_rules_of_permon_take_the_steps_of_permon(
     minimise, expansion, iterations, products, cg, expansions, proportionings
 ):
-    """Counters that PERMON 3.25 prints for this problem at rtol = 1e-5."""
+    """The expected numbers are the counters that PERMON 3.25 prints for this problem at
+    rtol = 1e-5.
+    """
     A, b, lower = string()
     norm = power_method(lambda v: A @ v, b.size)
     run, counted = minimise(
@@ -291,7 +296,9 @@ def test_the_rules_of_permon_take_the_steps_of_permon(
 
 @pytest.mark.parametrize("rounds", [30, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_model_step_minimises_the_model_over_the_box(rounds):
-    """KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u: exact after Newton's method."""
+    """After Newton's method, the KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u, hold
+    exactly.
+    """
     rng = np.random.default_rng(271828)
     for k, tau in rounds * ((5, 0.1), (5, 1e-5), (20, 0.01)):
         U = np.linalg.qr(rng.standard_normal((40, k)))[0].T
@@ -329,7 +336,7 @@ def test_the_inverse_in_a_face_inverts_the_block_of_the_model():
 
 
 def test_a_model_is_increased_to_the_curvature_of_a_product():
-    """Afterwards sᵀBs = sᵀHs, and the model is unchanged along U."""
+    """After the increase, sᵀBs = sᵀHs, and the model is unchanged along U."""
     rng = np.random.default_rng(271828)
     U = np.linalg.qr(rng.standard_normal((12, 3)))[0].T
     B = Model(0.5, U, np.array([30.0, 20.0, 10.0]))
@@ -357,7 +364,7 @@ def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
 
 
 def test_an_exact_model_finds_the_minimum_at_once(minimise):
-    """For B = H, the first step ends at the solution."""
+    """For B = H, the first step ends at the minimiser."""
     U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
     B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
     H = np.eye(20) + U.T @ np.diag(B.w) @ U
@@ -511,7 +518,7 @@ def string_and_boxes():
 
 
 def test_there_are_at_most_as_many_steps_beyond_the_box_as_inside(minimise):
-    """There may be one such step if there are no steps inside; hence the products are
+    """One step beyond the box is allowed without steps inside; hence the products are
     at most doubled.
     """
     most, steps = 0, 0
@@ -607,7 +614,7 @@ def test_directions_are_conjugate_and_the_last_ones_are_kept():
 
 
 def test_directions_that_span_the_face_solve_for_another_right_hand_side():
-    """The solve takes no product and ends at a bound if one is in the way."""
+    """The solve takes no product, and it ends at the first bound on its path."""
     a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
     p = np.diag(1 / np.sqrt(a))
     known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))

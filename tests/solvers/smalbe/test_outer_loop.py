@@ -35,7 +35,9 @@ def drawn(seed, n=60, condition=1e3):
 
 @pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
 def outer_loop(request):
-    """Run from x with constants for which the penalty is far too small."""
+    """Return a function that runs the loop from x with a penalty that is
+    far too small.
+    """
 
     def run(problem, x, *, tol, max_steps=20_000, energy=0.0, at=None):
         options = SMALBE(
@@ -57,7 +59,7 @@ def problem_of(qp):
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, seed):
     """Since the estimate never falls below its limit, the solve takes a quarter more
-    products and those of the last inner run.
+    products, plus the products of the last inner run.
     """
     qp = drawn(seed)
     products, found = [], []

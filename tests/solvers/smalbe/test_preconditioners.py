@@ -19,7 +19,7 @@ BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 
 
 def chain(n):
-    """Stiffness of n springs in series, fixed at the left end."""
+    """Return the stiffness of n springs in series, fixed at the left end."""
     K = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     K[-1, -1] = 1
     return K
@@ -27,7 +27,7 @@ def chain(n):
 
 @pytest.fixture
 def gap():
-    """Dual of one body: rows select every third node, F = BK⁻¹Bᵀ."""
+    """Return the dual of one body; rows select every third node, and F = BK⁻¹Bᵀ."""
     K, B = chain(30), np.eye(30)[::3]
     structure = Structure(
         K=csr_array(K), B=csr_array(B), fixed=np.zeros(0, dtype=np.int64)

@@ -28,7 +28,7 @@ SEED = 20210805
 
 @pytest.fixture
 def G():
-    """Nine rows of very different norms with forty unknowns."""
+    """Return nine rows of very different norms with forty unknowns."""
     rng = np.random.default_rng(SEED)
     entries = random_array((9, 40), density=0.2, rng=rng, data_sampler=rng.normal)
     return csr_array(np.logspace(-3, 3, 9)[:, None] * entries.tocsr())
@@ -44,8 +44,9 @@ ALL, THIRD = np.ones(40, dtype=bool), np.arange(40) % 3 == 0
 
 @pytest.fixture(params=["held", "all", "all, refactorised"])
 def pair(G, e, request, monkeypatch):
-    """The rows, sparse and dense. The set of components that may be fixed determines
-    how faces are factorised.
+    """Return the rows in sparse and in dense form.
+
+    The set of components that may be fixed determines how faces are factorised.
     """
     if "refactorised" in request.param:
         monkeypatch.setattr(module, "MAX_BORDER", 0)
@@ -55,7 +56,7 @@ def pair(G, e, request, monkeypatch):
 
 @pytest.fixture
 def face():
-    """A face with every third component fixed."""
+    """Return a face with every third component fixed."""
     return ~THIRD
 
 
@@ -134,7 +135,7 @@ def test_a_model_of_the_penalty_is_the_same_preconditioner(
     assert sparse[np.ix_(face, face)] == pytest.approx(
         inverse[np.ix_(face, face)], abs=1e-9
     )
-    if rho > 1:  # else nothing is preconditioned
+    if rho > 1:  # otherwise, nothing is preconditioned
         assert sparse == pytest.approx(inverse, abs=1e-9)
 
 

@@ -198,7 +198,7 @@ def test_the_gradient_projection_step_is_shorter_than_two_over_the_norm(dual, rh
 
 def test_the_model_uses_the_lanczos_process_and_the_rows(dual):
     """The model is ρ on C, and the Ritz value plus its residual on a Ritz vector.
-    Elsewhere it is far below the norm, because the spectrum decays like 1/k².
+    Elsewhere the model is far below the norm, because the spectrum decays like 1/k².
     """
     rng = np.random.default_rng(271828)
     V = np.linalg.qr(rng.standard_normal((60, 60)))[0]

@@ -38,7 +38,7 @@ def products(name, qp, tol):
 
 
 def ratio(qp, tol):
-    """Return the products of SMALBE divided by those of the better preset."""
+    """Return the number of products of SMALBE divided by that of the better preset."""
     return products("smalbe", qp, tol) / min(products(p, qp, tol) for p in PRESETS)
 
 

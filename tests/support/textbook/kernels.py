@@ -1,6 +1,6 @@
 """The vector operations of an MPRGP step.
 
-Few components of a dual have a bound, so bounds are evaluated for these only.
+Few components of a dual have bounds; bounds are evaluated for these components only.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
 def split(
     x: Vector, g: Vector, lower: Vector, upper: Vector
 ) -> tuple[Mask, Vector, Vector, float, float]:
-    """Split the gradient: free components, φ, β, ‖φ‖², ‖β‖²."""
+    """Return the mask of free components, φ, β, ‖φ‖² and ‖β‖²."""
     free, phi, beta = _parted(x, g, lower, upper)
     phi_square, beta_square = inner_products((phi, phi), (beta, beta))
     return free, phi, beta, phi_square, beta_square

@@ -152,7 +152,7 @@ def minimised(
         first, last, same = inner_products(
             (here.slope, dy), (there.slope, dy), least=_equal(here.piece, there.piece)
         )
-        if same:  # Newton's method is exact there
+        if same:  # Newton's method is exact on one piece
             return y + dy, there
         t, here = _searched(at, y, dy, there, (first, last))
         y = y + t * dy

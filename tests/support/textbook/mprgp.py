@@ -9,13 +9,13 @@ inside) and the projected gradient g^P = φ + β, each step is one of
   is conjugate to all stored `Directions` of the face, not only to the last one
 * b, beyond: conjugate gradients on the face without its bounds, before an expansion
 * e, expansion of the active set by the rule `Expansion`
-* f, fallback: repetition of an expansion with too small a gain, in the safe way
+* f, fallback: safe repetition of an expansion whose gain is too small
 * p, proportioning: free components by the rule `Proportioning`
 
 A proportioning step is taken if  ‖β‖² > Γ² φ̃ᵀφ,  where φ̃ is the reduced free gradient:
 a step of length ᾱ along −φ̃ does not leave the box.
 
-A run also ends if it *stagnates*. This is tested after `FIRST_LOOK` steps, and then
+A run also ends if it *stagnates*. Stagnation is tested after `FIRST_LOOK` steps, then
 each time the number of steps has doubled. A run stagnates if, since the previous test,
 the least ‖g^P‖ was not halved and the decrease of the cost is within the rounding error
 of its terms. Rounding then leaves no descent direction that is conjugate to the
@@ -312,7 +312,7 @@ def mprgp(
 def _minimised_along(
     task: _Task, at: Point, known: Directions | None
 ) -> tuple[Point, Face, Directions]:
-    """Minimise over known directions of this face, as far as the step is feasible.
+    """Minimise over the stored directions of this face, as far as the step is feasible.
 
     If the step reaches a bound, the face changes and the directions are discarded.
     """
@@ -329,7 +329,7 @@ def _minimised_along(
 
 
 def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
-    """Split the gradient into its free and its chopped part."""
+    """Split the gradient into the free and the chopped gradient."""
     return Face(*kernels.split(*at, *bounds))
 
 
@@ -347,7 +347,7 @@ def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
 def _proportion(
     task: _Task, at: Point, face: Face, B: BoxModel, *, by_model: bool
 ) -> Step:
-    """Take a step that frees components, within the opposite bounds."""
+    """Take a step that frees components and respects the opposite bounds."""
     if by_model and task.rules.proportioning == "model":
         return _model_step(task, at, B)
     p = face.beta
