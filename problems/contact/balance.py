@@ -41,7 +41,7 @@ class _BodyMotion(NamedTuple):
     name: str
     centre: Floats  #: (dim,) centre of the nodes, m
     velocity: Floats  #: (dim,) velocity of the centre
-    #: (1,) in the plane, (3,) in space: velocity at distance `size` from the centre due
+    #: (1,) in 2D, (3,) in 3D: velocity at distance `size` from the centre due
     #: to the rotation about each axis; `size` is that of `_motions`
     rotation: Floats
 
@@ -113,7 +113,7 @@ def check_friction(
 
     A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B and
     ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
-    minimises the 1-norm of this residual. In space, circumscribed polygons with
+    minimises the 1-norm of this residual. In 3D, circumscribed polygons with
     `POLYGON` sides replace the discs. A load that exceeds the friction bound by less
     than 2 % may hence pass this check and fail in the solve.
 
@@ -159,7 +159,7 @@ def check_friction(
 def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
     """Return the rows of polygons around discs, as arguments of `linprog`.
 
-    The result is empty in the plane, where bounds on the unknowns suffice.
+    The result is empty in 2D, where bounds on the unknowns suffice.
 
     before, after : numbers of other unknowns before and after those of friction
     """

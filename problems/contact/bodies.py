@@ -32,7 +32,7 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """A pair of sides that may touch: chains of nodes in the plane, faces in space."""
+    """A pair of sides that may touch: chains of nodes in 2D, faces in 3D."""
 
     slave: Nodes
     master: Nodes  #: empty for a rigid master
@@ -57,7 +57,7 @@ class ContactPair(NamedTuple):
 
     @property
     def slave_nodes(self) -> Nodes:
-        """Slave nodes in the order of the chain; in space, ascending."""
+        """Slave nodes in the order of the chain; in 3D, ascending."""
         return self.slave if self.slave.ndim == 1 else np.unique(self.slave)
 
     @property
@@ -75,7 +75,7 @@ class ContactSides:
     names: tuple[str, ...]  #: names of all bodies
     pairs: tuple[ContactPair, ...]
     length: float  #: l, unit of length of the QPs, m
-    force: float  #: F₀, unit of force of the QPs, N/m; N in space
+    force: float  #: F₀, unit of force of the QPs, N/m; N in 3D
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,7 +83,7 @@ class UnassembledBodies:
     """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
 
     Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
-    divided by `length`, forces (in the plane per thickness) by `force`.
+    divided by `length`, forces (in 2D per thickness) by `force`.
 
     Raises
     ------
@@ -96,9 +96,9 @@ class UnassembledBodies:
     body: NDArray[np.int64]  #: (E,) body of each cell
     names: tuple[str, ...]
     materials: tuple[Material, ...]
-    plane: Plane | None  #: None in space
+    plane: Plane | None  #: None in 3D
     length: float  #: l, unit of length, m
-    force: float  #: F₀, unit of force, N/m; N in space
+    force: float  #: F₀, unit of force, N/m; N in 3D
     f: Vector  #: (n,) full load of eq. (1), non-dimensional
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
     pairs: tuple[ContactPair, ...]  #: sides that may touch
@@ -186,9 +186,9 @@ def assemble(
     ----------
     body : (E,) body of each cell
     names, materials : name and material of each body
-    units : (l, F₀), the units of the non-dimensional QPs: m, and N/m or (in space) N
+    units : (l, F₀), the units of the non-dimensional QPs: m, and N/m or (in 3D) N
     fixed : displacement components that are zero
-    load : (n,) nodal forces: N/m in the plane, N in space
+    load : (n,) nodal forces: N/m in 2D, N in 3D
 
     """
     length, force = units

@@ -44,7 +44,7 @@ def linearisation(
 
     The returned function raises InputError at zero displacement if no pair has a row.
 
-    contact : "nts" (node to segment, or node to face in space) or "mortar"; pairs with
+    contact : "nts" (node to segment, or node to face in 3D) or "mortar"; pairs with
         a rigid master have nodal rows
     basis : multiplier basis of mortar contact, "dual" or "standard"
     laws : friction law of each pair; empty without friction

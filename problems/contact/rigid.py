@@ -54,7 +54,7 @@ class RigidPlane:
 
 @dataclass(frozen=True)
 class RigidSphere:
-    """A ball, or a disc in the plane."""
+    """A ball, or a disc in 2D."""
 
     centre: tuple[float, ...]  #: position of the centre, m
     radius: float  #: radius, m
@@ -66,7 +66,7 @@ class RigidSphere:
 
 @dataclass(frozen=True)
 class RigidCylinder:
-    """An infinite circular cylinder in space."""
+    """An infinite circular cylinder in 3D."""
 
     point: tuple[float, ...]  #: a point on the axis, m
     axis: tuple[float, ...]  #: unit vector along the axis

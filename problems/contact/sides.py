@@ -40,12 +40,12 @@ def contact_sides(
 
     The nodal force is the sum of the contact and friction forces on a slave node. The
     pressure is the component of the contact force against the outward normal of the
-    deformed side, divided by the undeformed length ∫N_j (in space, area) that belongs
+    deformed side, divided by the undeformed length ∫N_j (in 3D, area) that belongs
     to the node. The gap is the slack c − Bu of the row of the node; with mortar
     contact, it is the mean gap around the node, weighted as in the row.
 
     With friction, the shear is the friction force along the tangent (−n_y, n_x),
-    divided by the same length; in space, it is the norm of the friction force, divided
+    divided by the same length; in 3D, it is the norm of the friction force, divided
     by the area. A node with a row has one of the `states`; the state of a node without
     a row is the empty string.
     """

@@ -1,6 +1,6 @@
 """Contact sides in the current configuration: facets, normals and nodal areas.
 
-In the plane, facets are the segments of a chain of nodes; in space, faces of cells.
+In 2D, facets are the segments of a chain of nodes; in 3D, faces of cells.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Surface:
     A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
     a face is that of the plane through the midpoints of its edges. The normal of a node
     is the normalised sum of the normals of its facets (the averaged nodal normal of
-    Popp, Gee and Wall 2009, without weights). In the plane, a node at an end of the
+    Popp, Gee and Wall 2009, without weights). In 2D, a node at an end of the
     chain has one facet, any other node has two.
     """
 
@@ -59,7 +59,7 @@ class Surface:
 
     @property
     def areas(self) -> Vector:
-        """Nodal areas ∫N_j (v,), m²; in the plane lengths, m."""
+        """Nodal areas ∫N_j (v,), m²; in 2D lengths, m."""
         if self.x.shape[1] == 2:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]
@@ -134,7 +134,7 @@ def surface(x: Points, name: str) -> Surface:
 
 
 def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
-    """Return the faces (f, 4) and normals of a side in space at positions x (v, 3)."""
+    """Return the faces (f, 4) and normals of a side in 3D at positions x (v, 3)."""
     a, b, c, d = np.moveaxis(x[faces], 1, 0)
     area = np.cross(c - a, d - b)  # twice the area vector, also for triangles (c = d)
     size = np.linalg.norm(area, axis=1, keepdims=True)
@@ -157,8 +157,8 @@ def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
 def tangents(normal: Points) -> Points:
     """Return unit tangents (…, dim − 1, dim) of unit normals (…, dim).
 
-    In the plane, the tangent is the normal rotated anticlockwise by a right angle,
-    (−n_y, n_x). In space, there are two orthogonal tangents, which are −e_x and −e_y
+    In 2D, the tangent is the normal rotated anticlockwise by a right angle,
+    (−n_y, n_x). In 3D, there are two orthogonal tangents, which are −e_x and −e_y
     for the normal e_z (Duff et al., Building an orthonormal basis, revisited, J.
     Comput. Graph. Tech. 6, 2017).
     """

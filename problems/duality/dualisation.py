@@ -6,8 +6,8 @@ to a solution (point and all multipliers) of the primal problem.
 
 Friction with a prescribed bound g adds Σ g‖Tu − s‖ to the objective. The friction rows
 T, s follow the contact rows in B and c, and the friction multipliers λ_t follow those
-of contact in z of the primal solution. They satisfy ‖λ_t‖ ≤ g: bounds in the plane,
-discs in space.
+of contact in z of the primal solution. They satisfy ‖λ_t‖ ≤ g: bounds in 2D,
+discs in 3D.
 """
 
 from __future__ import annotations

@@ -75,9 +75,9 @@ class Shape(Protocol):
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Contact sides by name: chains of nodes in the plane, faces in space.
+        """Contact sides by name: chains of nodes in 2D, faces in 3D.
 
-        In the plane, this property does not generate the mesh.
+        In 2D, this property does not generate the mesh.
         """
 
     def layout(self, size: int) -> Subdivision:
@@ -218,9 +218,9 @@ class ElasticBodies:
     shape: Shape
     names: tuple[str, ...]
     materials: tuple[Material, ...]  #: one per body
-    plane: Plane | None  #: None in space
+    plane: Plane | None  #: None in 3D
     length: float  #: l, m: unit of length of the QPs
-    force: float  #: F₀, N/m in the plane, N in space: unit of force of the QPs
+    force: float  #: F₀, N/m in 2D, N in 3D: unit of force of the QPs
     fixed: Nodes  #: components with u = 0
     forces: Forces  #: full load
     pairs: tuple[ContactPair, ...]

@@ -28,7 +28,8 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_NODES = 50_000_000  #: limit due to the 32-bit indices of the entries of K
+#: largest number of nodes, due to 32-bit indices of the entries of K
+MAX_NODES = 50_000_000
 
 
 class BeamRing(ContactFamily):
@@ -85,7 +86,7 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; raise InputError if friction is set.
+        """Return the keys of the case with half the mesh size; reject friction.
 
         The load steps of the refined case are solved on the refined mesh. Friction is
         not supported, because refinement changes the polygons of the arcs.

@@ -72,7 +72,7 @@ class HalfSpace(DeclaredFamily):
         if needed > limit:
             raise InputError(
                 f"{self.name}: a grid of {p['n']} × {p['n']} cells takes {needed:.2g} "
-                f"MiB of memory; expected one that fits into {limit:.0f} MiB, or "
+                f"MiB of memory; expected a grid that fits into {limit:.0f} MiB, or "
                 f"{CASE_VARIABLE} set to the memory available"
             )
 
@@ -93,7 +93,7 @@ class HalfSpace(DeclaredFamily):
         if law == "rough" and p["n"] < MIN_ROUGH:
             raise InputError(
                 f"{self.name}: n={p['n']} must be at least {MIN_ROUGH} for law=rough, "
-                "two cells per shortest wave"
+                "two cells per shortest wavelength"
             )
         coulomb = law == "mindlin" or friction == "coulomb"
         users = {

@@ -112,6 +112,6 @@ class HertzCylinder(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; reject cases with friction."""
+        """Return the keys of the case with half the mesh size; reject friction."""
         refuse_friction(self.name, params)
         return super().refined(params)

@@ -60,7 +60,7 @@ class HertzSphere(ContactFamily):
         if params["Q"] and params["against"] == "plane":
             raise InputError(
                 f"{self.name}: Q={params['Q']} with against=plane; expected "
-                "against=sphere, where the exact solution is known"
+                "against=sphere, for which the exact solution is known"
             )
         if params["mu"] != self.defaults["mu"] and not params["Q"]:
             raise InputError(

@@ -82,7 +82,7 @@ class ContactPatch(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; raise InputError for Coulomb's law.
+        """Return the keys of the case with half the mesh size; reject Coulomb's law.
 
         A block has ⌈n/2⌉ rows of cells. If n is odd, this number does not double
         exactly.

@@ -10,7 +10,7 @@ barycentric coordinates,
 so that the bilinear element *is* the linear triangle (P1). The 2×2 Gauss rule
 integrates its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
 
-Meshes in space consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
+Meshes in 3D consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
 are stored as hexahedra, which are degenerate in the same way: a tetrahedron is
 (a, b, c, c, d, d, d, d), a wedge (a, b, c, c, d, e, f, f). The stiffness of such a cell
 is that of the tetrahedral or wedge element.
@@ -40,8 +40,8 @@ REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]
 class Mesh:
     """Nodes, cells and named boundaries; lengths in m.
 
-    In the plane, a boundary is a chain of nodes with the body on its left: with the
-    unit tangent t, the outward normal is (t_y, −t_x). In space, a boundary is an array
+    In 2D, a boundary is a chain of nodes with the body on its left: with the
+    unit tangent t, the outward normal is (t_y, −t_x). In 3D, a boundary is an array
     (k, 4) of faces whose corners are anticlockwise as seen from outside; triangular
     faces repeat their last corner.
 
@@ -51,7 +51,7 @@ class Mesh:
     """
 
     points: NDArray[np.float64]  #: (N, dim)
-    #: (E, c) nodes of each cell, counter-clockwise in the plane; in mixed meshes, cells
+    #: (E, c) nodes of each cell, counter-clockwise in 2D; in mixed meshes, cells
     #: with fewer corners repeat nodes
     cells: Nodes
     boundaries: Mapping[str, Nodes]  #: chains or faces by name

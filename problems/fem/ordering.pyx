@@ -188,7 +188,7 @@ cdef void coordinates(
 cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
     """Write the eigenvector for the largest eigenvalue of C (upper triangle) to `axis`.
 
-    In space, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
+    In 3D, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
     entries due to rounding are not eliminated, so that a cube is bisected across its
     edges.
     """

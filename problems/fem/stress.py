@@ -105,7 +105,7 @@ def von_mises(
 ) -> Vector:
     """Return the von Mises stress (…) of stresses in Voigt's notation.
 
-    Stresses are (…, 3) in the plane, and (…, 6) if `plane` is None.
+    Stresses are (…, 3) in 2D, and (…, 6) if `plane` is None.
 
     In plane strain, σ_z = ν(σ_x + σ_y).
     """

@@ -118,7 +118,7 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
 
 
 def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Label the cells of a structured mesh in space by blocks of compact shape.
+    """Label the cells of a structured mesh in 3D by blocks of compact shape.
 
     Let hₐ be the mean edge length of a block along direction a. The block may have
     most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut

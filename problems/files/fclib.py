@@ -52,7 +52,7 @@ Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """Contact problem, with the solution if the file contains one."""
+    """Contact problem of an FCLIB file, with its solution if the file contains one."""
 
     contact: FrictionalContact
     is_local: bool

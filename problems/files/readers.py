@@ -118,7 +118,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
             raise InputError(f"{name} has shape {got}, expected {right}")
     for name, size in (("n", n), ("m", m)):
         if name in arrays and vector(arrays, name).tolist() != [size]:
-            raise InputError(f"{name} is not {size}, the size of the other variables")
+            raise InputError(f"{name} contradicts the other variables; expected {size}")
     bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
     rows = m - n if bounded else m
     return TwoSidedQP(

@@ -11,7 +11,7 @@ are the tangential displacements of five points of the contact side, ±5 %, and 
 normal force at x = 38.75 mm for 32 cells per side (GRECO working group on friction; see
 document V6.04.128 of Code_Aster).
 
-In space (dim=3) the square is extruded along z into layers of cubes. The end faces have
+In 3D (dim=3) the square is extruded along z into layers of cubes. The end faces have
 u_z = 0; the solution in every layer of nodes is therefore that of plane strain.
 """
 
@@ -67,8 +67,8 @@ class Plate(NamedTuple):
     left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths (areas)
     right: Nodes  #: nodes of x = 40 mm
     corner: Nodes  #: nodes of x = 40 mm, y = 0
-    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in the plane
-    thickness: float  #: thickness, m; 1 in the plane
+    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in 2D
+    thickness: float  #: thickness, m; 1 in 2D
 
 
 def plate(n: int) -> Plate:
@@ -112,7 +112,7 @@ def extruded_plate(n: int, depth: int) -> Plate:
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the problem of the plate with n × n cells, or n × n × depth in space."""
+    """Return the problem of the plate with n × n cells, or n × n × depth in 3D."""
     p: Any = params
     dim, n = p["dim"], p["n"]
     body = plate(n) if dim == 2 else extruded_plate(n, p["depth"])
@@ -162,7 +162,7 @@ def published_quantities(
 ) -> dict[str, Any]:
     """Return the published quantities, interpolated linearly between nodes.
 
-    In space, displacements are means over z, and forces are sums over z divided by the
+    In 3D, displacements are means over z, and forces are sums over z divided by the
     thickness. The keys are `displacement`, u_x at `PLACES` in m; `published_error`, the
     largest relative deviation from the published values; `normal_force`, the nodal
     force at 38.75 mm in N/m; and `tangential_sum`, the magnitude of the total friction

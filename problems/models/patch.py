@@ -14,7 +14,7 @@ not vanish with the mesh size. Friction has no effect if the blocks are of the s
 material. The upper block is supported by contact alone; hence the form
 ``dual-bounds`` does not exist.
 
-In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
+In 3D (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
 −p. Hexahedra represent linear displacements exactly even if they are distorted (key
 `distort`).
 
@@ -90,7 +90,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     D = elasticity_matrices(elastic.materials, elastic.plane)
 
     def error(answer: ContactSolution) -> dict[str, Any]:
-        """Return the largest |σ_y + p|/p (in space |σ_z + p|/p) at Gauss points."""
+        """Return the largest |σ_y + p|/p (in 3D |σ_z + p|/p) at Gauss points."""
         largest = 0.0
         for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)

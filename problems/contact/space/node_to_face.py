@@ -1,6 +1,6 @@
-"""Node-to-face non-penetration in space, linearised at a given displacement.
+"""Node-to-face non-penetration in 3D, linearised at a given displacement.
 
-Each slave node stays on the outer side of the master, as in the plane
+Each slave node stays on the outer side of the master, as in 2D
 (`problems.contact.node_to_segment`). With the closest point x_c = Σ N_a x_a on the
 master faces and the outward normal n at x_c, the condition is B u ≤ c with
 B = [−n at s, +N_a n at a] and c = g + B u^k.

@@ -1,4 +1,4 @@
-"""Faces of contact sides in space, divided into triangles.
+"""Faces of contact sides in 3D, divided into triangles.
 
 A quadrilateral face is divided into four triangles about the mean of its corners. Its
 shape functions are linear on each triangle and ¼ at the centre. Thus the surface is
@@ -27,7 +27,7 @@ _TRIANGLE = _CORNERS[:3]
 
 
 class FaceTriangles(NamedTuple):
-    """Triangles of the faces of a contact side in space."""
+    """Triangles of the faces of a contact side in 3D."""
 
     surface: Surface
     centre: Points  #: (f, 3) means of the corners of each face, m

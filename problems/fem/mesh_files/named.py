@@ -91,15 +91,15 @@ class FileMesh(NamedTuple):
 
 
 class NamedMesh(NamedTuple):
-    """A mesh with named bodies and boundaries, in the plane or in space."""
+    """A mesh with named bodies and boundaries, in 2D or 3D."""
 
     points: NDArray[np.float64]  #: (N, dim)
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in space)
-    #: edges (k, 2) of each named curve, with the body on their left; in space, faces
+    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in 3D)
+    #: edges (k, 2) of each named curve, with the body on their left; in 3D, faces
     #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
-    #: nodes of each named point or set of nodes and, in space, of each named curve
+    #: nodes of each named point or set of nodes and, in 3D, of each named curve
     spots: Mapping[str, Nodes]
     words: Words = Words()
 
