@@ -41,8 +41,8 @@ class _BodyMotion(NamedTuple):
     name: str
     centre: Floats  #: (dim,) centre of the nodes, m
     velocity: Floats  #: (dim,) velocity of the centre
-    #: (1,) in 2D, (3,) in 3D: velocity at distance `size` from the centre due
-    #: to the rotation about each axis; `size` is that of `_motions`
+    #: (1,) in 2D, (3,) in 3D: velocity due to the rotation about each axis, at the
+    #: distance `size` from the centre; for `size`, see `_motions`
     rotation: Floats
 
 
@@ -75,7 +75,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     load, closing = R.T @ bodies.f, csr_array(B) @ R
     threshold = MAX_IMBALANCE * np.abs(bodies.f).sum()
     modes, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
-    # translations along an axis come first, because their message is simpler
+    # test translations along an axis first, because their message is simpler
     sliding = [
         (b, axis)
         for b in range(len(bodies.names))
@@ -109,13 +109,13 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Check that supports, contacts and friction within bounds can balance the load.
+    """Check that supports, contact and bounded friction can balance the load.
 
-    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B and
-    ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
-    minimises the 1-norm of this residual. In 3D, circumscribed polygons with
-    `POLYGON` sides replace the discs. A load that exceeds the friction bound by less
-    than 2 % may hence pass this check and fail in the solve.
+    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B, and
+    forces λ_t of the friction rows T with ‖λ_t‖ ≤ g, such that  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) =
+    0.  A linear program minimises the 1-norm of this residual. In 3D, circumscribed
+    polygons with `POLYGON` sides replace the discs. Hence, a load that exceeds the
+    friction bound by less than 2 % may pass this check, although the solve then fails.
 
     step : number of the load step
     share : load factor of this step

@@ -92,7 +92,7 @@ class FrictionalContact:
             object.__setattr__(self, "A", no_rows(self.q.size))
 
     def check_convex(self) -> None:
-        """Raise InputError if W has a negative eigenvalue not due to rounding."""
+        """Raise InputError if W has a negative eigenvalue beyond rounding errors."""
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
@@ -103,7 +103,10 @@ class FrictionalContact:
 
     @cached_property
     def _eigenvalues(self) -> Vector:
-        """Eigenvalues of W, ascending; only the largest above `MAX_DENSE_ROWS`."""
+        """Eigenvalues of W, ascending.
+
+        If W has more than `MAX_DENSE_ROWS` rows, only the largest eigenvalue.
+        """
         if self.q.size <= MAX_DENSE_ROWS:
             return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
         return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
@@ -139,9 +142,10 @@ class FrictionalContact:
     def natural_map(
         self, r: Vector, multipliers: Vector, omega: float | None = None
     ) -> float:
-        """Evaluate  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖,  zero at solutions.
+        """Return the scaled natural map, which is zero at solutions.
 
-        Π is the projector onto the friction cones.
+        The result is  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖  with the projector Π onto
+        the friction cones.
 
         Parameters
         ----------
@@ -214,7 +218,8 @@ def coulomb_steps(
     Parameters
     ----------
     loop : name of the sequence, one of `LOOPS`
-    solve : solves a convex problem; raises ArithmeticError if it has no solution
+    solve : function that solves a convex problem and raises ArithmeticError if the
+        problem has no solution
     count : largest number of problems; with 0, the sequence ends at convergence
 
     Raises

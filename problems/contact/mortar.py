@@ -75,8 +75,8 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-#: integration segments shorter than this, in ξ, are due to rounding of the projection
-#: and are dropped
+#: integration segments whose length in ξ is below this value are due to rounding of the
+#: projection and are dropped
 MIN_SEGMENT = 1e-8
 #: averaged normals of a straight side differ by at most this value. Smaller components
 #: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single
@@ -259,7 +259,8 @@ def cast_rays(
     beta = np.clip(f_A / (f_A - f_B), 0.0, 1.0)
     gap = np.einsum("pgx,pgx->pg", A + beta[..., None] * (B - A) - x, n)
 
-    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])  # at the middle point
+    # normals at the middle Gauss point
+    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])
     near = (cosine <= reach.cosine) & (
         np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )

@@ -60,7 +60,8 @@ class ContactRows(NamedTuple):
     c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
-    #: (m_I,) length ∫N_j of the slave side assigned to the row, m; area in 3D, m²
+    #: (m_I,) ∫N_j over the slave side, the length in m (2D) or the area in m² (3D) that
+    #: is assigned to the row
     share: Vector
     place: Nodes  #: (m_I,) index of the slave node of each row in the slave chain
 

@@ -34,7 +34,7 @@ class BulkResults(NamedTuple):
     nodes: int
     elements: int
     supports: int  #: number of prescribed components
-    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m; J in 3D
+    energy: float  #: ½uᵀKu − fᵀu of eq. (1): J/m in 2D, J in 3D
     #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
     max_von_mises: Sequence[float]
 

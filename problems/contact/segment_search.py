@@ -66,7 +66,7 @@ class Chords(NamedTuple):
 
     start: Points  #: (k, 2) position of the first node, m
     edge: Points  #: (k, 2) vector from the first to the last node, m
-    inverse: Vector  #: (k,) 1/|edge|², 0 where a sub-chain closes on itself
+    inverse: Vector  #: (k,) 1/|edge|², 0 if the ends of a sub-chain coincide
     deviation: Vector  #: (k,) δ, m
 
 

@@ -151,7 +151,7 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Return, for each pair, the slice of its rows in B (m, n)."""
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
-    # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
+    # (m, N) nodes of each row, and for each pair a mask of the rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
     slices, first = [], 0
     for pair in bodies.pairs:

@@ -1,6 +1,7 @@
 """Contact sides in the current configuration: facets, normals and nodal areas.
 
-In 2D, facets are the segments of a chain of nodes; in 3D, faces of cells.
+In 2D, facets are the segments of a chain of nodes; in 3D, facets are the faces of
+cells.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
 )
 
-Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
+Points = NDArray[np.float64]  #: (…, dim) positions in m, or dimensionless vectors
 
-#: segments shorter than this times the longest one of their chain count as points,
-#: because their direction is dominated by rounding
+#: segments shorter than this fraction of the longest segment of their chain count as
+#: points, because their direction is dominated by rounding
 MIN_RELATIVE_LENGTH = 1e-12
 
 
@@ -59,7 +60,7 @@ class Surface:
 
     @property
     def areas(self) -> Vector:
-        """Nodal areas ∫N_j (v,), m²; in 2D lengths, m."""
+        """Nodal ∫N_j (v,): lengths in m (2D), or areas in m² (3D)."""
         if self.x.shape[1] == 2:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]

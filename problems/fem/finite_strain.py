@@ -197,8 +197,9 @@ def convex_tangent(
     Parameters
     ----------
     tangents : tangents of the cells, see `EnergyDerivatives`
-    positive : returns True if K_t (n, n) is positive definite on the motions that the
-        supports allow, as tested by a Cholesky factorisation
+    positive : function that returns True if K_t (n, n) is positive definite on the
+        motions
+        that the supports allow, as tested by a Cholesky factorisation
 
     Returns
     -------

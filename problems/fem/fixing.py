@@ -84,7 +84,8 @@ def _graph(cells: Nodes, nodes: int) -> csr_array:
 def _bisected(graph: Matrix, group: Nodes) -> tuple[Nodes, Nodes]:
     part = laplacian(graph[group][:, group]).tocsc()
     shift = -1e-3 / group.size  # σ just below the zero eigenvalue: L − σI is definite
-    start = np.linspace(-1, 1, group.size)  # the default of eigsh is random
+    # fixed start, because the default of eigsh is random
+    start = np.linspace(-1, 1, group.size)
     values, vectors = eigsh(part, k=2, sigma=shift, which="LM", v0=start)
     order = group[np.argsort(vectors[:, values.argmax()], kind="stable")]
     return order[: len(order) // 2], order[len(order) // 2 :]

@@ -40,9 +40,9 @@ _CURVATURE_OF_J = np.einsum("ik,jl->ijkl", [[0, 1], [-1, 0]], [[0, 1], [-1, 0]])
 class Derivatives(NamedTuple):
     """Values and derivatives of a scalar function of F, at points (…)."""
 
-    value: Floats  #: (…)
-    first: Floats  #: (…, 2, 2)
-    second: Floats  #: (…, 2, 2, 2, 2)
+    value: Floats  #: (…) values
+    first: Floats  #: (…, 2, 2) first derivatives
+    second: Floats  #: (…, 2, 2, 2, 2) second derivatives
 
 
 @dataclass(frozen=True)

@@ -159,8 +159,8 @@ def floating_inverse(
     K : (n, n) block diagonal matrix with one block per body
     kernels : for each body, an orthonormal basis (n_body, r_body) of its rigid modes
     fixing : for each body, the components of its fixing nodes, numbered within the
-        body; no rigid mode may vanish on them, which requires at least two nodes in the
-        plane and three in 3D
+        body; no rigid mode may vanish on them, which requires at least two nodes in 2D
+        and three in 3D
     interface : components c for (K⁺)_cc; None to solve once per row of B instead
 
     """

@@ -50,7 +50,7 @@ class Mesh:
     (6, 2, [0, 1, 2])
     """
 
-    points: NDArray[np.float64]  #: (N, dim)
+    points: NDArray[np.float64]  #: (N, dim) positions of the nodes
     #: (E, c) nodes of each cell, counter-clockwise in 2D; in mixed meshes, cells
     #: with fewer corners repeat nodes
     cells: Nodes

@@ -76,7 +76,8 @@ from mortarbench.problems.feti.subdomain_classes import (
 )
 
 MAX_EXPLICIT_MIB = 2048  #: memory for all explicit blocks of an operator
-STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
+#: number of columns per product when an implicit block is evaluated
+STRIP_COLUMNS = 256
 #: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
 #: singular where contact rows are linearly dependent
 CONTACT_SHIFT = 1e-8

@@ -472,9 +472,9 @@ class DecomposedBodies:
 
     classes: tuple[SubdomainClass, ...]
     class_of: NDArray[np.int64]  #: (S,) class of each subdomain
-    spread: csr_array  #: T (N, n)
-    B: csr_array  #: (m, N), scaled
-    c: Vector  #: (m,), scaled
+    spread: csr_array  #: T (N, n), maps displacements to torn unknowns
+    B: csr_array  #: (m, N) constraint rows, scaled
+    c: Vector  #: (m,) right-hand side, scaled
     scale: Vector  #: positive factors of the contact rows
     f: Vector  #: (N,) torn load; Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first

@@ -90,7 +90,7 @@ GLUE: Mapping[str, Weights] = MappingProxyType(
 class Contact(NamedTuple):
     """Global contact rows followed by friction rows, replicated on every rank."""
 
-    rows: csr_array  #: (m_I, n) in components of the undivided bodies
+    rows: csr_array  #: (m_I, n) rows in components of the undivided bodies
     c: Vector  #: (m_I,) right-hand side
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
@@ -114,16 +114,16 @@ class DecomposedProblem:
     layout: Subdivision  #: the S subdomains
     components: int  #: number of components per node; 1 for a scalar field
     material: Integers  #: (S,) material of each subdomain
-    #: assembles the class of a floating subdomain
+    #: function that assembles the class of a floating subdomain
     assemble_class: Callable[[SubdomainMesh], SubdomainClass]
     E: Vector  #: (bodies,) moduli for the scaling of rows
     names: tuple[str, ...]  #: names of the bodies
-    #: maps numbers of subdomains to a function that evaluates the factors of E at their
-    #: torn nodes, see `problems.feti.structured.Layout.shaping`; None if all factors
-    #: are 1
+    #: map from numbers of subdomains to a function that evaluates the factors of E at
+    #: their torn nodes, see `problems.feti.structured.Layout.shaping`; None if all
+    #: factors are 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
-    load: Callable[[Nodes], Vector]  #: maps global components (k,) to forces (k,)
-    fixed: Nodes  #: global components that are zero, in the order of their rows
+    load: Callable[[Nodes], Vector]  #: map from global components (k,) to forces (k,)
+    fixed: Nodes  #: global components prescribed as zero, in the order of their rows
     #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
     #: of adding rows to B. Subdomains with supports then do not float and keep the
     #: global axes
@@ -364,7 +364,8 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # looser than in `classify`
+            # a looser tolerance than in `classify`
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         candidates = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -540,7 +541,7 @@ class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
 
     number: Nodes  #: (t,) global numbers, ascending
-    B: csr_array  #: (t, N_p) in local torn unknowns
+    B: csr_array  #: (t, N_p) rows in local torn unknowns
     #: (t,) for a row of a tangential vector, the number of the first row of this
     #: vector; for any other row, its own number. All rows of a vector have the same
     #: owner

@@ -237,7 +237,7 @@ def congruent(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Find the images of the first of g point sets under rigid motions.
 
-    points : (g, n, dim)
+    points : (g, n, dim) point sets
 
     Returns
     -------

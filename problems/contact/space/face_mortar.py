@@ -3,7 +3,8 @@
 Sources: Puso and Laursen, "A mortar segment-to-segment contact method for large
 deformation solid mechanics", Comput. Methods Appl. Mech. Engrg. 193 (2004) 601-629, for
 the auxiliary plane; Popp, Gitterle, Gee and Wall, Int. J. Numer. Meth. Engng 83 (2010)
-1428-1465, for the dual basis. In 2D see `problems.contact.mortar`.
+1428-1465, for the dual basis. The two-dimensional method is in
+`problems.contact.mortar`.
 
 *Triangles.* A quadrilateral face is divided into four triangles about the mean of its
 corners. Its shape functions N_k are linear on each triangle and ¼ at the centre. (With

@@ -70,8 +70,9 @@ def read_msh_sets(path: Path) -> FileMesh:
                     name, [np.zeros(0, dtype=np.int64) for _ in blocks]
                 )
                 rows[k] = np.flatnonzero(tag == number)
-    # cells with tag 0 beside named groups: the file was saved with Mesh.SaveAll = 1;
-    # otherwise gmsh omits entities without a physical group if any group exists
+    # in a file with named groups, cells with tag 0 show that the file was saved with
+    # Mesh.SaveAll = 1; without this option, gmsh omits entities without a physical
+    # group if any group exists
     is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
     more = f"; or, if they belong to no body, save {_SAVED}" if is_all else ""
     return FileMesh(

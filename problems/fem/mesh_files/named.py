@@ -36,15 +36,15 @@ class Words(NamedTuple):
     body: str = "body"
     boundary: str = "boundary"
     point: str = "point"
-    naming: str = "a name for every body"  #: how to name a body
-    linear: str = "linear cells"  #: how to obtain cells of first order
+    naming: str = "a name for every body"  #: instruction for naming a body
+    linear: str = "linear cells"  #: instruction for obtaining cells of first order
 
 
 class FileMesh(NamedTuple):
     """Content of a mesh file: cells of any dimension, and sets of cells and nodes."""
 
     path: Path
-    points: NDArray[np.float64]  #: (N, 2) or (N, 3)
+    points: NDArray[np.float64]  #: (N, 2) or (N, 3) positions of the nodes
     #: cells by kind, with meshio's names; node numbers start at 0
     blocks: Sequence[tuple[str, NDArray[Any]]]
     #: sets of cells by dimension and name; for each block, a set lists the rows of its
@@ -93,7 +93,7 @@ class FileMesh(NamedTuple):
 class NamedMesh(NamedTuple):
     """A mesh with named bodies and boundaries, in 2D or 3D."""
 
-    points: NDArray[np.float64]  #: (N, dim)
+    points: NDArray[np.float64]  #: (N, dim) positions of the nodes
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
     surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in 3D)
     #: edges (k, 2) of each named curve, with the body on their left; in 3D, faces
