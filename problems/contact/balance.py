@@ -112,10 +112,11 @@ def check_friction(
     """Check that supports, contact and bounded friction can balance the load.
 
     A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B, and
-    forces λ_t of the friction rows T with ‖λ_t‖ ≤ g, such that  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) =
-    0.  A linear program minimises the 1-norm of this residual. In 3D, circumscribed
-    polygons with `POLYGON` sides replace the discs. Hence, a load that exceeds the
-    friction bound by less than 2 % may pass this check, although the solve then fails.
+    forces λ_t of the friction rows T with ‖λ_t‖ ≤ g, such that the residual  Zᵀ(f −
+    Bᵀλ_n − Tᵀλ_t)  is zero. A linear program minimises the 1-norm of this residual. In
+    3D, circumscribed polygons with `POLYGON` sides replace the discs. Hence, a load
+    that exceeds the friction bound by less than 2 % may pass this check, although the
+    solve then fails.
 
     step : number of the load step
     share : load factor of this step

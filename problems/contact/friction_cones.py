@@ -75,8 +75,9 @@ class FrictionalContact:
     W: Any  #: (n, n) sparse, stored as its symmetric part
     q: Vector  #: (n,) velocity in the absence of contact forces
     mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
-    A: Any = None  #: (p, n) = Vᵀ
-    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,) right-hand side
+    A: Any = None  #: (p, n) matrix Vᵀ of the equations
+    #: (p,) right-hand side b of the equations
+    b: Vector = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         """Symmetrise W up to rounding."""

@@ -26,7 +26,8 @@ from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
 from mortarbench.problems.fem.mesh import Nodes
 
-#: functions that implement the methods "nts" and "mortar", by dimension
+#: mapping from the dimension to the functions that implement the methods "nts" and
+#: "mortar"
 METHODS: Mapping[int, tuple[Callable[..., ContactRows], Callable[..., ContactRows]]] = {
     2: (node_to_segment, mortar),
     3: (node_to_face, face_mortar),

@@ -18,13 +18,13 @@ node j
 
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
 −Φ_j ν on the master at x(ξ) + g n, along the same line. Up to rounding, the forces of a
-row are hence in equilibrium and have no moment, even on curved sides. (With n_j outside
-the integrals, the moments would be O(h²). A body supported by contact alone would then
-rotate until a row far from the contact, at the end of an arc, balances the moments of
-the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
-In return, the integrands of D are polynomials, which the Gauss rule integrates exactly:
-D is independent of the position of the master's nodes, and a row of the dual basis acts
-on the slave along n_j.
+row are therefore in equilibrium and have no moment, even on curved sides. (With n_j
+outside the integrals, the moments would be O(h²). A body supported by contact alone
+would then rotate until a row far from the contact, at the end of an arc, balances the
+moments of the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1
+− O(h²). In return, the integrands of D are polynomials, which the Gauss rule integrates
+exactly: D is independent of the position of the master's nodes, and a row of the dual
+basis acts on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -259,7 +259,7 @@ def cast_rays(
     beta = np.clip(f_A / (f_A - f_B), 0.0, 1.0)
     gap = np.einsum("pgx,pgx->pg", A + beta[..., None] * (B - A) - x, n)
 
-    # normals at the middle Gauss point
+    # cosine of the angle at the middle Gauss point
     cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])
     near = (cosine <= reach.cosine) & (
         np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)

@@ -67,7 +67,7 @@ class Chords(NamedTuple):
     start: Points  #: (k, 2) position of the first node, m
     edge: Points  #: (k, 2) vector from the first to the last node, m
     inverse: Vector  #: (k,) 1/|edge|², 0 if the ends of a sub-chain coincide
-    deviation: Vector  #: (k,) δ, m
+    deviation: Vector  #: (k,) deviation δ, m
 
 
 #: maps a level and pairs of a query (p,) and a sub-chain (p,) to a mask of the pairs

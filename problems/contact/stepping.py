@@ -84,7 +84,7 @@ class Stage:
     forces: Forces  #: full load
     fixed: Nodes  #: components fixed by supports
     laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction
-    #: map from the end of the preceding stage to the initial state of this one
+    #: map from the final state of the preceding stage to the initial state of this one
     begin: Callable[[State], State] = continue_slip
 
 
@@ -100,8 +100,7 @@ def load_steps(
     """Return the stages of a load that grows in equal steps, `relin` stages per step.
 
     quasi_static : True to measure slip from the end of the preceding load step, False
-        to
-        measure slip from the undeformed state
+        to measure slip from the undeformed state
     """
     return tuple(
         Stage(

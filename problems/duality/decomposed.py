@@ -243,7 +243,7 @@ class LinearisedSides:
     nodes: int  #: number of nodes of the bodies
     B: csr_array  #: (m, dim·N) contact rows B u ≤ c in local components
     c: Vector  #: (m,) right-hand side
-    friction: Friction  #: without rows if there is no friction
+    friction: Friction  #: friction rows; empty without friction
     place: Nodes  #: (m,) slave node of each row
 
     @property
@@ -398,8 +398,9 @@ def elastic_class(
     )
 
 
-BATCH_NODES = 2**15  #: nodes per batch of subdomains; limits the memory for stresses
-#: layers of cells around a node on which its recovered stress may depend
+#: number of nodes per batch of subdomains; limits the memory for stresses
+BATCH_NODES = 2**15
+#: number of layers of cells around a node on which its recovered stress may depend
 STRESS_LAYERS = 3
 
 

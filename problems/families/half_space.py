@@ -10,7 +10,6 @@ from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
     LAW_KEYS,
-    LAW_PARAMETERS,
     MAX_SIZE,
     MIN_SIZE,
     choice,
@@ -114,8 +113,8 @@ class HalfSpace(DeclaredFamily):
         if friction == "tresca" and not MIN_SIZE <= bound <= MAX_SIZE:
             given = "" if bound == self.defaults["bound"] else f", got {bound:g}"
             raise InputError(
-                f"{self.name}: friction=tresca needs bound, {LAW_PARAMETERS['bound']}"
-                f"{given}"
+                f"{self.name}: friction=tresca needs bound, a traction between "
+                f"{MIN_SIZE:g} and {MAX_SIZE:g} Pa{given}"
             )
         if friction == "coulomb" and p["n"] > MAX_SOLVED:
             raise InputError(

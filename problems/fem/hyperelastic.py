@@ -180,7 +180,7 @@ class StVenantKirchhoff(Hyperelastic):
         return np.ones(F.shape[:-2])
 
 
-#: material classes by value of the key `material`
+#: mapping from the value of the key `material` to the class of the material
 MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyType(
     {"neo-hooke": NeoHooke, "svk": StVenantKirchhoff}
 )

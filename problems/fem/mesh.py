@@ -54,7 +54,8 @@ class Mesh:
     #: (E, c) nodes of each cell, counter-clockwise in 2D; in mixed meshes, cells
     #: with fewer corners repeat nodes
     cells: Nodes
-    boundaries: Mapping[str, Nodes]  #: chains or faces by name
+    #: mapping from the name of a boundary to its chain or faces
+    boundaries: Mapping[str, Nodes]
 
     @property
     def dim(self) -> int:

@@ -227,7 +227,7 @@ class _Extent(NamedTuple):
 
     centre: Vector  #: (dim,) centroid of the nodes
     radius: float  #: root mean square distance of the nodes from the centroid
-    size: float  #: √N
+    size: float  #: √N for a body with N nodes
     #: (k, k) matrix that combines the rotations into orthonormal ones; None in the
     #: plane
     turn: NDArray[np.float64] | None

@@ -73,7 +73,7 @@ class Layout:
 
     @cached_property
     def node_start(self) -> NDArray[np.int64]:
-        """(grids + 1,) first node of each grid, then the total number of nodes."""
+        """First node of each grid, then the total number of nodes, (grids + 1,)."""
         return np.cumsum([0, *(grid.nodes for grid in self.grids)])
 
     @property
@@ -101,7 +101,7 @@ class Layout:
 
     @cached_property
     def block_start(self) -> NDArray[np.int64]:
-        """(grids + 1,) first block of each grid, then the total number of blocks."""
+        """First block of each grid, then the total number of blocks, (grids + 1,)."""
         counts = [(x.size - 1) * (y.size - 1) for x, y in self.cuts]
         return np.cumsum([0, *counts])
 

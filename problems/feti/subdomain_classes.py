@@ -2,7 +2,7 @@
 
 In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
 subdomain floats; supports, gluing and contact are rows of one matrix B. The kernel of
-every stiffness matrix is hence known in advance: the rigid motions.
+every stiffness matrix is therefore known in advance: the rigid motions.
 
 The torn unknowns v (N,) are the displacement components of all copies of all nodes, in
 the frames of their subdomains, numbered by subdomain and then by node. Subdomains that
@@ -191,7 +191,7 @@ class Subdomains:
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
-        """(S + 1,) first torn unknown of each subdomain, then their total number."""
+        """First torn unknown of each subdomain, then the total number N, (S + 1,)."""
         sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
@@ -283,7 +283,7 @@ class Clusters:
 
     @cached_property
     def coordinates(self) -> NDArray[np.int64]:
-        """(S + 1,) first coordinate of each subdomain, then their total number."""
+        """First coordinate of each subdomain, then the total number, (S + 1,)."""
         sizes = np.array([modes.shape[1] for modes in self.faces])
         return np.concatenate([[0], np.cumsum(sizes[self.domains.class_of])])
 
@@ -301,7 +301,7 @@ class Clusters:
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """(clusters + 1,) first row of C of each cluster, then their total number."""
+        """First row of C of each cluster, then the number of rows, (clusters + 1,)."""
         subdomain = np.searchsorted(
             self.coordinates, self.joints.indices[self.joints.indptr[:-1]], side="right"
         )
@@ -487,7 +487,7 @@ class DecomposedBodies:
 
     @property
     def start(self) -> NDArray[np.int64]:
-        """First torn unknown of each subdomain, then their total number, (S + 1,)."""
+        """First torn unknown of each subdomain, then the total number N, (S + 1,)."""
         return self.domains.start
 
     @cached_property

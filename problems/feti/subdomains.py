@@ -22,8 +22,8 @@ This row is orthogonal to the gluing rows.
 
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
-homogeneous, F = BK⁺Bᵀ is hence independent of E. In support and gluing rows, E may be
-multiplied by a factor for the shape of the cells (`problems.feti.structured`).
+homogeneous, F = BK⁺Bᵀ is therefore independent of E. In support and gluing rows, E may
+be multiplied by a factor for the shape of the cells (`problems.feti.structured`).
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: functions that return the weights (rows, m) of m copies, by the name of the gluing
+#: mapping from the name of the gluing to a function that returns the weights (rows, m)
+#: of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
@@ -389,7 +390,7 @@ class LocalSubdomains:
 
     @cached_property
     def motions(self) -> NDArray[np.int64]:
-        """Number of the first rigid motion of each subdomain, then the total, (S + 1,).
+        """First rigid motion of each subdomain, followed by the total number, (S + 1,).
 
         The subdomains of all ranks are included.
         """
@@ -592,7 +593,7 @@ def _local_clusters(local: LocalSubdomains) -> Clusters:
     nodes. The modes Φ_s of subdomain s are its rigid motions, restricted to these nodes
     and orthonormalised. After rotation to global axes by Q_s, the modes of both
     subdomains span the same space: Q_1Φ_1 = Q_2Φ_2Tᵀ with an orthogonal matrix T. The
-    averages are hence equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
+    averages are therefore equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
     """
     nodes, domains, d = local.nodes, local.domains, local.problem.components
     r = domains.classes[0].R.shape[1]

@@ -118,7 +118,8 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
-#: keys of each shape of rigid bodies, by dimension; all except radius are vectors
+#: mapping from the dimension to the keys of each shape of rigid bodies; all keys except
+#: radius are vectors
 _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
     2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
     3: {
@@ -127,7 +128,7 @@ _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
         "sphere": ("centre", "radius"),
     },
 }
-#: units of length by name, m
+#: mapping from the name of a unit of length to its size in m
 LENGTH_UNITS = {
     "m": 1.0,
     "cm": 1e-2,
@@ -316,9 +317,9 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     vector = _vector(kinds[0], entry[kinds[0]], named.dim)
     nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
-    if facets.size and named.dim == 3:  # ∫N over the boundary, m²
+    if facets.size and named.dim == 3:  # ∫N_j over the boundary, m²
         nodes, weights[nodes] = nodal_areas(named.points, facets)
-    elif facets.size:  # in 2D, m
+    elif facets.size:  # ∫N_j in 2D, m
         lengths = np.linalg.norm(np.diff(named.points[facets], axis=1)[:, 0], axis=1)
         np.add.at(weights, facets, lengths[:, None] / 2)
     elif kinds == ["traction"]:

@@ -52,19 +52,21 @@ from mortarbench.problems.fem.mesh import (
 SIDE = 0.04  #: side length of the square, m
 MATERIAL = Material(E=1.3e11, nu=0.2)
 TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
-FORCE = TOP * SIDE  #: F₀, N/m
-PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
-PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x at PLACES, m
-FORCE_AT = 38.75e-3  #: x of the published normal force, m
+FORCE = TOP * SIDE  #: unit of force F₀, N/m
+#: positions x of the published points, m
+PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])
+#: published u_x at PLACES, m
+PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])
+FORCE_AT = 38.75e-3  #: position x of the published normal force, m
 
 
 class Plate(NamedTuple):
     """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
 
     shape: StructuredGrids | StructuredSolids
-    ground: Nodes  #: side y = 0, without its nodes on x = 40 mm
+    ground: Nodes  #: contact side y = 0, without its nodes on x = 40 mm
     top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
-    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths (areas)
+    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths, m (areas, m²)
     right: Nodes  #: nodes of x = 40 mm
     corner: Nodes  #: nodes of x = 40 mm, y = 0
     ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in 2D

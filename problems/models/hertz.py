@@ -8,7 +8,7 @@ with the pressure
 
 Bodies are half discs under a uniform pressure on the flat side. The force is
 prescribed, since the theory does not determine the approach. Contact alone supports the
-upper body vertically; hence the form ``dual-bounds`` does not exist.
+upper body vertically; therefore, the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
 Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
@@ -81,7 +81,7 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
-RADIUS = 8e-3  #: R of the upper cylinder, m
+RADIUS = 8e-3  #: radius R of the upper cylinder, m
 NAMES = ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
@@ -353,7 +353,8 @@ def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
     if p["programme"] == "proportional":
-        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a ∝ √P grows evenly
+        # a ∝ √P grows by equal increments
+        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2
         return [(part, part * p["Q"]) for part in parts]
     return [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
 

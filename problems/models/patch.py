@@ -11,7 +11,7 @@ A contact discretisation passes the test if it reproduces this solution, that is
 transfers constant pressures exactly (Taylor and Papadopoulos 1991). Mortar methods
 pass. One-pass node-to-segment contact fails: its error in σ_y is of order one and does
 not vanish with the mesh size. Friction has no effect if the blocks are of the same
-material. The upper block is supported by contact alone; hence the form
+material. The upper block is supported by contact alone; therefore, the form
 ``dual-bounds`` does not exist.
 
 In 3D (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
@@ -78,8 +78,9 @@ from mortarbench.problems.ranges import MIN_STRETCH
 
 LENGTH, HEIGHT = 1.0, 0.5  #: size of each block, m
 NAMES = ("lower", "upper")
-PRESSURE = 1e6  #: p, Pa
-E_UPPER, NU = 10e6, 0.3  #: modulus of the upper block, Pa, and ν of both
+PRESSURE = 1e6  #: pressure p, Pa
+#: modulus of the upper block, Pa, and Poisson's ratio of both blocks
+E_UPPER, NU = 10e6, 0.3
 
 
 @cached_problem
@@ -115,10 +116,10 @@ class Homogeneous(NamedTuple):
 
     lateral: float  #: stretch λ₁ along x
     stretch: float  #: stretch λ₂ along y
-    nominal: float  #: P₂₂, force per reference length and thickness, Pa
-    cauchy: float  #: σ_y, Pa
-    energy: float  #: W per reference area, Pa
-    stiffness: float  #: dP₂₂/dλ₂ with P₁₁ = 0, Pa
+    nominal: float  #: nominal stress P₂₂, force per reference length and thickness, Pa
+    cauchy: float  #: Cauchy stress σ_y, Pa
+    energy: float  #: strain energy W per reference area, Pa
+    stiffness: float  #: derivative dP₂₂/dλ₂ at P₁₁ = 0, Pa
 
 
 def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:

@@ -4,8 +4,9 @@ A plate of `width` × `height` is clamped at its left edge and pulled down by 1 
 of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some
 subdomains, the modulus is multiplied by `jump`: in every other subdomain
 (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
-contact; hence the dual has equality constraints only. Condition numbers of the dual
-measure the scalability of the method independently of load, stopping test and units.
+contact; therefore, the dual has equality constraints only. Condition numbers of the
+dual measure the scalability of the method independently of load, stopping test and
+units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
@@ -88,7 +89,7 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
-LOAD = 1e6  #: F₀, the load, N/m; in 3D, N
+LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
 STEEL = Material(E=210e9, nu=0.3)
 #: preconditioner and scaling for each spectrum; None means no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
@@ -148,12 +149,12 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 class Plate:
     """Plate for one set of keys; K, f and moduli are in units of l and F₀."""
 
-    volume: float  #: width × height, m²; volume in 3D, m³
+    volume: float  #: width × height in m² (2D), or volume in m³ (3D)
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
     moduli: Vector  #: (k,) moduli of the materials, the modulus of steel first
-    plane: Plane | None  #: None in 3D
+    plane: Plane | None  #: plane state; None in 3D
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
     parts: DecomposedProblem

@@ -25,7 +25,7 @@ fixed planes and overlaps,
     D_jk = Σ_e n_e ∫_e Φ_j N_k,   M_jl = Σ_e n_e ∫_e Φ_j N^m_l,   g̃_j = Σ_e ∫_e Φ_j g.
 
 *Balance.* At each point of an overlap, a row exerts the force Φ_j n_e on the slave and
-−Φ_j n_e on the master, on the same line along n_e. The forces of a row are hence in
+−Φ_j n_e on the master, on the same line along n_e. The forces of a row are therefore in
 equilibrium and have no moment.
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is Φ = A N on each face with A = D_e M_e⁺,
@@ -225,7 +225,7 @@ def _integrals(
     """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
     t_s, pair = slave.of_faces(e)
     t_m, place = master.of_faces(m[pair])
-    # pair all triangles of one face with all triangles of the other
+    # pair all triangles of the slave face with all triangles of the master face
     t_s, pair = t_s[place], pair[place]
     # coordinates in the auxiliary plane, and height above it
     frame = np.concatenate(
@@ -237,7 +237,7 @@ def _integrals(
         )
         for side, t in ((slave, t_s), (master, t_m))
     )
-    on_m = on_m[:, ::-1]  # opposite faces run clockwise on the plane
+    on_m = on_m[:, ::-1]  # corners run clockwise on the plane
     meets = (on_s.max(axis=1) > on_m.min(axis=1))[:, :2].all(axis=1)
     meets &= (on_m.max(axis=1) > on_s.min(axis=1))[:, :2].all(axis=1)
     meets &= _double_area(on_m) > 0

@@ -51,7 +51,8 @@ class FileMesh(NamedTuple):
     #: cells
     cell_sets: Mapping[int, Mapping[str, Sequence[Nodes]]]
     node_sets: Mapping[str, Nodes]
-    vocabulary: Mapping[int, Words]  #: terms by the dimension of the bodies
+    #: mapping from the dimension of the bodies to the terms
+    vocabulary: Mapping[int, Words]
 
     @property
     def dim(self) -> int:
@@ -399,8 +400,8 @@ def _check_apart(
     for i, name in enumerate(names):
         if (count := np.unique(part[owner == i]).size) > 1:
             raise InputError(
-                f"{path}: body {name!r} falls into {count} parts; expected one "
-                f"{words.body} for each"
+                f"{path}: body {name!r} consists of {count} disconnected parts; "
+                f"expected one {words.body} for each part"
             )
 
 

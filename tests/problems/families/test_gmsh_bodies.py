@@ -751,7 +751,7 @@ def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
 def test_a_body_of_two_parts_is_refused(tmp_path):
     one, cells = square()
     both = np.vstack([one, square(at=(5.0, 0.0))[0]])
-    with pytest.raises(InputError, match="body 'a' falls into 2 parts"):
+    with pytest.raises(InputError, match="body 'a' consists of 2 disconnected parts"):
         read(tmp_path, both, {"a": np.vstack([cells, cells + 9])}, {}, {})
 
 
