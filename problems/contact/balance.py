@@ -131,7 +131,8 @@ def check_friction(
     allowed = _kernel(bodies.B_D @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
-    from scipy.optimize import linprog  # imported here: rarely needed, slow to import
+    # imported here, because it is rarely needed and slow to import
+    from scipy.optimize import linprog
 
     motions = R @ allowed
     forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
@@ -216,7 +217,8 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
 
     The result is the residual of the least-squares problem over forces λ ≥ 0.
     """
-    from scipy.optimize import nnls  # imported here: only floating bodies need it
+    # imported here, because only floating bodies need it
+    from scipy.optimize import nnls
 
     sizes = np.linalg.norm(closing, axis=1)
     rows = closing[sizes > 1e-12 * sizes.max(initial=0.0)]

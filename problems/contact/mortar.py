@@ -139,8 +139,8 @@ def mortar(
     slave, master : (s,), (v,) chains of nodes with their body on the left
     basis : multiplier basis, "dual" or "standard"
     reach : limits on the angle and distance of integration segments. Without a limit on
-        the angle, rays can graze a distant master. Weighted gaps between separate
-        bodies could then be negative, because the dual basis is negative in places
+        the angle, rays can graze a distant master side. Weighted gaps between separate
+        bodies could then be negative, because dual basis functions take negative values
     tangential : add tangential rows for friction
 
     Raises

@@ -116,7 +116,7 @@ def _contact_force(
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
-    # contact forces on both bodies cancel: sum over one of them
+    # the contact forces on both bodies cancel, so only those on one body are summed
     loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 

@@ -98,7 +98,7 @@ TOLERANCE = 1e-9  #: largest `NewtonPath.residual` at the end of a load step
 #: are differences of displacements
 FORCE_ROUNDING = 2 * float(np.finfo(float).eps)
 MAX_ITERATIONS = 60  #: largest number of Newton iterations at one load
-KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
+KEEP_AFTER = 20  #: number of iterations after which pressing nodes keep their segments
 MAX_HALVINGS = 8  #: largest number of halvings of a load increment
 MIN_STEP = 2.0**-16  #: smallest step length of the line search
 #: rounding error of the merit function relative to the energies; without this
@@ -174,7 +174,7 @@ class NewtonPath:
 
     """
 
-    bodies: Bodies  #: undeformed bodies with their K
+    bodies: Bodies  #: undeformed bodies and their stiffness matrix K
     cells: Cells  #: data of the cells, nondimensional like K
     gaps: Gaps
     reference: Reference
@@ -407,7 +407,7 @@ class NewtonPath:
     def _linearise(
         self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps
     ) -> Iteration:
-        """Assemble the QP (1) at a configuration and solve it."""
+        """Assemble the QP (1) at a configuration, and solve this QP."""
         K, inverse, clipped = self._convex(at, lam, gaps.curvature)
         tangent = replace(self.bodies, K=K, f=K @ at.u - at.r)
         primal = primal_qp(tangent, at.rows)

@@ -20,7 +20,7 @@ from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
 #: numbers of load steps and of linearisations per step for which the result is
-#: converged: larger numbers do not change it
+#: converged: larger numbers do not change the result
 CONVERGED = (2, 8)
 
 #: mapping from the name of a contact method in figures to the keys of its case

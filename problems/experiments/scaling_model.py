@@ -36,7 +36,8 @@ from dataclasses import dataclass
 from math import ceil, log2, prod, sqrt
 
 BYTES = 8  #: bytes of a floating-point number
-REPLICATED = 20_000  #: largest coarse problem whose inverse may be explicit, unknowns
+#: largest number of unknowns of a coarse problem whose inverse may be explicit
+REPLICATED = 20_000
 ENTRY = 12  #: bytes of an entry of a sparse matrix, including its index
 #: global reductions per product with F; 4.4 to 6.8 were counted for cube-wall, n = 32
 REDUCTIONS = 6.5

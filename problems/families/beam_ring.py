@@ -56,8 +56,8 @@ class BeamRing(ContactFamily):
     problem = "beam_ring.problem"
     model = "beam_ring.newton_step"
     cells = ("Nr", "Nh", "radial", "depth")
-    #: the energy under the point load grows like log 1/h
-    singular = "the work of a point load grows without bound as its cell shrinks"
+    #: the energy under the point load grows like log(1/h)
+    singular = "the work of a point load grows without bound as the mesh is refined"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; `radial` defaults to 2·Nh, and `step` to `steps`."""

@@ -38,8 +38,8 @@ class DeclaredFamily(Family):
     subdomains : module of `problems.models` whose `in_subdomains` returns the
         decomposed problem and whose `results` returns a function that evaluates
         solutions on ranks; empty if the family has no such module
-    cells : keys that are numbers of cells; refinement doubles them if there is no key
-        `halvings`
+    cells : keys that are numbers of cells; refinement doubles the values unless there
+        is a key `halvings`
     conditions : mapping from a key to a check that involves several keys; the check
         applies if the family declares the key
 

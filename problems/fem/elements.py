@@ -11,11 +11,11 @@ Quadrilaterals and hexahedra are products of intervals, wedges are products of a
 triangle and an interval, and tetrahedra are single simplices. An isoparametric cell is
 the image of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
 
-The quadrature rule of a simplex has d + 1 points of equal weight, at centroid +
-(vertex − centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3
-on intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1).
-The stiffness of affine cells is therefore exact. If the cell is a single simplex,
-gradients are constant, and the centroid suffices.
+The quadrature rule of a simplex has d + 1 points of equal weight, at centroid + (vertex
+− centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3 on
+intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1). The
+stiffness of affine cells is therefore exact. If the cell is a single simplex, gradients
+are constant, and the centroid suffices as quadrature point.
 """
 
 from __future__ import annotations

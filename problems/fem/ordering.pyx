@@ -81,7 +81,8 @@ def dissect_components(
     roots = np.zeros(3 * nodes, dtype=np.bool_)
     cdef int[::1] length = lengths, children = branches
     cdef int[:, ::1] stack = np.empty((2 * nodes, 2), dtype=np.int32)
-    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # half in the last bisection
+    # half of each node in the last bisection
+    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
     cdef double[:, ::1] along = np.empty((2, nodes))
     cdef int cut = 0

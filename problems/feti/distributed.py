@@ -1,10 +1,10 @@
 """The dual of decomposed bodies, distributed over MPI ranks.
 
 Each rank p stores some of the subdomains, with their stiffness K_p and their columns
-B_p of B. Of each vector of multipliers, a rank stores the entries for the rows of B
-that it *owns*. A row of B that touches subdomains of several ranks is owned by one of
-these ranks, chosen round-robin, and is a *ghost* row on all others. Before a product
-with B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
+B_p of B. A rank stores the entries of vectors of multipliers for the rows of B that it
+*owns*. A row of B that touches subdomains of several ranks is owned by one of these
+ranks, chosen round-robin, and is a *ghost* row on all others. Before a product with
+B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
 ghost row. After the product with B_p, these ranks send their contributions back to the
 owner, so that the result is
 

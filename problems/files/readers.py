@@ -22,7 +22,7 @@ from mortarbench.problems.files.file_digest import format_of
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 
-#: (QP, scale, constant); the objective of the file is scale·(objective of the QP) +
+#: QP, scale and constant: the objective of the file is scale·(objective of the QP) +
 #: constant
 Loaded = tuple[QP, float, float]
 

@@ -256,7 +256,7 @@ def _programme(
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
     """Return the cylinders, with n cells per a on the upper one and m on the lower one.
 
-    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower one is
+    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower cylinder is
     multiplied by `radius`, and its modulus by `ratio`. If Hertz's a exceeds a radius,
     because the bodies are too soft for the theory, the mesh is that for a = radius, so
     that the uniform part of the arc does not exceed the half disc.

@@ -159,7 +159,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
 
 
 def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
-    """Return the decomposed problem of a string, from its whole mesh."""
+    """Return the decomposed problem of a string; the whole mesh is generated."""
     n = p["n"]
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)

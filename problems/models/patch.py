@@ -336,5 +336,5 @@ def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
 
 
 def _divisions(n: int) -> tuple[int, int]:
-    """Return the numbers of cells along x and y, such that cells are nearly square."""
+    """Return numbers of cells along x and y for which cells are nearly square."""
     return n, -(-n // 2)

@@ -115,11 +115,11 @@ def _read(path: Path) -> Any:
 def _parse(path: Path) -> Any:
     """Parse a file with meshio, admitting entities without a physical group.
 
-    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2
-    they have tag 0. In format 4.1 they have no tag, and meshio fails; tag 0 is then
-    inserted into a copy of the text.
+    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2,
+    these cells have tag 0. In format 4.1, these cells have no tag, and meshio fails; in
+    this case, tag 0 is inserted into a copy of the text.
     """
-    import meshio  # imported here: workers and other families do not need it
+    import meshio  # imported here, because workers and other families do not need it
 
     try:
         return meshio.gmsh.read(path)  # meshio.read would print errors and exit
