@@ -281,5 +281,5 @@ def _message(names: list[str], what: str) -> str:
     who = "bodies" if len(names) > 1 else "body"
     return (
         f"{who} {' and '.join(map(repr, names))}: nothing balances {what}; expected a "
-        "support, or a contact that presses against it"
+        "support, or a contact that resists the load"
     )

@@ -108,7 +108,7 @@ def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Poi
     if not np.isfinite(x).all():
         k = int(np.flatnonzero(~np.isfinite(x).all(axis=1))[0])
         raise InputError(
-            f"contact {name}: node {nodes[k]} is at {x[k].tolist()}, expected a "
+            f"contact {name}: node {nodes[k]} is at {x[k].tolist()}; expected a "
             "finite position"
         )
     return x
@@ -121,7 +121,7 @@ def surface(x: Points, name: str) -> Surface:
     first = np.flatnonzero(length > MIN_RELATIVE_LENGTH * length.max(initial=0.0))
     if not len(first):
         raise InputError(
-            f"contact {name}: {len(x)} node(s) and no segment of positive length, "
+            f"contact {name}: {len(x)} node(s) and no segment of positive length; "
             "expected a chain of at least two nodes"
         )
     normal = -tangents(edge[first] / length[first, None])[:, 0]
@@ -143,7 +143,7 @@ def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
     if flat.any():
         raise InputError(
             f"contact {name}: the face around {x[faces[flat.argmax()]].mean(axis=0)} "
-            "has no area, expected faces with distinct corners"
+            "has no area; expected faces with distinct corners"
         )
     normal = area / size
     mean = np.zeros_like(x)

@@ -67,7 +67,7 @@ class DeclaredFamily(Family):
             key.check(self.name, name, params)
         if p.get("step", 0) > p.get("steps", 0):
             raise InputError(
-                f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
+                f"{self.name}: step={p['step']} must be at most steps={p['steps']}"
             )
         for name, check in self.conditions.items():
             if name in params:

@@ -85,7 +85,7 @@ class Fclib(FromFile):
         remarks = []
         if (rank := contact.rank) is not None and rank < contact.q.size:
             remarks.append(
-                f"W has rank {rank} of {contact.q.size}: the forces may not be unique"
+                f"W has rank {rank} of {contact.q.size}, so forces may not be unique"
             )
         stored = file.stored
         quantities: dict[str, Any] = {

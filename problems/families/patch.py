@@ -64,8 +64,8 @@ class ContactPatch(ContactFamily):
         distort = float(params["distort"])
         if not 0 <= distort <= MAX_DISTORTION * (dim - 2):
             raise InputError(
-                f"{self.name}: distort={distort:g} with dim={dim}; expected 0, or with "
-                f"dim=3 at most {MAX_DISTORTION:g} of a cell"
+                f"{self.name}: distort={distort:g} is not supported with dim={dim}; "
+                f"expected 0, or with dim=3 at most {MAX_DISTORTION:g} of a cell"
             )
         stretch = float(params["stretch"])
         if stretch == self.defaults["stretch"]:

@@ -91,8 +91,8 @@ def read_msh_sets(path: Path) -> FileMesh:
 def _read(path: Path) -> Any:
     if path.suffix.lower() == ".geo":
         raise InputError(
-            f"{path}: a drawing, not a mesh; mesh it first: gmsh -2 {path.name} writes "
-            f"{path.with_suffix('.msh').name}"
+            f"{path}: a drawing, not a mesh; generate a mesh first: "
+            f"gmsh -2 {path.name} writes {path.with_suffix('.msh').name}"
         )
     with opened(path, "a .msh file") as file:
         size = os.fstat(file.fileno()).st_size

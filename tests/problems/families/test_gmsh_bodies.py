@@ -744,7 +744,8 @@ def test_a_drawing_in_place_of_its_mesh_is_refused_with_the_command(described):
         build(f"{text}/dual")
 
     assert str(e.value) == (
-        "two.geo: a drawing, not a mesh; mesh it first: gmsh -2 two.geo writes two.msh"
+        "two.geo: a drawing, not a mesh; generate a mesh first: "
+        "gmsh -2 two.geo writes two.msh"
     )
 
 
@@ -804,7 +805,7 @@ def test_other_files_are_refused(tmp_path, capsys):
             "no/a.toml: No such file or directory; expected a TOML",
         ),
         ("bodies:a.toml", "bodies:a.toml: no form at the end; expected one of primal"),
-        ("bodies:a.toml/step=3/dual", "bodies: step=3 must be in 1..steps=2"),
+        ("bodies:a.toml/step=3/dual", "bodies: step=3 must be at most steps=2"),
         ("bodies:a.toml/step=0/dual", "bodies: step=0 must be at least 1"),
         ("bodies:a.toml/contact=glue/dual", "bodies: contact='glue' is unknown"),
         ("bodies:a.toml/contact=b.toml/dual", "bodies: contact='b.toml' is unknown"),
