@@ -43,7 +43,7 @@ part, and N̄_j = N_j(ξ̄), the only linear solution is
 
     Φ_1 = N̄_1 − κ (ξ − ξ̄),   Φ_2 = N̄_2 + κ (ξ − ξ̄),   κ = 2 N̄_1 N̄_2 / v
 
-(for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
+For a fully covered segment, Φ_1 = 2N_1 − N_2 and Φ_2 = 2N_2 − N_1.
 
 Friction rows have (−ν_y, ν_x) in place of ν; across an open gap, their forces have a
 moment. For both bases, the friction bound of a row under Tresca's law is the bound of
@@ -103,16 +103,16 @@ class Mortar:
 class Overlaps(NamedTuple):
     """Integration segments: overlaps of slave segments with master segments."""
 
-    slave: Nodes  #: (p,) slave segment, ascending
-    master: Nodes  #: (p,) master segment
+    slave: Nodes  #: (p,) slave segment of each integration segment, ascending
+    master: Nodes  #: (p,) master segment of each integration segment
     xi: NDArray[np.float64]  #: (p, 2) coordinates ξ of both ends, ascending
 
 
 class GaussPoints(NamedTuple):
     """Gauss points of the integration segments."""
 
-    slave: Nodes  #: (p,) slave segment, ascending
-    master: Nodes  #: (p,) master segment
+    slave: Nodes  #: (p,) slave segment of each integration segment, ascending
+    master: Nodes  #: (p,) master segment of each integration segment
     xi: NDArray[np.float64]  #: (p, 3) coordinate on the slave segment, in [−1, 1]
     beta: NDArray[np.float64]  #: (p, 3) coordinate on the master segment, in [0, 1]
     field: NDArray[np.float64]  #: (p, 3, 2) ν(ξ), |ν| ≤ 1

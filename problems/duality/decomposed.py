@@ -238,7 +238,7 @@ def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
 class LinearisedSides:
     """Nondimensional linearised contact, restricted to nodes of the contact sides."""
 
-    bodies: ContactSides  #: contact sides with N nodes in all
+    bodies: ContactSides  #: contact sides with a total of N nodes
     node: Nodes  #: (N,) global numbers of these nodes
     nodes: int  #: number of nodes of the bodies
     B: csr_array  #: (m, dim·N) contact rows B u ≤ c in local components

@@ -264,7 +264,7 @@ def rectangle_grid(
 def box(
     corner: tuple[float, ...], size: tuple[float, ...], divisions: tuple[int, ...]
 ) -> Mesh:
-    """Mesh a box by nx × ny × nz equal hexahedra.
+    """Mesh a box with nx × ny × nz equal hexahedra.
 
     Numbers of nodes and cells vary fastest along x. The names of boundaries are those
     of `box_grid`. Lengths are in m.
@@ -281,7 +281,7 @@ def box(
 
 
 def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
-    """Mesh a box by hexahedra whose faces lie at the given increasing coordinates.
+    """Mesh a box with hexahedra whose faces lie at the given increasing coordinates.
 
     Numbers of nodes and cells vary fastest along x. The boundaries are left and right
     (smallest and largest x), front and back (y), bottom and top (z).
@@ -373,7 +373,7 @@ def half_ring_grid(
 def rectangle(
     corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh a rectangle by nx × ny equal cells.
+    """Mesh a rectangle with nx × ny equal cells.
 
     The boundaries are bottom, right, top and left. Lengths are in m.
 
@@ -386,7 +386,7 @@ def rectangle(
 def half_ring(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh the upper half of a ring by cells of equal angle and equal thickness.
+    """Mesh the upper half of a ring with cells of equal angle and equal thickness.
 
     The boundaries are outer (from angle 0 to π), left_foot, inner and right_foot.
 
@@ -397,7 +397,7 @@ def half_ring(
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
-    """Mesh half a disc by rings of cells, the innermost of which consists of triangles.
+    """Mesh half a disc with rings of cells; the innermost ring consists of triangles.
 
     The boundaries are arc (anticlockwise) and flat (through the centre).
 

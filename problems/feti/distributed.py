@@ -123,7 +123,7 @@ def partition(
 
 
 def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return the owner (t,) of each row, chosen round-robin among the ranks it touches.
+    """Return the owner (t,) of each row, a touched rank that is chosen round-robin.
 
     group : (t,) for a row of a disc, the number of the first row of this disc; for any
         other row, its own number. All rows of a disc have the same owner, because they

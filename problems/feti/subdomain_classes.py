@@ -448,7 +448,7 @@ class _Joined(NamedTuple):
     def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
         """Return M⁺ of this cluster from the blocks ΦᵀK⁺Φ of all classes."""
         S, (c, r) = self.product(compliance), self.CR.shape
-        # scale CK⁺Cᵀ to order one, the order of CR
+        # scale CK⁺Cᵀ to the magnitude of CR, which is of order one
         unit = float(np.trace(S)) / c if c else 1.0
         M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
         Z = block_diagonal(self.dependent, self.N)  # ker M

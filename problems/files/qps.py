@@ -62,7 +62,7 @@ class _QPSModel:
     upper: dict[str, float] = field(default_factory=dict)
     triangle: dict[tuple[str, str], float] = field(default_factory=dict)
     whole: dict[tuple[str, str], float] = field(default_factory=dict)
-    sign: float = 1.0  #: −1 if the objective is maximised
+    sign: float = 1.0  #: −1 if the objective is maximised, otherwise 1
     objective: str = ""  #: name of the objective, the first row of type N
 
 

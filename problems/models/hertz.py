@@ -254,7 +254,7 @@ def _programme(
 
 
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
-    """Return the cylinders, with n cells per a on the upper one and m on the lower one.
+    """Return the cylinders, with n (upper) and m (lower) cells per half width a.
 
     The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower cylinder is
     multiplied by `radius`, and its modulus by `ratio`. If Hertz's a exceeds a radius,
@@ -385,7 +385,7 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
 def graded_points(h: float, uniform: float, total: float) -> Vector:
     """Divide [0, total] into cells of size h up to `uniform`, then growing by GROWTH.
 
-    If `uniform` covers the interval, all cells have the same size of at most h.
+    If `uniform` covers the interval, all cells have the same size, which is at most h.
     """
     equal = h * np.arange(np.ceil(uniform / h) + 1)
     if equal[-1] >= total:

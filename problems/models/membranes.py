@@ -195,7 +195,7 @@ class Membranes:
         return supported_inverse(self.qp.P, free, self.rigid)
 
     def quantities(self, s: Solution) -> dict[str, Any]:
-        """Return counts, energy, contact force and lowest height of a primal solution.
+        """Return counts, energy, contact force and least height of a primal solution.
 
         Energy and force are divided by the tension.
         """

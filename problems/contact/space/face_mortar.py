@@ -84,8 +84,8 @@ class Overlaps(NamedTuple):
     N_j are the shape functions of the slave face, N^m_l those of the master face.
     """
 
-    slave: Nodes  #: (p,) slave face
-    master: Nodes  #: (p,) master face
+    slave: Nodes  #: (p,) slave face of each pair
+    master: Nodes  #: (p,) master face of each pair
     area: NDArray[np.float64]  #: (p, 4) ∫N_j, m²
     own: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N_k, m²
     other: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N^m_l, m²

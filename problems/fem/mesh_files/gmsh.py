@@ -156,7 +156,7 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
     # skip the end of the section's title and the line with the counts
     lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]
     numbers: list[int] = []
-    remaining = 0  # cells of the current block, in format 4
+    remaining = 0  # number of remaining cells of the current block, in format 4
     for fields in (list(map(int, line.split())) for line in lines):
         if not fields:
             continue

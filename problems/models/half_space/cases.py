@@ -271,8 +271,8 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
         """Evaluate stick area, resultant and energies; compare with the exact solution.
 
         A radius is that of a disc with the same area as the cells in the zone.
-        `c_over_a` is the stick radius over the exact contact radius; `energy` is the
-        elastic energy and `dissipation` is Σ bound·|slip|, both in J. Errors are
+        `c_over_a` is the stick radius divided by the exact contact radius; `energy` is
+        the elastic energy and `dissipation` is Σ bound·|slip|, both in J. Errors are
         relative; the error of the shear traction is in the l² norm over the centres of
         the cells. Cattaneo and Mindlin's solution is exact only for nu = 0.
         """

@@ -337,7 +337,7 @@ def _approach(
     material: Material,
     length: float,
 ) -> float:
-    """Return the approach of distant points of a body to z = 0, m.
+    """Return the approach of distant points of a body to the plane z = 0, m.
 
     The approach is averaged over the side opposite the contact.
     """
@@ -439,12 +439,12 @@ def _shear_quantities(
     """Compare stick zone and tangential force of full spheres with the exact solution.
 
     `tangential_force` is the force along x on the lower sphere in N. `stick_area` is
-    the sum of the nodal areas of sticking nodes in m². `stick_radius` is
-    √(5∫sr²dA/2∫s dA) in m, with s = μp − q at sticking nodes. This radius is exact for
-    Cattaneo and Mindlin's traction q, because s is then distributed like Hertz's
-    pressure on a disc of radius c. `c_over_a` is the stick radius over the exact
-    contact radius. `c_over_a_moment` follows from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which
-    also holds for Cattaneo and Mindlin's q.
+    the sum of the nodal areas of sticking nodes in m². `stick_radius` is √(5∫sr²dA/2∫s
+    dA) in m, with s = μp − q at sticking nodes. This radius is exact for Cattaneo and
+    Mindlin's traction q, because s is then distributed like Hertz's pressure on a disc
+    of radius c. `c_over_a` is the stick radius divided by the exact contact radius.
+    `c_over_a_moment` follows from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which also holds for
+    Cattaneo and Mindlin's q.
     """
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None
