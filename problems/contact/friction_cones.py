@@ -72,7 +72,7 @@ class FrictionalContact:
 
     """
 
-    W: Any  #: (n, n) sparse, stored as its symmetric part
+    W: Any  #: (n, n) sparse matrix, stored as its symmetric part
     q: Vector  #: (n,) velocity in the absence of contact forces
     mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
     A: Any = None  #: (p, n) matrix Vᵀ of the equations

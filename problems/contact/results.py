@@ -169,7 +169,8 @@ def pair_results(
         total = side.force.sum(axis=0)
         force = {slave: total.tolist()}
         if pair.master.size:
-            force = {master: (0.0 - total).tolist()} | force  # 0.0 − x: avoids −0
+            # 0.0 − x avoids negative zeros
+            force = {master: (0.0 - total).tolist()} | force
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
         pressed = float(side.length[side.pressed(ACTIVE_THRESHOLD * largest)].sum())
         results[side.name] = {

@@ -81,7 +81,7 @@ class CholeskyInverse:
     factor: Factor
     free: Nodes  #: components that are not fixed; other rows and columns of K⁺ are zero
     kernel: NDArray[np.float64]
-    seconds: float  #: time of the factorisation
+    seconds: float  #: time of the factorisation, s
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ with one solve per column of b."""
@@ -107,7 +107,7 @@ class CondensedInverse:
     interface: Nodes  #: components c with entries in constraint rows, ascending
     compliance: NDArray[np.float64]  #: (K⁺)_cc, zero for prescribed components
     kernel: NDArray[np.float64]
-    seconds: float  #: time of factorisation and condensation
+    seconds: float  #: time of factorisation and condensation, s
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ by a solve with the whole factor."""

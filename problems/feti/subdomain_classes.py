@@ -482,7 +482,7 @@ class DecomposedBodies:
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """Floating units that B glues: clusters if there are any, else subdomains."""
+        """Floating units that B glues: clusters, or subdomains without clusters."""
         return self.clusters or self.domains
 
     @property

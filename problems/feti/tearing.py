@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
 
-#: largest distance between points of congruent subdomains, relative to their radius
+#: largest distance between corresponding points of congruent subdomains, relative to
+#: the radius of the subdomains
 CONGRUENCE_TOL = 1e-11
 
 

@@ -17,10 +17,10 @@ MIN_INFINITE = 1e20  #: bounds of at least this magnitude count as infinite
 class TwoSidedQP(NamedTuple):
     """The problem  min ½xᵀPx + qᵀx + r  subject to  l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
 
-    P: Any  #: (n, n) sparse, with both triangles
+    P: Any  #: (n, n) sparse Hessian, with both triangles
     q: Vector  #: (n,) linear term
     r: float
-    A: Any  #: (m, n) sparse
+    A: Any  #: (m, n) sparse constraint matrix
     l: Vector  #: (m,) lower limits; a value ≤ −1e20 means no limit
     u: Vector  #: (m,) upper limits; a value ≥ 1e20 means no limit
     lb: Vector  #: (n,) lower bounds; a value ≤ −1e20 means no bound

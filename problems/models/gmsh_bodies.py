@@ -55,7 +55,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     ------
     InputError
         If the load of a body cannot be balanced, or if there are several load steps or
-        linearisations although neither supports nor friction prevent a rigid motion.
+        linearisations although supports and friction allow a rigid motion.
 
     """
     p: Any = params

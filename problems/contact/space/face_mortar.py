@@ -153,7 +153,8 @@ def face_mortar(
         axes = s.tangents  # (v, 2, 3)
         stacked = [rows(axes[j, axis]) for axis in range(2)]
         row = np.repeat(np.arange(active.size), 2)
-        order = np.arange(2 * active.size).reshape(2, -1).T.ravel()  # row by row
+        # both tangents of a row in succession
+        order = np.arange(2 * active.size).reshape(2, -1).T.ravel()
         T = csr_array(vstack(stacked).tocsr()[order])
     return ContactRows(
         B, gap[active] / cover[active] + B @ u, T, row, cover[active], active
