@@ -38,8 +38,8 @@ PROBLEMS: Registry[Family] = Registry(
     }
 )
 
-#: functions that restore the Hessian P of a stored QP if P is an operator, by the name
-#: of the operator; see `harness.operators`
+#: mapping from the name of an operator to the function that restores it as the Hessian
+#: P of a stored QP; see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
     {
         "tfeti": entry(

@@ -112,9 +112,11 @@ def one_step(
     form : "primal", "dual" or, if the supports fix every body, "dual-bounds"
     contact : "nts" (node to segment) or "mortar"
     basis : basis of the multipliers of mortar contact
-    friction : law for every pair: FrictionLaw("tresca", bound=1e6), in Pa, or
-        FrictionLaw("coulomb", mu=0.3), for which the QP is the last fixed-point iterate
-    reference : argument of `Family.build`; required by Coulomb's law
+    friction : friction law of every contact pair. Either FrictionLaw("tresca",
+        bound=1e6), with the bound in Pa, or FrictionLaw("coulomb", mu=0.3), whose QP is
+        the last fixed-point iterate
+    reference : function that solves a QP, as in `Family.build`; required by Coulomb's
+        law
     parts : total number of subdomains (Total FETI), for form "dual" only; 0 for no
         decomposition
     glue : type of the constraint rows that join the copies of nodes of several
@@ -139,7 +141,7 @@ def one_step(
     laws = (law,) * len(bodies.pairs)
     elastic = elastic_bodies_of(bodies)
     rows = linearisation(bodies, contact, basis, laws)(np.zeros(bodies.mesh.dofs))
-    # friction can act in both directions
+    # the friction force of a tangential row can act in both directions
     check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
     problem = ContactProblem(
         bodies=elastic,

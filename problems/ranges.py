@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 MIN_STRETCH = 0.1  #: smallest stretch of a body under pressure
-#: limits of the magnitude of physical values, SI; products of several such values
-#: neither overflow nor underflow
+#: smallest and largest magnitude of a physical value in SI units; within these limits,
+#: products of several values neither overflow nor underflow
 MIN_SIZE, MAX_SIZE = 1e-30, 1e30
 MAX_STEPS = 10_000  #: largest number of load steps, and of linearisations per step
-#: lower bound of the memory that K and its pattern take per displacement component, MiB
+#: lower bound on the memory that K and its sparsity pattern take per displacement
+#: component, MiB
 COMPONENT_MIB = 1 / 1024
 
 
@@ -35,7 +36,7 @@ class Key:
     default: Value
     least: int | None = None  #: smallest allowed integer; None for no limit
     most: int | None = None  #: largest allowed integer; None for no limit
-    values: tuple[Value, ...] = ()  #: allowed values; empty if not a choice
+    values: tuple[Value, ...] = ()  #: allowed values; empty if the key is not a choice
     is_size: bool = False  #: True if the value must be between MIN_SIZE and MAX_SIZE
 
     def with_default(self, default: Value) -> Key:
@@ -99,11 +100,13 @@ CLUSTERS = schema(cluster=key(0, 0))
 #: the side of a subdomain, H/h, or 0 for undivided bodies
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
 DIMENSION = schema(dim=choice(2, 3))
-#: keys that families in space do not support yet, with their only allowed value
+#: keys that three-dimensional families do not support yet, with their only allowed
+#: value
 PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
-#: key of the parameter of each friction law; empty if the law has no parameter
+#: mapping from a friction law to the key of its parameter; empty if the law has no
+#: parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
-#: parameters of the friction laws, with a description of their allowed values
+#: mapping from the parameter of a friction law to a description of its allowed values
 LAW_PARAMETERS = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
@@ -126,7 +129,7 @@ KINEMATICS = schema(
 #: key of the contact stiffness: `geometric` adds the second derivatives of the gaps to
 #: the tangent
 CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
-#: keys that finite strain does not support, with their only allowed value
+#: keys that are not supported with finite strain, with their only allowed value
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0,
     "parts": 0,
@@ -201,8 +204,9 @@ def physical(where: str, value: Any) -> float:
 def check_memory(family: str, components: int) -> None:
     """Raise InputError if a case of this size would not fit into memory.
 
-    components : lower bound of the number of displacement components; each requires at
-        least 1 KiB (stiffness and its pattern), and about 4 KiB including the factor
+    components : lower bound on the number of displacement components; each requires at
+        least 1 KiB (stiffness matrix and its sparsity pattern), and about 4 KiB
+        including the factor
     """
     needed, limit = components * COMPONENT_MIB, case_limit_mib()
     if needed > limit:
@@ -251,7 +255,7 @@ def check_decomposition(
     params: Mapping[str, Value],
     *,
     key: str = "feti",
-    what: str = "the most cells along a subdomain's side",
+    what: str = "the largest number of cells along the side of a subdomain",
 ) -> None:
     """Raise InputError unless the keys of a decomposition are consistent.
 
@@ -261,8 +265,8 @@ def check_decomposition(
     for name, default in defaults_of({**GLUES, **CLUSTERS}).items():
         if not params[key] and params.get(name, default) != default:
             raise InputError(
-                f"{family}: {name}={params[name]} is not used by {key}=0, one piece "
-                f"per body; expected no {name}, or {key}, {what}"
+                f"{family}: {name}={params[name]} is not used by {key}=0, which "
+                f"leaves bodies undivided; expected no {name}, or {key}, {what}"
             )
 
 
@@ -273,12 +277,12 @@ def other_decomposition(key: str, keys: Container[str]) -> str:
     """
     if key == "parts" and "feti" in keys:
         return (
-            "feti and parts exclude each other, parts is for bodies:PATH.toml; "
-            "expected feti, the most cells along a subdomain's side"
+            "feti and parts exclude each other, only bodies:PATH.toml takes parts; "
+            "expected feti, the largest number of cells along the side of a subdomain"
         )
     if key in ("feti", *CLUSTERS) and "parts" in keys:
         return (
-            f"{key} and parts exclude each other, {key} needs subdomains that form a "
+            f"{key} and parts exclude each other, as {key} needs subdomains in a "
             "grid; expected parts, the number of subdomains"
         )
     return ""
@@ -314,7 +318,7 @@ def check_dimension(family: str, params: Mapping[str, Value]) -> None:
 
 
 def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> None:
-    """Raise InputError if a key has a value that families in space do not support.
+    """Raise InputError if a key has a value that 3D families do not support.
 
     space : the key and value that make the family three-dimensional, for the message
     """
@@ -333,8 +337,9 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
     """
     if params["friction"] != "none":
         raise InputError(
-            f"{family}: friction={params['friction']} on curved sides, where slip "
-            "depends on the mesh; expected flat sides with friction=tresca"
+            f"{family}: friction={params['friction']} forbids the refinement of curved "
+            "sides, because slip depends on the mesh; expected flat sides with "
+            "friction=tresca"
         )
 
 
@@ -397,7 +402,7 @@ def one_of(
 
 
 def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
-    """Return the `keys`, which are numbers of cells, with twice their values."""
+    """Return the `keys`, which are numbers of cells, with doubled values."""
     return {key: 2 * int(params[key]) for key in keys}
 
 

@@ -41,8 +41,8 @@ class _BodyMotion(NamedTuple):
     name: str
     centre: Floats  #: (dim,) centre of the nodes, m
     velocity: Floats  #: (dim,) velocity of the centre
-    #: (1,) in the plane, (3,) in space: velocity at distance `size` from the centre due
-    #: to the rotation about each axis; `size` is that of `_motions`
+    #: (1,) in 2D, (3,) in 3D: velocity due to the rotation about each axis, at the
+    #: distance `size` from the centre; for `size`, see `_motions`
     rotation: Floats
 
 
@@ -75,7 +75,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     load, closing = R.T @ bodies.f, csr_array(B) @ R
     threshold = MAX_IMBALANCE * np.abs(bodies.f).sum()
     modes, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
-    # translations along an axis come first, because their message is simpler
+    # test translations along an axis first, because their message is simpler
     sliding = [
         (b, axis)
         for b in range(len(bodies.names))
@@ -109,13 +109,14 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Check that supports, contacts and friction within bounds can balance the load.
+    """Check that supports, contact and bounded friction can balance the load.
 
-    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B and
-    ‖λ_t‖ ≤ g of the friction rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program
-    minimises the 1-norm of this residual. In space, circumscribed polygons with
-    `POLYGON` sides replace the discs. A load that exceeds the friction bound by less
-    than 2 % may hence pass this check and fail in the solve.
+    A load can be balanced if there exist forces λ_n ≥ 0 of the contact rows B, and
+    forces λ_t of the friction rows T with ‖λ_t‖ ≤ g, such that the residual  Zᵀ(f −
+    Bᵀλ_n − Tᵀλ_t)  is zero. A linear program minimises the 1-norm of this residual. In
+    3D, circumscribed polygons with `POLYGON` sides replace the discs. Hence, a load
+    that exceeds the friction bound by less than 2 % may pass this check, although the
+    solve then fails.
 
     step : number of the load step
     share : load factor of this step
@@ -130,7 +131,8 @@ def check_friction(
     allowed = _kernel(bodies.B_D @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
-    from scipy.optimize import linprog  # imported here: rarely needed, slow to import
+    # imported here, because it is rarely needed and slow to import
+    from scipy.optimize import linprog
 
     motions = R @ allowed
     forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
@@ -159,7 +161,7 @@ def check_friction(
 def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
     """Return the rows of polygons around discs, as arguments of `linprog`.
 
-    The result is empty in the plane, where bounds on the unknowns suffice.
+    The result is empty in 2D, where bounds on the unknowns suffice.
 
     before, after : numbers of other unknowns before and after those of friction
     """
@@ -215,7 +217,8 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
 
     The result is the residual of the least-squares problem over forces λ ≥ 0.
     """
-    from scipy.optimize import nnls  # imported here: only floating bodies need it
+    # imported here, because only floating bodies need it
+    from scipy.optimize import nnls
 
     sizes = np.linalg.norm(closing, axis=1)
     rows = closing[sizes > 1e-12 * sizes.max(initial=0.0)]
@@ -278,5 +281,5 @@ def _message(names: list[str], what: str) -> str:
     who = "bodies" if len(names) > 1 else "body"
     return (
         f"{who} {' and '.join(map(repr, names))}: nothing balances {what}; expected a "
-        "support, or a contact that presses against it"
+        "support, or a contact that resists the load"
     )

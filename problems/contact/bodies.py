@@ -32,11 +32,15 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """A pair of sides that may touch: chains of nodes in the plane, faces in space."""
+    """A pair of sides that may touch.
+
+    In 2D a side is a chain of nodes, in 3D an array of faces; see `Mesh`.
+    """
 
     slave: Nodes
-    master: Nodes  #: empty for a rigid master
-    rigid: RigidBody | None = None  #: master that does not deform
+    master: Nodes  #: master side; empty for a rigid master
+    #: master that does not deform; None if the master is elastic
+    rigid: RigidBody | None = None
     clamped: Nodes = NO_NODES  #: slave nodes without a row against a rigid master
 
     def renumbered(self, nodes: Nodes) -> ContactPair:
@@ -57,7 +61,7 @@ class ContactPair(NamedTuple):
 
     @property
     def slave_nodes(self) -> Nodes:
-        """Slave nodes in the order of the chain; in space, ascending."""
+        """Slave nodes, in the order of the chain in 2D, or ascending in 3D."""
         return self.slave if self.slave.ndim == 1 else np.unique(self.slave)
 
     @property
@@ -70,12 +74,12 @@ class ContactPair(NamedTuple):
 class ContactSides:
     """Contact sides of bodies, without the interior of the bodies."""
 
-    mesh: Mesh  #: nodes of the sides, m; without cells
+    mesh: Mesh  #: nodes of the sides, without cells; lengths in m
     body_of_node: NDArray[np.int64]  #: (N,) body of each node
     names: tuple[str, ...]  #: names of all bodies
     pairs: tuple[ContactPair, ...]
     length: float  #: l, unit of length of the QPs, m
-    force: float  #: F₀, unit of force of the QPs, N/m; N in space
+    force: float  #: F₀, unit of force of the QPs: N/m in 2D, N in 3D
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,7 +87,7 @@ class UnassembledBodies:
     """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
 
     Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
-    divided by `length`, forces (in the plane per thickness) by `force`.
+    divided by `length`, forces (in 2D per thickness) by `force`.
 
     Raises
     ------
@@ -96,11 +100,12 @@ class UnassembledBodies:
     body: NDArray[np.int64]  #: (E,) body of each cell
     names: tuple[str, ...]
     materials: tuple[Material, ...]
-    plane: Plane | None  #: None in space
+    plane: Plane | None  #: plane state; None in 3D
     length: float  #: l, unit of length, m
-    force: float  #: F₀, unit of force, N/m; N in space
+    force: float  #: F₀, unit of force: N/m in 2D, N in 3D
     f: Vector  #: (n,) full load of eq. (1), non-dimensional
-    B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
+    #: (m_E, n) support rows of eq. (5), one unit entry per prescribed component
+    B_D: csr_array
     pairs: tuple[ContactPair, ...]  #: sides that may touch
 
     def __post_init__(self) -> None:
@@ -186,9 +191,9 @@ def assemble(
     ----------
     body : (E,) body of each cell
     names, materials : name and material of each body
-    units : (l, F₀), the units of the non-dimensional QPs: m, and N/m or (in space) N
-    fixed : displacement components that are zero
-    load : (n,) nodal forces: N/m in the plane, N in space
+    units : units (l, F₀) of the non-dimensional QPs; l in m, F₀ in N/m (2D) or N (3D)
+    fixed : displacement components that are prescribed as zero
+    load : (n,) nodal forces: N/m in 2D, N in 3D
 
     """
     length, force = units

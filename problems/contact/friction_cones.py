@@ -72,11 +72,12 @@ class FrictionalContact:
 
     """
 
-    W: Any  #: (n, n) sparse, stored as its symmetric part
+    W: Any  #: (n, n) sparse matrix, stored as its symmetric part
     q: Vector  #: (n,) velocity in the absence of contact forces
     mu: Vector  #: (k,) coefficients of friction; a contact has n/k components
-    A: Any = None  #: (p, n) = Vᵀ
-    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,) right-hand side
+    A: Any = None  #: (p, n) matrix Vᵀ of the equations
+    #: (p,) right-hand side b of the equations
+    b: Vector = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         """Symmetrise W up to rounding."""
@@ -92,7 +93,7 @@ class FrictionalContact:
             object.__setattr__(self, "A", no_rows(self.q.size))
 
     def check_convex(self) -> None:
-        """Raise InputError if W has a negative eigenvalue not due to rounding."""
+        """Raise InputError if W has a negative eigenvalue beyond rounding errors."""
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
@@ -103,7 +104,10 @@ class FrictionalContact:
 
     @cached_property
     def _eigenvalues(self) -> Vector:
-        """Eigenvalues of W, ascending; only the largest above `MAX_DENSE_ROWS`."""
+        """Eigenvalues of W, ascending.
+
+        If W has more than `MAX_DENSE_ROWS` rows, only the largest eigenvalue.
+        """
         if self.q.size <= MAX_DENSE_ROWS:
             return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
         return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
@@ -139,9 +143,10 @@ class FrictionalContact:
     def natural_map(
         self, r: Vector, multipliers: Vector, omega: float | None = None
     ) -> float:
-        """Evaluate  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖,  zero at solutions.
+        """Return the scaled natural map, which is zero at solutions.
 
-        Π is the projector onto the friction cones.
+        The result is  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖  with the projector Π onto
+        the friction cones.
 
         Parameters
         ----------
@@ -214,7 +219,8 @@ def coulomb_steps(
     Parameters
     ----------
     loop : name of the sequence, one of `LOOPS`
-    solve : solves a convex problem; raises ArithmeticError if it has no solution
+    solve : function that solves a convex problem and raises ArithmeticError if the
+        problem has no solution
     count : largest number of problems; with 0, the sequence ends at convergence
 
     Raises

@@ -26,7 +26,8 @@ from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
 from mortarbench.problems.fem.mesh import Nodes
 
-#: functions that implement the methods "nts" and "mortar", by dimension
+#: mapping from the dimension to the functions that implement the methods "nts" and
+#: "mortar"
 METHODS: Mapping[int, tuple[Callable[..., ContactRows], Callable[..., ContactRows]]] = {
     2: (node_to_segment, mortar),
     3: (node_to_face, face_mortar),
@@ -44,7 +45,7 @@ def linearisation(
 
     The returned function raises InputError at zero displacement if no pair has a row.
 
-    contact : "nts" (node to segment, or node to face in space) or "mortar"; pairs with
+    contact : "nts" (node to segment, or node to face in 3D) or "mortar"; pairs with
         a rigid master have nodal rows
     basis : multiplier basis of mortar contact, "dual" or "standard"
     laws : friction law of each pair; empty without friction

@@ -18,13 +18,13 @@ node j
 
 *Balance.* At every Gauss point a row exerts the force Φ_j ν on the slave at x(ξ) and
 −Φ_j ν on the master at x(ξ) + g n, along the same line. Up to rounding, the forces of a
-row are hence in equilibrium and have no moment, even on curved sides. (With n_j outside
-the integrals, the moments would be O(h²). A body supported by contact alone would then
-rotate until a row far from the contact, at the end of an arc, balances the moments of
-the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1 − O(h²).
-In return, the integrands of D are polynomials, which the Gauss rule integrates exactly:
-D is independent of the position of the master's nodes, and a row of the dual basis acts
-on the slave along n_j.
+row are therefore in equilibrium and have no moment, even on curved sides. (With n_j
+outside the integrals, the moments would be O(h²). A body supported by contact alone
+would then rotate until a row far from the contact, at the end of an arc, balances the
+moments of the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1
+− O(h²). In return, the integrands of D are polynomials, which the Gauss rule integrates
+exactly: D is independent of the position of the master's nodes, and a row of the dual
+basis acts on the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -43,7 +43,7 @@ part, and N̄_j = N_j(ξ̄), the only linear solution is
 
     Φ_1 = N̄_1 − κ (ξ − ξ̄),   Φ_2 = N̄_2 + κ (ξ − ξ̄),   κ = 2 N̄_1 N̄_2 / v
 
-(for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
+For a fully covered segment, Φ_1 = 2N_1 − N_2 and Φ_2 = 2N_2 − N_1.
 
 Friction rows have (−ν_y, ν_x) in place of ν; across an open gap, their forces have a
 moment. For both bases, the friction bound of a row under Tresca's law is the bound of
@@ -75,8 +75,8 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-#: integration segments shorter than this, in ξ, are due to rounding of the projection
-#: and are dropped
+#: integration segments whose length in ξ is below this value are due to rounding of the
+#: projection and are dropped
 MIN_SEGMENT = 1e-8
 #: averaged normals of a straight side differ by at most this value. Smaller components
 #: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single
@@ -103,16 +103,16 @@ class Mortar:
 class Overlaps(NamedTuple):
     """Integration segments: overlaps of slave segments with master segments."""
 
-    slave: Nodes  #: (p,) slave segment, ascending
-    master: Nodes  #: (p,) master segment
+    slave: Nodes  #: (p,) slave segment of each integration segment, ascending
+    master: Nodes  #: (p,) master segment of each integration segment
     xi: NDArray[np.float64]  #: (p, 2) coordinates ξ of both ends, ascending
 
 
 class GaussPoints(NamedTuple):
     """Gauss points of the integration segments."""
 
-    slave: Nodes  #: (p,) slave segment, ascending
-    master: Nodes  #: (p,) master segment
+    slave: Nodes  #: (p,) slave segment of each integration segment, ascending
+    master: Nodes  #: (p,) master segment of each integration segment
     xi: NDArray[np.float64]  #: (p, 3) coordinate on the slave segment, in [−1, 1]
     beta: NDArray[np.float64]  #: (p, 3) coordinate on the master segment, in [0, 1]
     field: NDArray[np.float64]  #: (p, 3, 2) ν(ξ), |ν| ≤ 1
@@ -139,8 +139,8 @@ def mortar(
     slave, master : (s,), (v,) chains of nodes with their body on the left
     basis : multiplier basis, "dual" or "standard"
     reach : limits on the angle and distance of integration segments. Without a limit on
-        the angle, rays can graze a distant master. Weighted gaps between separate
-        bodies could then be negative, because the dual basis is negative in places
+        the angle, rays can graze a distant master side. Weighted gaps between separate
+        bodies could then be negative, because dual basis functions take negative values
     tangential : add tangential rows for friction
 
     Raises
@@ -259,7 +259,8 @@ def cast_rays(
     beta = np.clip(f_A / (f_A - f_B), 0.0, 1.0)
     gap = np.einsum("pgx,pgx->pg", A + beta[..., None] * (B - A) - x, n)
 
-    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])  # at the middle point
+    # cosine of the angle at the middle Gauss point
+    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])
     near = (cosine <= reach.cosine) & (
         np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )

@@ -8,10 +8,10 @@ order in the total displacement u, with N_a and n fixed at u^k,
     (x_s − x_c)·n ≥ 0    ⟺    B u ≤ c,    B = [−n at s, +N_a n at a],  c = g + B u^k
 
 This is the paper's B_M u ≤ c_M (Section 2). The paper calls the method "Mortar", but
-the condition is pointwise and fails the contact patch test; problems.contact.mortar
-passes it. The normal n is that of the segment that contains the closest point, or at a
-vertex the averaged normal of the two segments. If the closest point is inside a
-segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
+the condition is pointwise and fails the contact patch test; the method of
+`problems.contact.mortar` passes this test. The normal n is that of the segment that
+contains the closest point, or at a vertex the averaged normal of the two segments. If
+the closest point is inside a segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
 
 Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
@@ -24,8 +24,8 @@ master, and n is the normal of its last segment.
 
 A slave node can be assigned to a fixed segment. The node then stays on the outer side
 of the whole line through this segment, irrespective of its closest point. Newton's
-method requires this at a re-entrant vertex of the master, where the force of each
-segment pushes the node onto the other segment and the closest segment alternates
+method requires this assignment at a re-entrant vertex of the master, where the force of
+each segment pushes the node onto the other segment and the closest segment alternates
 between iterations.
 """
 
@@ -60,7 +60,8 @@ class ContactRows(NamedTuple):
     c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
-    #: (m_I,) length ∫N_j of the slave side assigned to the row, m; area in space, m²
+    #: (m_I,) ∫N_j over the slave side, the length in m (2D) or the area in m² (3D) that
+    #: is assigned to the row
     share: Vector
     place: Nodes  #: (m_I,) index of the slave node of each row in the slave chain
 

@@ -34,7 +34,7 @@ class BulkResults(NamedTuple):
     nodes: int
     elements: int
     supports: int  #: number of prescribed components
-    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m; J in space
+    energy: float  #: ½uᵀKu − fᵀu of eq. (1): J/m in 2D, J in 3D
     #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
     max_von_mises: Sequence[float]
 
@@ -74,7 +74,7 @@ def results_of(
     `energy` is ½uᵀKu − fᵀu in J/m. `contact_force` is the total force −ΣBᵀλ of contact
     and friction on the body of the master (of the slave if the master is rigid) in N/m.
     With several pairs, `contact_force` is omitted, because the sum over pairs would be
-    meaningless. In space, energies are in J and forces in N. `max_von_mises` is the
+    meaningless. In 3D, energies are in J and forces in N. `max_von_mises` is the
     largest patch-recovered von Mises stress of each body in Pa. `contacts` contains the
     results of each pair, see `pair_results`. With friction, the items of
     `friction_quantities` are added.
@@ -116,7 +116,7 @@ def _contact_force(
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
-    # contact forces on both bodies cancel: sum over one of them
+    # the contact forces on both bodies cancel, so only those on one body are summed
     loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
@@ -158,7 +158,7 @@ def pair_results(
     `force` is the force on each body of the pair in N/m; `largest_pressure` is the
     largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if bodies
     overlap; `half_width` is half the undeformed length in m of the slave side under
-    pressure (in space, `pressed_area` is its area in m²). With friction,
+    pressure (in 3D, `pressed_area` is its area in m²). With friction,
     `friction_force` is the contribution of friction to the force on the slave in N/m,
     and `stick` and `slip` are the numbers of sticking and slipping slave nodes.
     """
@@ -169,7 +169,8 @@ def pair_results(
         total = side.force.sum(axis=0)
         force = {slave: total.tolist()}
         if pair.master.size:
-            force = {master: (0.0 - total).tolist()} | force  # 0.0 − x: avoids −0
+            # 0.0 − x avoids negative zeros
+            force = {master: (0.0 - total).tolist()} | force
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
         pressed = float(side.length[side.pressed(ACTIVE_THRESHOLD * largest)].sum())
         results[side.name] = {
@@ -239,8 +240,8 @@ def contact_forces(
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
     """Recover nodal stresses (N,) by name, Pa, from the displacement u (n,), m.
 
-    The components are sxx, syy and sxy in the plane, with szz = ν(σ_x + σ_y) in plane
-    strain, and all six in space. `von_mises` is computed from the recovered components
+    The components are sxx, syy and sxy in 2D, with szz = ν(σ_x + σ_y) in plane
+    strain, and all six in 3D. `von_mises` is computed from the recovered components
     instead of being recovered itself, so that all values are consistent.
     """
     stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))

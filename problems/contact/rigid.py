@@ -7,8 +7,8 @@ x = X + u^k and n fixed there,
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
 This linearisation is exact for planes. The nonzero entries of a row belong to a single
-node; hence the contact rows are orthonormal. Friction rows are T = −t at the node, with
-the tangents t.
+node; therefore, the contact rows are orthonormal. Friction rows are T = −t at the node,
+with the tangents t.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class RigidBody(Protocol):
-    """A rigid body, described by its signed distance function, positive outside."""
+    """A rigid body, described by its signed distance function (positive outside)."""
 
     def gap(self, x: Points) -> tuple[Vector, Points]:
         """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
@@ -54,7 +54,7 @@ class RigidPlane:
 
 @dataclass(frozen=True)
 class RigidSphere:
-    """A ball, or a disc in the plane."""
+    """A ball in 3D, or a disc in 2D."""
 
     centre: tuple[float, ...]  #: position of the centre, m
     radius: float  #: radius, m
@@ -66,7 +66,7 @@ class RigidSphere:
 
 @dataclass(frozen=True)
 class RigidCylinder:
-    """An infinite circular cylinder in space."""
+    """An infinite circular cylinder in 3D."""
 
     point: tuple[float, ...]  #: a point on the axis, m
     axis: tuple[float, ...]  #: unit vector along the axis
@@ -82,8 +82,8 @@ def _gap_from_centre(offset: Points, radius: float) -> tuple[Vector, Points]:
     distance = np.linalg.norm(offset, axis=1)
     if not distance.all():
         raise InputError(
-            "a contact node is at the centre of a rigid sphere or cylinder, expected "
-            "nodes near its surface"
+            "a contact node is at the centre of a rigid sphere or on the axis of a "
+            "rigid cylinder; expected nodes near the surface"
         )
     return distance - radius, offset / distance[:, None]
 
@@ -103,14 +103,15 @@ def rigid_rows(
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement u^k at which to linearise, m
-    side : boundary of a `Mesh`
+    side : nodes or faces of the side, a boundary of a `Mesh`
     clamped : nodes of the side whose components are all prescribed; they have no row
     tangential : add tangential rows for friction
 
     Raises
     ------
     InputError
-        If a position is not finite, or at the centre of a sphere or cylinder.
+        If a position is not finite, at the centre of a sphere, or on the axis of a
+        cylinder.
 
     """
     dim, nodes = points.shape[1], side if side.ndim == 1 else np.unique(side)
@@ -136,6 +137,7 @@ def _rows(values: Points, components: Nodes, n: int) -> csr_array:
     k, dim = values.shape
     start = dim * np.arange(k + 1)
     parts = values.ravel(), components.ravel(), start
-    rows = csr_array(parts, shape=(k, n), copy=True)  # the next line works in place
+    # copy, because the next line works in place
+    rows = csr_array(parts, shape=(k, n), copy=True)
     rows.eliminate_zeros()
     return rows

@@ -66,12 +66,12 @@ class Chords(NamedTuple):
 
     start: Points  #: (k, 2) position of the first node, m
     edge: Points  #: (k, 2) vector from the first to the last node, m
-    inverse: Vector  #: (k,) 1/|edge|², 0 where a sub-chain closes on itself
-    deviation: Vector  #: (k,) δ, m
+    inverse: Vector  #: (k,) 1/|edge|², 0 if the ends of a sub-chain coincide
+    deviation: Vector  #: (k,) deviation δ, m
 
 
-#: maps a level and pairs of a query (p,) and a sub-chain (p,) to a mask of the pairs
-#: whose sub-chains are visited
+#: function that maps a level and pairs of a query (p,) and a sub-chain (p,) to a mask
+#: of the pairs whose sub-chains are visited
 Criterion = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 
 
@@ -203,7 +203,7 @@ def _to_chords(x: Points, level: Chords, node: Nodes) -> tuple[Vector, Vector]:
 
 
 def _minimum_per_query(values: Vector, query: Nodes) -> Vector:
-    """Return for each pair the minimum over its query (queries are sorted)."""
+    """Return, for each pair, the minimum over the pairs of its query (sorted)."""
     first = _first_of_each(query)
     pairs = np.diff(first, append=query.size)
     return np.minimum.reduceat(values, first).repeat(pairs)

@@ -40,12 +40,12 @@ def contact_sides(
 
     The nodal force is the sum of the contact and friction forces on a slave node. The
     pressure is the component of the contact force against the outward normal of the
-    deformed side, divided by the undeformed length ∫N_j (in space, area) that belongs
+    deformed side, divided by the undeformed length ∫N_j (in 3D, area) that belongs
     to the node. The gap is the slack c − Bu of the row of the node; with mortar
     contact, it is the mean gap around the node, weighted as in the row.
 
     With friction, the shear is the friction force along the tangent (−n_y, n_x),
-    divided by the same length; in space, it is the norm of the friction force, divided
+    divided by the same length; in 3D, it is the norm of the friction force, divided
     by the area. A node with a row has one of the `states`; the state of a node without
     a row is the empty string.
     """
@@ -151,7 +151,7 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Return, for each pair, the slice of its rows in B (m, n)."""
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
-    # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
+    # (m, N) nodes of each row, and for each pair a mask of the rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
     slices, first = [], 0
     for pair in bodies.pairs:

@@ -80,11 +80,11 @@ class Stage:
     """One linearisation of a load step."""
 
     step: int  #: number of the load step, 1, 2, …
-    part: float  #: load factor: fraction of `forces` that acts
+    part: float  #: load factor: the fraction of `forces` that acts
     forces: Forces  #: full load
     fixed: Nodes  #: components fixed by supports
     laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty without friction
-    #: map from the end of the preceding stage to the initial state of this one
+    #: map from the final state of the preceding stage to the initial state of this one
     begin: Callable[[State], State] = continue_slip
 
 
@@ -99,8 +99,8 @@ def load_steps(
 ) -> tuple[Stage, ...]:
     """Return the stages of a load that grows in equal steps, `relin` stages per step.
 
-    quasi_static : measure slip from the end of the preceding load step; if False, from
-        the undeformed state
+    quasi_static : True to measure slip from the end of the preceding load step, False
+        to measure slip from the undeformed state
     """
     return tuple(
         Stage(
@@ -145,7 +145,8 @@ class Iterate(NamedTuple, Generic[P]):
 
     problem: P
     friction: Friction  #: friction with the bound of this iterate
-    solution: Callable[[], Solution]  #: returns the dual solution, computed only once
+    #: function that returns the dual solution, which is computed only once
+    solution: Callable[[], Solution]
 
 
 @dataclass(frozen=True, eq=False)

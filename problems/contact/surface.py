@@ -1,6 +1,7 @@
 """Contact sides in the current configuration: facets, normals and nodal areas.
 
-In the plane, facets are the segments of a chain of nodes; in space, faces of cells.
+In 2D, facets are the segments of a chain of nodes; in 3D, facets are the faces of
+cells.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
 )
 
-Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
+Points = NDArray[np.float64]  #: (…, dim) positions in m, or dimensionless vectors
 
-#: segments shorter than this times the longest one of their chain count as points,
-#: because their direction is dominated by rounding
+#: segments shorter than this fraction of the longest segment of their chain count as
+#: points, because their direction is dominated by rounding
 MIN_RELATIVE_LENGTH = 1e-12
 
 
@@ -32,7 +33,7 @@ class Surface:
     A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
     a face is that of the plane through the midpoints of its edges. The normal of a node
     is the normalised sum of the normals of its facets (the averaged nodal normal of
-    Popp, Gee and Wall 2009, without weights). In the plane, a node at an end of the
+    Popp, Gee and Wall 2009, without weights). In 2D, a node at an end of the
     chain has one facet, any other node has two.
     """
 
@@ -59,7 +60,7 @@ class Surface:
 
     @property
     def areas(self) -> Vector:
-        """Nodal areas ∫N_j (v,), m²; in the plane lengths, m."""
+        """Nodal ∫N_j (v,): lengths in m (2D), or areas in m² (3D)."""
         if self.x.shape[1] == 2:
             return nodal_lengths(self.x)
         return nodal_areas(self.x, self.facets)[1]
@@ -107,7 +108,7 @@ def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Poi
     if not np.isfinite(x).all():
         k = int(np.flatnonzero(~np.isfinite(x).all(axis=1))[0])
         raise InputError(
-            f"contact {name}: node {nodes[k]} is at {x[k].tolist()}, expected a "
+            f"contact {name}: node {nodes[k]} is at {x[k].tolist()}; expected a "
             "finite position"
         )
     return x
@@ -120,7 +121,7 @@ def surface(x: Points, name: str) -> Surface:
     first = np.flatnonzero(length > MIN_RELATIVE_LENGTH * length.max(initial=0.0))
     if not len(first):
         raise InputError(
-            f"contact {name}: {len(x)} node(s) and no segment of positive length, "
+            f"contact {name}: {len(x)} node(s) and no segment of positive length; "
             "expected a chain of at least two nodes"
         )
     normal = -tangents(edge[first] / length[first, None])[:, 0]
@@ -134,7 +135,7 @@ def surface(x: Points, name: str) -> Surface:
 
 
 def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
-    """Return the faces (f, 4) and normals of a side in space at positions x (v, 3)."""
+    """Return the faces (f, 4) and normals of a side in 3D at positions x (v, 3)."""
     a, b, c, d = np.moveaxis(x[faces], 1, 0)
     area = np.cross(c - a, d - b)  # twice the area vector, also for triangles (c = d)
     size = np.linalg.norm(area, axis=1, keepdims=True)
@@ -142,7 +143,7 @@ def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
     if flat.any():
         raise InputError(
             f"contact {name}: the face around {x[faces[flat.argmax()]].mean(axis=0)} "
-            "has no area, expected faces with distinct corners"
+            "has no area; expected faces with distinct corners"
         )
     normal = area / size
     mean = np.zeros_like(x)
@@ -157,8 +158,8 @@ def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
 def tangents(normal: Points) -> Points:
     """Return unit tangents (…, dim − 1, dim) of unit normals (…, dim).
 
-    In the plane, the tangent is the normal rotated anticlockwise by a right angle,
-    (−n_y, n_x). In space, there are two orthogonal tangents, which are −e_x and −e_y
+    In 2D, the tangent is the normal rotated anticlockwise by a right angle,
+    (−n_y, n_x). In 3D, there are two orthogonal tangents, which are −e_x and −e_y
     for the normal e_z (Duff et al., Building an orthonormal basis, revisited, J.
     Comput. Graph. Tech. 6, 2017).
     """

@@ -151,14 +151,15 @@ def contact_case(
 
     Parameters
     ----------
-    floating : factorises K and returns K⁺ with the rigid modes as kernel; called only
-        for the form `dual`
-    clamped : returns K⁺ with the fixed components eliminated; called only for the form
-        `dual-bounds`
-    supported : like `clamped`, but also for bodies that are supported by contact alone;
-        called to certify a solution
-    quantities : evaluates physical results from a solution of the primal problem; the
-        z of this solution lists the multipliers of contact rows, then of friction rows
+    floating : function that factorises K and returns K⁺ with the rigid modes as kernel;
+        called only for the form `dual`
+    clamped : function that returns K⁺ with the fixed components eliminated; called only
+        for the form `dual-bounds`
+    supported : function like `clamped`, but also for bodies that are supported by
+        contact alone; called to certify a solution
+    quantities : function that evaluates physical results from a solution of the primal
+        problem; z of this solution lists the multipliers of the contact rows, then
+        those of the friction rows
     friction : friction law with a prescribed bound; the objective includes its work
     parts : decomposed problem; if present, `form` is ignored and the case is its dual
 

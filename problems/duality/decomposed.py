@@ -238,12 +238,12 @@ def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
 class LinearisedSides:
     """Nondimensional linearised contact, restricted to nodes of the contact sides."""
 
-    bodies: ContactSides  #: contact sides with N nodes in all
+    bodies: ContactSides  #: contact sides with a total of N nodes
     node: Nodes  #: (N,) global numbers of these nodes
     nodes: int  #: number of nodes of the bodies
     B: csr_array  #: (m, dim·N) contact rows B u ≤ c in local components
     c: Vector  #: (m,) right-hand side
-    friction: Friction  #: without rows if there is no friction
+    friction: Friction  #: friction rows; empty without friction
     place: Nodes  #: (m,) slave node of each row
 
     @property
@@ -398,8 +398,9 @@ def elastic_class(
     )
 
 
-BATCH_NODES = 2**15  #: nodes per batch of subdomains; limits the memory for stresses
-#: layers of cells around a node on which its recovered stress may depend
+#: number of nodes per batch of subdomains; limits the memory for stresses
+BATCH_NODES = 2**15
+#: number of layers of cells around a node on which its recovered stress may depend
 STRESS_LAYERS = 3
 
 

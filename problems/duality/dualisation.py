@@ -6,8 +6,8 @@ to a solution (point and all multipliers) of the primal problem.
 
 Friction with a prescribed bound g adds Σ g‖Tu − s‖ to the objective. The friction rows
 T, s follow the contact rows in B and c, and the friction multipliers λ_t follow those
-of contact in z of the primal solution. They satisfy ‖λ_t‖ ≤ g: bounds in the plane,
-discs in space.
+of contact in z of the primal solution. They satisfy ‖λ_t‖ ≤ g, a bound in 2D and a disc
+in 3D.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Transformed(NamedTuple):
     recover: Callable[[Solution], Solution]
     sign: float  #: primal objective = sign·new objective + constant, at the solutions
     constant: float
-    #: returns a primal point (n,) that is valid at the interface only; cheaper than
-    #: `recover`
+    #: function that returns a primal point (n,), which is valid at the interface only;
+    #: it is cheaper than `recover`
     interface_displacement: Callable[[Solution], Vector]
 
 

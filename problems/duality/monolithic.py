@@ -54,11 +54,12 @@ MAX_REFERENCE_RESIDUAL = 1e-6
 class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
 
-    bodies: Bodies  #: with the load and the supports of the stage
-    primal: QP  #: equation (1) of the paper
+    bodies: Bodies  #: bodies with the load and the supports of the stage
+    primal: QP  #: QP of equation (1) of the paper
     friction: Friction
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
-    #: returns the dual with the initial friction bounds, which `solve` replaces
+    #: function that returns the dual with the initial friction bounds, which `solve`
+    #: replaces
     dual: Callable[[], Transformed]
     reference: Reference
     part: float  #: load factor
@@ -138,8 +139,8 @@ def load_path(
 
     Parameters
     ----------
-    factorise : returns the generalised inverse K⁺ that `transform` requires; called
-        once, before the first solve
+    factorise : function that returns the generalised inverse K⁺ that `transform`
+        requires; called once, before the first solve
     laws : friction law of each contact pair; empty without friction
     initial_force : normal force per slave node at the start of the fixed-point
         iteration for Coulomb's law

@@ -29,10 +29,10 @@ descent direction of the exact penalty function (Nocedal and Wright, (18.27))
 
     φ(u) = Π(u) + w Σ max(0, −g_i(u)),
 
-and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A
-full step that halves the smallest residual so far is accepted without this test,
-because curved constraints may increase φ near the solution (Maratos effect). Each such
-step halves the smallest residual; hence only finitely many occur.
+and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A full
+step that halves the smallest residual so far is accepted without this test, because
+curved constraints may increase φ near the solution (Maratos effect). Each such step
+halves the smallest residual; therefore, only finitely many such steps occur.
 
 *Vertices*: where the master surface is concave, a slave node may alternate between two
 segments. If the iteration does not converge, pressing nodes (those with multipliers
@@ -98,7 +98,7 @@ TOLERANCE = 1e-9  #: largest `NewtonPath.residual` at the end of a load step
 #: are differences of displacements
 FORCE_ROUNDING = 2 * float(np.finfo(float).eps)
 MAX_ITERATIONS = 60  #: largest number of Newton iterations at one load
-KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
+KEEP_AFTER = 20  #: number of iterations after which pressing nodes keep their segments
 MAX_HALVINGS = 8  #: largest number of halvings of a load increment
 MIN_STEP = 2.0**-16  #: smallest step length of the line search
 #: rounding error of the merit function relative to the energies; without this
@@ -111,8 +111,8 @@ ARMIJO_FRACTION = 1e-4  #: required fraction of the decrease predicted by the sl
 PENALTY_FACTOR = 1.5
 MAX_ROTATION = 1e-8  #: largest rotational fraction of a motion that counts as rounding
 
-#: maps a displacement (n,) in m and multipliers (m,) in N/m to blocks −λ_i g_i''(u),
-#: (m, k, k) in Pa, and their displacement components (m, k)
+#: function that maps a displacement (n,) in m and multipliers (m,) in N/m to blocks
+#: −λ_i g_i''(u), (m, k, k) in Pa, and their displacement components (m, k)
 Curvature = Callable[[Vector, Vector], tuple[NDArray[np.float64], NDArray[np.int64]]]
 
 
@@ -120,10 +120,11 @@ class Gaps(NamedTuple):
     """The gaps of the contact rows as functions of the displacement."""
 
     linearise: Linearise
-    curvature: Curvature | None = None  #: None if contact stiffness is neglected
-    #: returns, for a displacement (n,) in m and a mask (places,) of slave nodes, gaps
-    #: with these nodes kept on their closest segments; None if the method of contact
-    #: has no segments, or if nodes already keep their segments
+    #: function that evaluates contact stiffness; None to neglect it
+    curvature: Curvature | None = None
+    #: function that returns, for a displacement (n,) in m and a mask (places,) of slave
+    #: nodes, gaps with these nodes kept on their closest segments; None if the method
+    #: of contact has no segments, or if nodes already keep their segments
     keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
@@ -141,7 +142,7 @@ class Iteration:
     rows: ContactRows
     gaps: Gaps
     u: Vector  #: u^j (n,), nondimensional
-    load_factor: float  #: κ
+    load_factor: float  #: load factor κ
     #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, the constant of the quadratic model of Π
     constant: float
     clipped: int  #: number of cells whose tangent was made positive semidefinite
@@ -157,7 +158,7 @@ class Configuration(NamedTuple):
     rows: ContactRows
     gap: Vector  #: (m,) gaps of the contact rows, nondimensional
     cells: EnergyDerivatives
-    energy: float  #: Π(u), nondimensional
+    energy: float  #: potential energy Π(u), nondimensional
     r: Vector  #: (n,) gradient Π'(u)
 
 
@@ -173,8 +174,8 @@ class NewtonPath:
 
     """
 
-    bodies: Bodies  #: with K of the undeformed bodies
-    cells: Cells  #: nondimensional, like K
+    bodies: Bodies  #: undeformed bodies and their stiffness matrix K
+    cells: Cells  #: data of the cells, nondimensional like K
     gaps: Gaps
     reference: Reference
     steps: int = 1
@@ -398,7 +399,7 @@ class NewtonPath:
         """Return a bound on the rounding error of `residual`.
 
         Strains are differences of displacements. The rounding error of the forces Ku is
-        hence proportional to |K||u|, however small Ku is.
+        therefore proportional to |K||u|, however small Ku is.
         """
         rounded = self._free_norm(abs(iteration.tangent.K) @ np.abs(at.u))
         return FORCE_ROUNDING * rounded / self._forces(at, lam, iteration.load_factor)
@@ -406,7 +407,7 @@ class NewtonPath:
     def _linearise(
         self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps
     ) -> Iteration:
-        """Assemble the QP (1) at a configuration and solve it."""
+        """Assemble the QP (1) at a configuration, and solve this QP."""
         K, inverse, clipped = self._convex(at, lam, gaps.curvature)
         tangent = replace(self.bodies, K=K, f=K @ at.u - at.r)
         primal = primal_qp(tangent, at.rows)

@@ -50,7 +50,7 @@ def newton_path(
 ) -> NewtonPath:
     """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
-    linearise : linearises contact by the method that `params` select
+    linearise : function that linearises contact by the method that `params` select
     params : keys of the case; `material` is required, `contact` and
         `contact_stiffness` are optional
     """
@@ -105,7 +105,8 @@ def newton_case(
     Parameters
     ----------
     step, newton : see `NewtonPath.iteration`
-    results : evaluates further quantities from a solution of the primal problem
+    results : function that evaluates further quantities from a solution of the primal
+        problem
 
     """
     at = path.iteration(step, newton)

@@ -75,9 +75,9 @@ class Shape(Protocol):
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Contact sides by name: chains of nodes in the plane, faces in space.
+        """Contact sides by name: chains of nodes in 2D, faces in 3D.
 
-        In the plane, this property does not generate the mesh.
+        In 2D, this property does not generate the mesh.
         """
 
     def layout(self, size: int) -> Subdivision:
@@ -100,7 +100,7 @@ class _Joined(Generic[B]):
 
     @property
     def mesh(self) -> Mesh:
-        """All bodies, m."""
+        """Joined mesh of all bodies, m."""
         return self._joined[0]
 
     @property
@@ -139,9 +139,11 @@ class HalfDiscs(_Joined[HalfDisc]):
 class StructuredSolids:
     """Boxes of hexahedra, possibly deformed; subdomains are compact blocks of cells."""
 
-    #: numbered as in `problems.fem.mesh.box`; the names of all boundaries are distinct
+    #: one mesh per body, numbered as in `problems.fem.mesh.box`; the names of all
+    #: boundaries are distinct
     parts: tuple[Mesh, ...]
-    divisions: tuple[tuple[int, int, int], ...]  #: cells of each part along x, y and z
+    #: numbers of cells of each box along x, y and z
+    divisions: tuple[tuple[int, int, int], ...]
     dim = 3
 
     @cached_property
@@ -150,7 +152,7 @@ class StructuredSolids:
 
     @property
     def mesh(self) -> Mesh:
-        """All bodies, m."""
+        """Joined mesh of all bodies, m."""
         return self._joined[0]
 
     @property
@@ -217,11 +219,11 @@ class ElasticBodies:
 
     shape: Shape
     names: tuple[str, ...]
-    materials: tuple[Material, ...]  #: one per body
-    plane: Plane | None  #: None in space
-    length: float  #: l, m: unit of length of the QPs
-    force: float  #: F₀, N/m in the plane, N in space: unit of force of the QPs
-    fixed: Nodes  #: components with u = 0
+    materials: tuple[Material, ...]  #: material of each body
+    plane: Plane | None  #: plane state; None in 3D
+    length: float  #: l, unit of length of the QPs, m
+    force: float  #: F₀, unit of force of the QPs: N/m in 2D, N in 3D
+    fixed: Nodes  #: displacement components that are prescribed as zero
     forces: Forces  #: full load
     pairs: tuple[ContactPair, ...]
 
@@ -303,7 +305,7 @@ class InterfaceState(NamedTuple):
     """Data and solution of a contact problem at all nodes, or only at contact sides."""
 
     bodies: Bodies | ContactSides
-    #: QP for the nodes of `bodies`; of P only the diagonal is used, and only with
+    #: QP for the nodes of `bodies`; only the diagonal of P is used, and only with
     #: friction
     primal: QP
     solution: Solution
@@ -314,7 +316,7 @@ class DisplacedMesh(NamedTuple):
     """Cells of one body with their displacement."""
 
     body: int  #: number of the body
-    mesh: Mesh  #: N nodes
+    mesh: Mesh  #: mesh of the cells, with N nodes
     #: (N,) False for nodes that belong only to added layers of neighbouring cells
     inner: NDArray[np.bool_]
     u: Vector  #: (dim·N,) displacement, m
@@ -342,7 +344,7 @@ class ContactSolution(Protocol):
 
 
 def no_further_results(solution: ContactSolution) -> dict[str, Any]:
-    """Return {}: no quantities beyond those common to all elastic bodies."""
+    """Return an empty dictionary: a problem without further quantities."""
     return {}
 
 
@@ -359,7 +361,7 @@ class ContactProblem:
     ]
     #: normal force per slave node for the first friction bound of Coulomb's law
     initial_force: float = 0.0
-    #: evaluates quantities beyond those common to all elastic bodies
+    #: function that evaluates quantities beyond those common to all elastic bodies
     results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
     #: (k, 3) with the columns x in m, exact pressure and exact shear in Pa on the slave
     #: side; None if unknown
@@ -369,11 +371,13 @@ class ContactProblem:
 class Choice(NamedTuple):
     """Selection of one QP of a contact problem."""
 
-    step: int = 1  #: load step, from 1
-    iterate: int = 0  #: fixed-point iterate for Coulomb's law, from 1; 0: the last one
-    size: int = 0  #: argument of `Shape.layout`; 0: undivided bodies
+    step: int = 1  #: number of the load step, from 1
+    #: number of the fixed-point iterate for Coulomb's law, from 1; 0 for the last one
+    iterate: int = 0
+    size: int = 0  #: argument of `Shape.layout`; 0 for undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
-    cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
+    #: number of subdomains along a side of a cluster; 0 for no clusters
+    cluster: int = 0
 
 
 #: keys of a case that select one of the QPs of a problem

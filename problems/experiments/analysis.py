@@ -25,7 +25,8 @@ from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 
-#: variants by name; True if K⁺ is condensed onto the interface
+#: mapping from the name of a variant to True if the variant condenses K⁺ onto the
+#: interface
 VARIANTS = {
     "per-row": False,
     "condensed": True,
@@ -40,7 +41,7 @@ class Analysis:
     primal: QP  #: primal QP of the last step
     solution: Solution  #: solution of the last step
     dual: QP  #: dual QP of the last step
-    laps: Laps  #: seconds of each part, summed over all steps
+    laps: Laps  #: mapping from each part to its time in s, summed over all steps
 
 
 def analyse(
@@ -92,7 +93,7 @@ def analyse(
 
 
 def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
-    """Time both variants for each mesh of the rectangle, Figure 6."""
+    """Time both variants for each mesh of the rectangle (Figure 6)."""
     first = plan.scaling[0]
     for Nr in plan.scaling:
         run = partial(analyse, Nr, plan.Nh, steps=plan.steps)

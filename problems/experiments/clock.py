@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
-Laps = Mapping[str, float]  #: seconds by name of the timed part
+Laps = Mapping[str, float]  #: mapping from the name of a timed part to its time in s
 Contestant = Callable[[], Laps]  #: method that runs once and returns its times
 
 
@@ -27,7 +27,7 @@ class Rounds:
 
 
 class Stopwatch:
-    """Stopwatch that accumulates seconds by name of the timed part."""
+    """Stopwatch that accumulates the time of each named part, s."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}

@@ -53,7 +53,7 @@ def counts(Nr: int, Nh: int) -> Rows:
 
 
 def assembly(plan: Plan) -> Rows:
-    """Time the assembly of the stiffness matrix of the rectangle, Figure 3."""
+    """Time the assembly of the stiffness matrix of the rectangle (Figure 3)."""
     D = elasticity_matrix(BEAM, "strain")
     for Nr in plan.assembly:
         mesh = beam(Nr)
@@ -70,7 +70,7 @@ def assembly(plan: Plan) -> Rows:
 
 
 def contact(plan: Plan) -> Rows:
-    """Time one linearisation of contact at u = 0, Figure 4."""
+    """Time one linearisation of contact at u = 0 (Figure 4)."""
     for Nr in plan.contact[0]:
         for Nh in plan.contact[1]:
             # the number of layers of the ring (2) has no effect on contact
@@ -87,7 +87,7 @@ def contact(plan: Plan) -> Rows:
 
 
 def inverse(plan: Plan) -> Rows:
-    """Time the construction of K⁺ of the rectangle and the product K⁺v, Figure 5."""
+    """Time the construction of K⁺ of the rectangle and the product K⁺v (Figure 5)."""
     D = elasticity_matrix(BEAM, "strain") * (LENGTH / LOAD)
     random = np.random.default_rng(2024)
     for Nr in plan.inverse:

@@ -20,10 +20,10 @@ from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
 #: numbers of load steps and of linearisations per step for which the result is
-#: converged: larger numbers do not change it
+#: converged: larger numbers do not change the result
 CONVERGED = (2, 8)
 
-#: keys of a case by the name of its contact method in figures
+#: mapping from the name of a contact method in figures to the keys of its case
 ROWS: Mapping[str, Mapping[str, Value]] = {
     "nts": {"contact": "nts"},
     "mortar": {"contact": "mortar", "basis": "dual"},
@@ -67,10 +67,10 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     """Yield contact pressures along the arc for each load step and contact method.
 
     A row contains contact, step, node, angle in degrees, length in m, force in N/m and
-    pressure in Pa of one slave node j. The angle is that of the undeformed node about
-    the centre of the ring, measured from the right foot. The length is ∫N_j ds over the
-    arc, the force is the magnitude ‖(Bᵀλ)_j‖ of the contact force on the node, and the
-    pressure is force per length.
+    pressure in Pa of one slave node j. The angle is the polar angle of the undeformed
+    node about the centre of the ring, measured from the right foot. The length is ∫N_j
+    ds over the arc, the force is the magnitude ‖(Bᵀλ)_j‖ of the contact force on the
+    node, and the pressure is force per length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
     inverse = factorise_clamped(bodies)

@@ -11,23 +11,27 @@ from mortarbench.problems.experiments.clock import Rounds
 class Plan:
     """Parameters of all experiments, most of which the paper does not state."""
 
-    assembly: tuple[int, ...]  #: Nr of Figure 3
+    assembly: tuple[int, ...]  #: values of Nr in Figure 3
     assembly_rounds: Rounds
-    contact: tuple[tuple[int, ...], tuple[int, ...]]  #: Nr and Nh of Figure 4
+    #: values of Nr and of Nh in Figure 4
+    contact: tuple[tuple[int, ...], tuple[int, ...]]
     contact_rounds: Rounds
-    inverse: tuple[int, ...]  #: Nr of Figure 5
+    inverse: tuple[int, ...]  #: values of Nr in Figure 5
     inverse_rounds: Rounds
     dense: int  #: largest number of dofs for which a dense pseudoinverse is computed
-    scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; Table 1 uses the last
+    #: values of Nr in Figure 6, ascending; Table 1 uses the last
+    scaling: tuple[int, ...]
     scaling_rounds: Rounds
-    Nh: int = 15  #: Nh of Figures 6, 7 and Table 1
-    example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
-    steps: int = 10  #: load steps
-    stepped: tuple[int, int]  #: Nr, Nh of the study of load stepping
+    Nh: int = 15  #: value of Nh in Figures 6, 7 and Table 1
+    example: tuple[int, int] = (4, 3)  #: values of Nr and Nh in Figure 2
+    steps: int = 10  #: number of load steps
+    stepped: tuple[int, int]  #: values of Nr and Nh in the study of load stepping
     stepping: tuple[int, ...]  #: numbers of load steps in this study
-    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations per step in this study
-    patch: tuple[int, ...]  #: elements along the upper block of the patch test
-    hertz: tuple[int, ...]  #: elements per half width of Hertz's contact
+    #: numbers of linearisations per step in this study
+    relin: tuple[int, ...] = (1, 2, 3)
+    #: numbers of elements along the upper block of the patch test
+    patch: tuple[int, ...]
+    hertz: tuple[int, ...]  #: numbers of elements per half width of Hertz's contact
 
 
 PAPER = Plan(

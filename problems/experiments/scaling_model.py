@@ -36,7 +36,8 @@ from dataclasses import dataclass
 from math import ceil, log2, prod, sqrt
 
 BYTES = 8  #: bytes of a floating-point number
-REPLICATED = 20_000  #: largest coarse problem whose inverse may be explicit
+#: largest number of unknowns of a coarse problem whose inverse may be explicit
+REPLICATED = 20_000
 ENTRY = 12  #: bytes of an entry of a sparse matrix, including its index
 #: global reductions per product with F; 4.4 to 6.8 were counted for cube-wall, n = 32
 REDUCTIONS = 6.5
@@ -71,10 +72,12 @@ class Distribution:
     """Distribution of a cube of subdomains over cores."""
 
     cores: int
-    per_core: float = 8.0  #: subdomains per core
-    cells: int = 8  #: H/h, cells per side of a subdomain
-    cluster: float = 1.0  #: m, subdomains per side of a cluster; 1 for no clusters
-    components: int = 3  #: components per node: 3 in elasticity, 1 in heat transfer
+    per_core: float = 8.0  #: number of subdomains per core
+    cells: int = 8  #: H/h, number of cells per side of a subdomain
+    #: m, number of subdomains per side of a cluster; 1 for no clusters
+    cluster: float = 1.0
+    #: number of components per node: 3 in elasticity, 1 in heat transfer
+    components: int = 3
     congruent: bool = False  #: True if all subdomains of a core share a block
 
     @property
@@ -84,7 +87,7 @@ class Distribution:
 
     @property
     def grid(self) -> tuple[int, int, int]:
-        """Numbers of cores along the edges of the cube: those with the smallest sum."""
+        """Numbers of cores along the three edges of the cube, with the smallest sum."""
         grids = (
             (p, q, self.cores // p // q)
             for p in _divisors(self.cores)
@@ -115,13 +118,13 @@ class Distribution:
 
         A node with one copy in each of c subdomains on k cores has c − 1 rows per
         component, for which each of these cores sends 2(1 − 1/k)(c − 1) values on
-        average. Both c and k are products of one factor per axis; the factor of k is 2
-        on the faces between bricks, otherwise 1. Hence, the sums of 1, c, 1/k and c/k
-        over the nodes of a brick are also products of one factor per axis.
+        average. Both c and k are products of one factor per axis; for k, the factor is
+        2 on the faces between bricks and 1 otherwise. Hence, the sums of 1, c, 1/k and
+        c/k over the nodes of a brick are also products of one factor per axis.
         """
         n, nodes, copies, share, copied = self.cells, 1.0, 1.0, 1.0, 1.0
         for cores, cuts in zip(self.grid, self.cuts, strict=True):
-            a = self.side / cores  # subdomains along the brick
+            a = self.side / cores  # number of subdomains along the brick
             nodes *= a * n + 1
             copies *= a * (n + 1) + cuts
             share *= a * n + 1 - cuts / 2
@@ -169,7 +172,7 @@ class Prediction:
     blocks: float  #: memory of the blocks (K⁺)_bb of a core's subdomains, B
     factors: float  #: memory of the factors of the stiffness of these subdomains, B
     coarse_memory: float  #: memory of the coarse problem, per core or on one node, B
-    steps: float  #: number of iterations relative to that without clusters
+    steps: float  #: number of iterations relative to a run without clusters
 
     @property
     def seconds(self) -> float:
@@ -215,7 +218,7 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
     else:
         coarse_memory = solve / 2
         coarse = solve / machine.node_bandwidth + gather
-    inner = s.components * (s.cells + 1) ** 3  # unknowns of a subdomain
+    inner = s.components * (s.cells + 1) ** 3  # number of unknowns of a subdomain
     factor = BYTES * factor_entries(inner, s.components)
     return Prediction(
         local=max(
@@ -241,7 +244,8 @@ def predict(run: Distribution, machine: Machine) -> Prediction:
 
 def _joints(s: Distribution, machine: Machine, distinct: float) -> float:
     """Return the time of a product with V M⁺Vᵀ, s."""
-    # columns of V for six faces and for the subdomain; unknowns of M⁺ of one cluster
+    # V has `modes` columns for each of six faces and for the subdomain itself;
+    # `unknowns` is the order of M⁺ of one cluster
     m, columns = s.cluster, 7 * s.modes
     unknowns = s.modes * (3 * m**2 * (m - 1) + m**3)
     inverse = BYTES * unknowns * (unknowns + 1) / 2 * s.per_core / m**3

@@ -28,7 +28,8 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_NODES = 50_000_000  #: limit due to the 32-bit indices of the entries of K
+#: largest number of nodes, due to 32-bit indices of the entries of K
+MAX_NODES = 50_000_000
 
 
 class BeamRing(ContactFamily):
@@ -55,8 +56,8 @@ class BeamRing(ContactFamily):
     problem = "beam_ring.problem"
     model = "beam_ring.newton_step"
     cells = ("Nr", "Nh", "radial", "depth")
-    #: the energy under the point load grows like log 1/h
-    singular = "the work of a point load grows without bound as its cell shrinks"
+    #: the energy under the point load grows like log(1/h)
+    singular = "the work of a point load grows without bound as the mesh is refined"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; `radial` defaults to 2·Nh, and `step` to `steps`."""
@@ -85,7 +86,7 @@ class BeamRing(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; raise InputError if friction is set.
+        """Return the keys of the case with half the mesh size; reject friction.
 
         The load steps of the refined case are solved on the refined mesh. Friction is
         not supported, because refinement changes the polygons of the arcs.

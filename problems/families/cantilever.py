@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 MIN_SLENDERNESS = 2.0  #: smallest ratio of length to thickness
-#: limits of PL²/EI, outside of which the formula of the elastica loses digits
+#: smallest and largest PL²/EI; outside this range, the formula of the elastica loses
+#: digits
 MIN_LOAD, MAX_LOAD = 1e-3, 1e3
 #: largest Poisson's ratio; closer to ½, the Cholesky factor of the tangent loses nearly
 #: all digits

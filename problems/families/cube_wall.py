@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class CubeWall(ContactFamily):
-    """An elastic cube in space, pressed down next to a rigid wall (PERMON)."""
+    """A three-dimensional elastic cube, pressed down next to a rigid wall (PERMON)."""
 
     name = "cube-wall"
     keys = schema(n=key(8, 1), **DECOMPOSITION)

@@ -38,10 +38,10 @@ class DeclaredFamily(Family):
     subdomains : module of `problems.models` whose `in_subdomains` returns the
         decomposed problem and whose `results` returns a function that evaluates
         solutions on ranks; empty if the family has no such module
-    cells : keys with numbers of cells, which refinement doubles if there is no key
-        `halvings`
-    conditions : checks that involve several keys, by the key that must be declared for
-        the check to apply
+    cells : keys that are numbers of cells; refinement doubles the values unless there
+        is a key `halvings`
+    conditions : mapping from a key to a check that involves several keys; the check
+        applies if the family declares the key
 
     """
 
@@ -67,18 +67,18 @@ class DeclaredFamily(Family):
             key.check(self.name, name, params)
         if p.get("step", 0) > p.get("steps", 0):
             raise InputError(
-                f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
+                f"{self.name}: step={p['step']} must be at most steps={p['steps']}"
             )
         for name, check in self.conditions.items():
             if name in params:
                 check(self.name, params)
 
     def instead_of(self, key: str) -> str:
-        """Return the key of a decomposition that excludes the key of another one."""
+        """Return the message for a key that the decomposition excludes, or ""."""
         return other_decomposition(key, self.keys)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size, or None if the family has no mesh.
+        """Return the keys of the case with half the mesh size, or None without a mesh.
 
         Refinement may change the polygons that approximate arcs.
 
@@ -102,9 +102,9 @@ class DeclaredFamily(Family):
     def emission(
         self, form: str, params: Mapping[str, Value]
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
-        """Return a function that assembles the subdomains of a rank in the dual.
+        """Return a function that assembles the local part of the dual on a rank.
 
-        None means that one process must assemble the whole case.
+        Return None if one process must assemble the whole case.
         """
         if form != "dual" or not self.is_divided(params):
             return None
@@ -140,7 +140,7 @@ class ContactFamily(DeclaredFamily):
     Attributes
     ----------
     problem : "MODULE.FUNCTION" of `problems.models` that returns the `ContactProblem`
-        for a mapping of all keys
+        for a mapping that contains all keys
     model : "MODULE.FUNCTION" of `problems.models` that returns the case of a Newton
         iteration if kinematics=finite; empty if the family has no such cases
 

@@ -48,7 +48,7 @@ class Fclib(FromFile):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Return the case of a convex problem, scaled by the largest W_ii and |q_i|.
+        """Return the case of one convex problem, scaled by max W_ii and max |q_i|.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class Fclib(FromFile):
         remarks = []
         if (rank := contact.rank) is not None and rank < contact.q.size:
             remarks.append(
-                f"W has rank {rank} of {contact.q.size}: the forces may not be unique"
+                f"W has rank {rank} of {contact.q.size}, so forces may not be unique"
             )
         stored = file.stored
         quantities: dict[str, Any] = {
@@ -98,8 +98,8 @@ class Fclib(FromFile):
             quantities |= {"stored_natural_map": error}
             if error > DUMMY:
                 remarks.append(
-                    "the solution that the file stores has a scaled natural map of "
-                    f"{error:.2g}: a dummy"
+                    "the scaled natural map of the stored solution is "
+                    f"{error:.2g}, so the stored solution is a dummy"
                 )
 
         def evaluate(s: Solution) -> dict[str, Any]:

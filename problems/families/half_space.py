@@ -10,7 +10,6 @@ from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
     LAW_KEYS,
-    LAW_PARAMETERS,
     MAX_SIZE,
     MIN_SIZE,
     choice,
@@ -72,7 +71,7 @@ class HalfSpace(DeclaredFamily):
         if needed > limit:
             raise InputError(
                 f"{self.name}: a grid of {p['n']} × {p['n']} cells takes {needed:.2g} "
-                f"MiB of memory; expected one that fits into {limit:.0f} MiB, or "
+                f"MiB of memory; expected a grid that fits into {limit:.0f} MiB, or "
                 f"{CASE_VARIABLE} set to the memory available"
             )
 
@@ -93,7 +92,7 @@ class HalfSpace(DeclaredFamily):
         if law == "rough" and p["n"] < MIN_ROUGH:
             raise InputError(
                 f"{self.name}: n={p['n']} must be at least {MIN_ROUGH} for law=rough, "
-                "two cells per shortest wave"
+                "two cells per shortest wavelength"
             )
         coulomb = law == "mindlin" or friction == "coulomb"
         users = {
@@ -114,8 +113,8 @@ class HalfSpace(DeclaredFamily):
         if friction == "tresca" and not MIN_SIZE <= bound <= MAX_SIZE:
             given = "" if bound == self.defaults["bound"] else f", got {bound:g}"
             raise InputError(
-                f"{self.name}: friction=tresca needs bound, {LAW_PARAMETERS['bound']}"
-                f"{given}"
+                f"{self.name}: friction=tresca needs bound, a traction between "
+                f"{MIN_SIZE:g} and {MAX_SIZE:g} Pa{given}"
             )
         if friction == "coulomb" and p["n"] > MAX_SOLVED:
             raise InputError(

@@ -90,8 +90,9 @@ class HertzCylinder(ContactFamily):
             for name, value in (("friction", "coulomb"), ("ratio", 1.0)):
                 if params[name] != value:
                     raise InputError(
-                        f"{self.name}: {name}={params[name]} with a tangential force; "
-                        f"expected {name}={value}, or no Q and no peak"
+                        f"{self.name}: {name}={params[name]} is not supported with a "
+                        f"tangential force; expected {name}={value}, or no Q and "
+                        "no peak"
                     )
             check_tangential(self.name, params)
             positive(self.name, params, ("mu",))
@@ -112,6 +113,6 @@ class HertzCylinder(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; reject cases with friction."""
+        """Return the keys of the case with half the mesh size; reject friction."""
         refuse_friction(self.name, params)
         return super().refined(params)

@@ -59,8 +59,8 @@ class HertzSphere(ContactFamily):
             )
         if params["Q"] and params["against"] == "plane":
             raise InputError(
-                f"{self.name}: Q={params['Q']} with against=plane; expected "
-                "against=sphere, where the exact solution is known"
+                f"{self.name}: Q={params['Q']} is not supported with against=plane; "
+                "expected against=sphere, for which the exact solution is known"
             )
         if params["mu"] != self.defaults["mu"] and not params["Q"]:
             raise InputError(

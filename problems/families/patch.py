@@ -64,8 +64,8 @@ class ContactPatch(ContactFamily):
         distort = float(params["distort"])
         if not 0 <= distort <= MAX_DISTORTION * (dim - 2):
             raise InputError(
-                f"{self.name}: distort={distort:g} with dim={dim}; expected 0, or with "
-                f"dim=3 at most {MAX_DISTORTION:g} of a cell"
+                f"{self.name}: distort={distort:g} is not supported with dim={dim}; "
+                f"expected 0, or with dim=3 at most {MAX_DISTORTION:g} of a cell"
             )
         stretch = float(params["stretch"])
         if stretch == self.defaults["stretch"]:
@@ -82,7 +82,7 @@ class ContactPatch(ContactFamily):
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys with half the mesh size; raise InputError for Coulomb's law.
+        """Return the keys of the case with half the mesh size; reject Coulomb's law.
 
         A block has ⌈n/2⌉ rows of cells. If n is odd, this number does not double
         exactly.

@@ -70,7 +70,7 @@ class Plate(DeclaredFamily):
         if p["supports"] == "eliminated" and p["Sx"] * p["Sy"] * p["Sz"] == 1:
             raise InputError(
                 f"{self.name}: supports=eliminated leaves a single subdomain without "
-                "any row; expected more subdomains, or supports=rows"
+                "any row of constraints; expected more subdomains, or supports=rows"
             )
 
         if p["supports"] == "eliminated" and p["cluster"]:

@@ -6,7 +6,7 @@
 #include <stddef.h>
 
 #define NODES 8 /* nodes of the largest element */
-#define DIM 3
+#define DIM 3   /* largest dimension */
 
 #if defined(__x86_64__) && defined(__gnu_linux__)
 /* Compile two versions, one of which is selected at load time. Both round identically,
@@ -30,7 +30,7 @@ static const int VOIGT[DIM + 1][DIM][DIM] = {
 typedef struct {
     int points, pairs;
     const double *gradients; /* (points, dim, n) gradients of the shape functions */
-    const double *weights;   /* (points,) */
+    const double *weights;   /* (points,) quadrature weights */
     const int *edges;        /* (dim, pairs, 2) first and last nodes of edges per axis */
 } element;
 

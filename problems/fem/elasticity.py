@@ -1,12 +1,12 @@
-"""Linear elasticity with linear and multilinear elements, in the plane and in space.
+"""Linear elasticity with linear and multilinear elements, in 2D and 3D.
 
-In the plane the element is the bilinear quadrilateral of the paper (Section 2);
+In 2D the element is the bilinear quadrilateral of the paper (Section 2);
 triangles are degenerate quadrilaterals with two coincident corners, see
 `problems.fem.mesh`.
 
-In Voigt's notation, strain is (ε_x, ε_y, γ_xy) in the plane and
-(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in space, and stress has the same order. In the plane,
-stiffness is per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m
+In Voigt's notation, strain is (ε_x, ε_y, γ_xy) in 2D and
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in 3D, and stress has the same order. In 2D,
+stiffness is per unit thickness: K is in Pa and forces are in N/m. In 3D, K is in N/m
 and forces are in N.
 """
 
@@ -56,7 +56,7 @@ class Material:
 
 
 def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
-    """Return D in σ = D ε, Pa: (3, 3) in plane strain or stress, (6, 6) in space."""
+    """Return D in σ = D ε, Pa: (3, 3) in plane strain or stress, (6, 6) in 3D."""
     E, nu = material.E, material.nu
     if plane == "stress":
         factor, off, shear = E / (1 - nu**2), nu, (1 - nu) / 2
@@ -158,7 +158,7 @@ def rigid_motions(points: Floats) -> Floats:
 
     The columns are a translation along each axis, followed by the linearised rotation
     x_k e_l − x_l e_k about the centroid of the nodes for each pair of axes (k, l). The
-    number r is 1 on a line, 3 in the plane and 6 in space.
+    number r is 1 in 1D, 3 in 2D and 6 in 3D.
     """
     N, dim = points.shape
     # about the centroid, rotations are orthogonal to translations
@@ -174,7 +174,7 @@ def rigid_motions(points: Floats) -> Floats:
 def rigid_modes(points: Floats) -> Floats:
     """Return an orthonormal basis R (n, r) of ker K of one body, see paper, eq. (4).
 
-    In the plane, the rigid motions of `rigid_motions` are already orthogonal. In space,
+    In 2D, the rigid motions of `rigid_motions` are already orthogonal. In 3D,
     the rotations are taken about the principal axes of inertia of the nodes, because
     rotations about the coordinate axes need not be orthogonal.
     """

@@ -11,11 +11,11 @@ Quadrilaterals and hexahedra are products of intervals, wedges are products of a
 triangle and an interval, and tetrahedra are single simplices. An isoparametric cell is
 the image of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
 
-The quadrature rule of a simplex has d + 1 points of equal weight, at centroid +
-(vertex − centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3
-on intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1).
-The stiffness of affine cells is therefore exact. If the cell is a single simplex,
-gradients are constant, and the centroid suffices.
+The quadrature rule of a simplex has d + 1 points of equal weight, at centroid + (vertex
+− centroid)/√(d + 2). It is exact for polynomials of degree 2, and of degree 3 on
+intervals (Stroud, Approximate calculation of multiple integrals, 1971, T_n: 2-1). The
+stiffness of affine cells is therefore exact. If the cell is a single simplex, gradients
+are constant, and the centroid suffices as quadrature point.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 class Element:
     """A product of simplices with n corners."""
 
-    kind: str  #: meshio's name for cells of this kind
+    kind: str  #: name of the cell type in meshio
     simplices: tuple[Ints, ...]  #: vertices (d + 1, d) of each simplex (factor)
     vertices: Ints  #: (n, factors) index of the vertex of each factor at a corner
 
@@ -119,8 +119,8 @@ class Element:
     def edges(self) -> NDArray[np.int32]:
         """First and last corners (dim, p, 2) of the edges along each axis.
 
-        Axis k of a simplex joins its vertices 0 and k + 1. An axis with fewer than p
-        edges is padded with pairs of equal corners.
+        Axis k of a simplex runs from vertex 0 to vertex k + 1. An axis with fewer than
+        p edges is padded with pairs of equal corners.
         """
         axes = []
         for f, simplex in enumerate(self.simplices):
@@ -156,7 +156,7 @@ TETRA = Element(
     simplices=(TETRAHEDRON,),
     vertices=np.arange(4)[:, None],
 )
-#: elements by dimension and number of corners
+#: mapping from the dimension and the number of corners to the element
 ELEMENTS = {
     (element.dim, len(element.vertices)): element
     for element in (QUAD, HEXAHEDRON, WEDGE, TETRA)

@@ -82,7 +82,7 @@ class Cells:
 class EnergyDerivatives(NamedTuple):
     """Strain energy of a displacement u, with its derivatives with respect to u."""
 
-    energy: float  #: Π
+    energy: float  #: strain energy Π
     forces: Vector  #: (n,)  r = ∂Π/∂u, internal forces
     tangents: Floats  #: (E, n·dim, n·dim)  ∂²Π_e/∂u² of each cell, see `assemble`
 
@@ -197,8 +197,8 @@ def convex_tangent(
     Parameters
     ----------
     tangents : tangents of the cells, see `EnergyDerivatives`
-    positive : returns True if K_t (n, n) is positive definite on the motions that the
-        supports allow, as tested by a Cholesky factorisation
+    positive : function that returns True if K_t (n, n) is positive definite on the
+        motions that the supports allow, as tested by a Cholesky factorisation
 
     Returns
     -------

@@ -2,7 +2,7 @@
 
 The farther apart the fixing nodes are, the better K is conditioned without their rows
 and columns. Fixing two neighbouring corners costs three digits of accuracy; fixing the
-central nodes of four parts of the body costs hardly any accuracy. In space the fixing
+central nodes of four parts of the body costs hardly any accuracy. In 3D the fixing
 nodes must not be collinear, because the body could rotate about their line.
 """
 
@@ -20,7 +20,7 @@ from mortarbench.problems.fem.mesh import Nodes
 #: number of fixing nodes per body; fewer nodes worsen the conditioning, more nodes
 #: increase the fill-in
 PARTS = 4
-#: fixing nodes in space count as collinear if their largest distance from the line of
+#: fixing nodes in 3D count as collinear if their largest distance from the line of
 #: best fit is below this multiple of the largest distance of a node of the last part.
 #: This ratio is at least 0.35 for blocks, and may be 0 for bars that are one cell wide
 MIN_DISTANCE = 0.25
@@ -31,7 +31,7 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
 
     The nodes at `points` (N, dim) are bisected recursively across their longest
     principal axis, until there are `parts` parts or a part is a single node. The node
-    nearest to the centroid of each part is selected. In space, if the selected nodes
+    nearest to the centroid of each part is selected. In 3D, if the selected nodes
     are nearly collinear, the last one is replaced by a node away from their line.
     """
     groups = [np.arange(len(points))]
@@ -84,7 +84,8 @@ def _graph(cells: Nodes, nodes: int) -> csr_array:
 def _bisected(graph: Matrix, group: Nodes) -> tuple[Nodes, Nodes]:
     part = laplacian(graph[group][:, group]).tocsc()
     shift = -1e-3 / group.size  # σ just below the zero eigenvalue: L − σI is definite
-    start = np.linspace(-1, 1, group.size)  # the default of eigsh is random
+    # fixed start, because the default of eigsh is random
+    start = np.linspace(-1, 1, group.size)
     values, vectors = eigsh(part, k=2, sigma=shift, which="LM", v0=start)
     order = group[np.argsort(vectors[:, values.argmax()], kind="stable")]
     return order[: len(order) // 2], order[len(order) // 2 :]

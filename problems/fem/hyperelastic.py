@@ -40,9 +40,9 @@ _CURVATURE_OF_J = np.einsum("ik,jl->ijkl", [[0, 1], [-1, 0]], [[0, 1], [-1, 0]])
 class Derivatives(NamedTuple):
     """Values and derivatives of a scalar function of F, at points (…)."""
 
-    value: Floats  #: (…)
-    first: Floats  #: (…, 2, 2)
-    second: Floats  #: (…, 2, 2, 2, 2)
+    value: Floats  #: (…) values
+    first: Floats  #: (…, 2, 2) first derivatives
+    second: Floats  #: (…, 2, 2, 2, 2) second derivatives
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class NeoHooke(Hyperelastic):
 
     def thickness_rate(self, F: Floats) -> Floats:
         """Return ∂θ/∂F₃₃ = J (…)."""
-        # det F = F₃₃ J₂ with the determinant J₂ in the plane
+        # det F = F₃₃ J₂ with the determinant J₂ of the in-plane part
         return determinant(F)
 
 
@@ -163,7 +163,7 @@ class StVenantKirchhoff(Hyperelastic):
 
     def dilatation(self, F: Floats) -> Derivatives:
         """Return θ = tr E with its derivatives."""
-        theta = (F**2).sum((-2, -1)) / 2 - 1  # tr E = ½ F:F − 1 in the plane
+        theta = (F**2).sum((-2, -1)) / 2 - 1  # tr E = ½ F:F − 1 in 2D
         identity = np.einsum("ik,jl->ijkl", _I, _I)
         return Derivatives(
             theta, F, np.broadcast_to(identity, (*theta.shape, 2, 2, 2, 2))
@@ -180,7 +180,7 @@ class StVenantKirchhoff(Hyperelastic):
         return np.ones(F.shape[:-2])
 
 
-#: material classes by value of the key `material`
+#: mapping from the value of the key `material` to the class of the material
 MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyType(
     {"neo-hooke": NeoHooke, "svk": StVenantKirchhoff}
 )

@@ -81,7 +81,7 @@ class CholeskyInverse:
     factor: Factor
     free: Nodes  #: components that are not fixed; other rows and columns of K⁺ are zero
     kernel: NDArray[np.float64]
-    seconds: float  #: time of the factorisation
+    seconds: float  #: time of the factorisation, s
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ with one solve per column of b."""
@@ -107,7 +107,7 @@ class CondensedInverse:
     interface: Nodes  #: components c with entries in constraint rows, ascending
     compliance: NDArray[np.float64]  #: (K⁺)_cc, zero for prescribed components
     kernel: NDArray[np.float64]
-    seconds: float  #: time of factorisation and condensation
+    seconds: float  #: time of factorisation and condensation, s
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ by a solve with the whole factor."""
@@ -159,8 +159,8 @@ def floating_inverse(
     K : (n, n) block diagonal matrix with one block per body
     kernels : for each body, an orthonormal basis (n_body, r_body) of its rigid modes
     fixing : for each body, the components of its fixing nodes, numbered within the
-        body; no rigid mode may vanish on them, which requires at least two nodes in the
-        plane and three in space
+        body; no rigid mode may vanish on them, which requires at least two nodes in 2D
+        and three in 3D
     interface : components c for (K⁺)_cc; None to solve once per row of B instead
 
     """

@@ -10,7 +10,7 @@ barycentric coordinates,
 so that the bilinear element *is* the linear triangle (P1). The 2×2 Gauss rule
 integrates its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
 
-Meshes in space consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
+Meshes in 3D consist of tetrahedra, wedges or hexahedra. In mixed meshes, all cells
 are stored as hexahedra, which are degenerate in the same way: a tetrahedron is
 (a, b, c, c, d, d, d, d), a wedge (a, b, c, c, d, e, f, f). The stiffness of such a cell
 is that of the tetrahedral or wedge element.
@@ -40,8 +40,8 @@ REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]
 class Mesh:
     """Nodes, cells and named boundaries; lengths in m.
 
-    In the plane, a boundary is a chain of nodes with the body on its left: with the
-    unit tangent t, the outward normal is (t_y, −t_x). In space, a boundary is an array
+    In 2D, a boundary is a chain of nodes with the body on its left: with the
+    unit tangent t, the outward normal is (t_y, −t_x). In 3D, a boundary is an array
     (k, 4) of faces whose corners are anticlockwise as seen from outside; triangular
     faces repeat their last corner.
 
@@ -50,11 +50,12 @@ class Mesh:
     (6, 2, [0, 1, 2])
     """
 
-    points: NDArray[np.float64]  #: (N, dim)
-    #: (E, c) nodes of each cell, counter-clockwise in the plane; in mixed meshes, cells
+    points: NDArray[np.float64]  #: (N, dim) positions of the nodes
+    #: (E, c) nodes of each cell, counter-clockwise in 2D; in mixed meshes, cells
     #: with fewer corners repeat nodes
     cells: Nodes
-    boundaries: Mapping[str, Nodes]  #: chains or faces by name
+    #: mapping from the name of a boundary to its chain or faces
+    boundaries: Mapping[str, Nodes]
 
     @property
     def dim(self) -> int:
@@ -263,7 +264,7 @@ def rectangle_grid(
 def box(
     corner: tuple[float, ...], size: tuple[float, ...], divisions: tuple[int, ...]
 ) -> Mesh:
-    """Mesh a box by nx × ny × nz equal hexahedra.
+    """Mesh a box with nx × ny × nz equal hexahedra.
 
     Numbers of nodes and cells vary fastest along x. The names of boundaries are those
     of `box_grid`. Lengths are in m.
@@ -280,7 +281,7 @@ def box(
 
 
 def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
-    """Mesh a box by hexahedra whose faces lie at the given increasing coordinates.
+    """Mesh a box with hexahedra whose faces lie at the given increasing coordinates.
 
     Numbers of nodes and cells vary fastest along x. The boundaries are left and right
     (smallest and largest x), front and back (y), bottom and top (z).
@@ -372,7 +373,7 @@ def half_ring_grid(
 def rectangle(
     corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh a rectangle by nx × ny equal cells.
+    """Mesh a rectangle with nx × ny equal cells.
 
     The boundaries are bottom, right, top and left. Lengths are in m.
 
@@ -385,7 +386,7 @@ def rectangle(
 def half_ring(
     centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
 ) -> Mesh:
-    """Mesh the upper half of a ring by cells of equal angle and equal thickness.
+    """Mesh the upper half of a ring with cells of equal angle and equal thickness.
 
     The boundaries are outer (from angle 0 to π), left_foot, inner and right_foot.
 
@@ -396,7 +397,7 @@ def half_ring(
 
 
 def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mesh:
-    """Mesh half a disc by rings of cells, the innermost of which consists of triangles.
+    """Mesh half a disc with rings of cells; the innermost ring consists of triangles.
 
     The boundaries are arc (anticlockwise) and flat (through the centre).
 

@@ -34,7 +34,7 @@ class Multifrontal:
     A front with p pivots and a border of b positions has p × (p + b) entries.
     """
 
-    order: Nodes  #: o, components in elimination order
+    order: Nodes  #: components o in elimination order
     fronts: Fronts  #: fronts of positions in `order`
     offset: NDArray[np.int64]  #: (F + 1,) start of each front in `rows`
     rows: Floats  #: entries of U, front by front

@@ -81,7 +81,8 @@ def dissect_components(
     roots = np.zeros(3 * nodes, dtype=np.bool_)
     cdef int[::1] length = lengths, children = branches
     cdef int[:, ::1] stack = np.empty((2 * nodes, 2), dtype=np.int32)
-    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # half in the last bisection
+    # half of each node in the last bisection
+    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
     cdef double[:, ::1] along = np.empty((2, nodes))
     cdef int cut = 0
@@ -188,7 +189,7 @@ cdef void coordinates(
 cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
     """Write the eigenvector for the largest eigenvalue of C (upper triangle) to `axis`.
 
-    In space, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
+    In 3D, the eigenvector is computed by the cyclic Jacobi method. Off-diagonal
     entries due to rounding are not eliminated, so that a cube is bisected across its
     edges.
     """

@@ -95,7 +95,8 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         has_value = has_value | (count > 0)
     # each polynomial is expanded about its node: its constant term is the nodal value
     result = polynomial[:, 0]
-    isolated = ~has_value  # in a single layer of cells: average over adjacent cells
+    # nodes of a single layer of cells: average over adjacent cells
+    isolated = ~has_value
     result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]
     return result
 
@@ -105,7 +106,7 @@ def von_mises(
 ) -> Vector:
     """Return the von Mises stress (…) of stresses in Voigt's notation.
 
-    Stresses are (…, 3) in the plane, and (…, 6) if `plane` is None.
+    Stresses are (…, 3) in 2D, and (…, 6) if `plane` is None.
 
     In plane strain, σ_z = ν(σ_x + σ_y).
     """

@@ -1,7 +1,7 @@
 /* Product of a dense block with the columns of all subdomains of a class.
 
-   It is compiled twice, for processors with AVX2 and FMA and for all others; the loader
-   selects a version when the module is imported. */
+   The product is compiled twice, for processors with AVX2 and FMA and for all others. The
+   loader selects one of the two versions when the module is imported. */
 
 #include <string.h>
 

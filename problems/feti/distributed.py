@@ -1,10 +1,10 @@
 """The dual of decomposed bodies, distributed over MPI ranks.
 
 Each rank p stores some of the subdomains, with their stiffness K_p and their columns
-B_p of B. Of each vector of multipliers, a rank stores the entries for the rows of B
-that it *owns*. A row of B that touches subdomains of several ranks is owned by one of
-these ranks, chosen round-robin, and is a *ghost* row on all others. Before a product
-with B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
+B_p of B. A rank stores the entries of vectors of multipliers for the rows of B that it
+*owns*. A row of B that touches subdomains of several ranks is owned by one of these
+ranks, chosen round-robin, and is a *ghost* row on all others. Before a product with
+B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
 ghost row. After the product with B_p, these ranks send their contributions back to the
 owner, so that the result is
 
@@ -123,7 +123,7 @@ def partition(
 
 
 def assign_owners(group: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Return the owner (t,) of each row, chosen round-robin among the ranks it touches.
+    """Return the owner (t,) of each row, a touched rank that is chosen round-robin.
 
     group : (t,) for a row of a disc, the number of the first row of this disc; for any
         other row, its own number. All rows of a disc have the same owner, because they
@@ -140,7 +140,7 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.class_of]
 
 
-#: largest accepted ratio of the largest to the mean work (or size) of the ranks
+#: largest accepted ratio of the maximum to the mean of the work (or size) of the ranks
 MAX_IMBALANCE = 1.1
 METIS_SEEDS = 12  #: number of random seeds tried for METIS
 SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: trial weights of the size relative to the work
@@ -343,7 +343,7 @@ class RowsOverRanks:
 
     halo: Halo
     owned: CompressedRows  #: (o, M) owned rows
-    transposed: CompressedRows  #: (M, o)
+    transposed: CompressedRows  #: (M, o) transpose of `owned`
     ghosts: CompressedRows  #: (t − o, M) ghost rows
     #: (k, t − o) nonzero rows of the transpose of `ghosts`
     ghosts_transposed: CompressedRows
@@ -595,7 +595,7 @@ class Assignment(NamedTuple):
 
 
 def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
-    """Assign the factorisation and the blocks of each class to one rank each.
+    """Assign one rank to the factorisation, and one to the blocks, of each class.
 
     In order of decreasing work, each class is assigned to the rank with the smallest
     load so far (longest processing time first, Graham 1969). Then the computation of
@@ -677,7 +677,7 @@ def condense_over_ranks(
         for n in sent + local
         if n not in exclusive
     }
-    blocks = dict[str, Dense]()  # (2, b, b) of classes on several ranks
+    blocks = dict[str, Dense]()  # (2, b, b) blocks of classes on several ranks
 
     def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
         for n in some:

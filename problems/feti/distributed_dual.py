@@ -191,7 +191,8 @@ def distributed_qp(
     """
     local = dual.subdomains
     for part in ("explicit", "q", "G", "b"):
-        getattr(dual, part)  # so that it does not count towards `prepare`
+        # evaluate the data now, so that their time does not count towards `prepare`
+        getattr(dual, part)
 
     def digest() -> str:
         names = others * [_digest(first.subdomains)] if first else [_digest(local)]

@@ -41,7 +41,8 @@ class LocalSolution:
 
     subdomains: LocalSubdomains
     bodies: LocalBodies
-    #: (n,) at `bodies.components`; equal on all ranks that share a component
+    #: (n,) displacement at `bodies.components`; equal on all ranks that share a
+    #: component
     u: Vector
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
@@ -224,9 +225,9 @@ def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
 class _Extent(NamedTuple):
     """Centre and size of a body with N nodes."""
 
-    centre: Vector  #: (dim,)
-    radius: float  #: root mean square distance of the nodes from the centre
-    size: float  #: √N
+    centre: Vector  #: (dim,) centroid of the nodes
+    radius: float  #: root mean square distance of the nodes from the centroid
+    size: float  #: √N for a body with N nodes
     #: (k, k) matrix that combines the rotations into orthonormal ones; None in the
     #: plane
     turn: NDArray[np.float64] | None

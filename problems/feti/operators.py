@@ -76,7 +76,8 @@ from mortarbench.problems.feti.subdomain_classes import (
 )
 
 MAX_EXPLICIT_MIB = 2048  #: memory for all explicit blocks of an operator
-STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
+#: number of columns per product when an implicit block is evaluated
+STRIP_COLUMNS = 256
 #: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
 #: singular where contact rows are linearly dependent
 CONTACT_SHIFT = 1e-8
@@ -182,7 +183,7 @@ def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pack
 
 
 def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """Return for each class the components that B touches in any of its subdomains."""
+    """Return, for each class, the components that B touches in any subdomain."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
     unknowns = np.flatnonzero(columns)

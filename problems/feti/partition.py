@@ -1,7 +1,7 @@
 """Partition of unstructured bodies into connected subdomains, by the graph of cells.
 
-In this graph, two cells are neighbours if they share a facet: an edge in the plane, a
-face in space. METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) partitions the
+In this graph, two cells are neighbours if they share a facet: an edge in 2D, a
+face in 3D. METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) partitions the
 graph of each body into parts of about equal size, and minimises the total weight of the
 facets between parts. The weight of a facet is its size relative to the adjacent cells,
 so that parts are compact even where the cells of graded meshes are long and thin. The
@@ -119,7 +119,7 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
     """Return the parts (E,) of the cells of one body."""
     if connected_components(graph)[0] > 1:
         raise InputError(
-            "the cells of a body are not all connected by edges (faces in space); "
+            "the cells of a body are not all connected by edges (faces in 3D); "
             "expected a separate body for each connected piece"
         )
     if parts == 1:

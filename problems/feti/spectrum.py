@@ -39,8 +39,8 @@ Product = Callable[[Vector], Vector]
 #: norm of a new vector, relative to the largest diagonal entry of the tridiagonal
 #: matrix, at which the Krylov space counts as invariant and the Lanczos process ends
 BREAKDOWN = 1e-10
-CHECK_INTERVAL = 5  #: steps between evaluations of the Ritz values
-_CHUNK = 64  #: vectors per allocation
+CHECK_INTERVAL = 5  #: number of Lanczos steps between evaluations of the Ritz values
+_CHUNK = 64  #: number of Lanczos vectors per allocation
 
 
 class Spectrum(NamedTuple):
@@ -50,7 +50,7 @@ class Spectrum(NamedTuple):
     largest: float
     smallest_error: float  #: bound on the distance from `smallest` to an eigenvalue
     largest_error: float  #: bound on the distance from `largest` to an eigenvalue
-    steps: int  #: products with F
+    steps: int  #: number of products with F
 
     @property
     def condition(self) -> float:
@@ -88,9 +88,9 @@ def spectrum(
     F : symmetric, positive definite on the range of P
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
-    tol : bound of the relative error of both extreme eigenvalues
+    tol : bound on the relative error of both extreme eigenvalues
     rows : components on this rank; None for all n components
-    total : returns the sum over all ranks of arrays (k,), on each rank
+    total : function that returns, on each rank, the sum over all ranks of arrays (k,)
 
     """
     local = np.arange(n) if rows is None else rows
@@ -102,7 +102,7 @@ def spectrum(
     # of x under the operator
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + local**2))  # arbitrary; rarely orthogonal to eigenvectors
+    v = P(np.sin(1.0 + local**2))  # arbitrary vector, rarely orthogonal to eigenvectors
     V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
@@ -146,7 +146,7 @@ def spectra_over_ranks(
         the supports must exclude rigid motions of every body
     preconditioners : kind and scaling of each, see `problems.feti.operators`; None
         selects PFP without a preconditioner
-    tol : bound of the relative error of both extreme eigenvalues
+    tol : bound on the relative error of both extreme eigenvalues
 
     """
     halo, ranks = F.halo, F.halo.ranks

@@ -5,9 +5,10 @@ entry per row, or per column, of nodes. Let aᵢ = 2 if column i of nodes separa
 blocks and aᵢ = 1 otherwise, and define bⱼ likewise for rows. Node (i, j) then has aᵢbⱼ
 copies, which are numbered like their blocks, from left to right and from bottom to top.
 
-The stiffest mode of an interface is a saw tooth along it, that is, alternating tension
-and compression, and its stiffness increases as the cells become thinner. Between half
-planes of cells with sides hₜ along the interface and hₙ across it, this stiffness is
+The stiffest mode of an interface is a saw tooth along the interface, that is,
+alternating tension and compression. The stiffness of this mode depends on the shape of
+the cells. Between half planes of cells with sides hₜ along the interface and hₙ across
+it, the stiffness is
 
     s(r) = √((C₆₆ + C₁₁r²) / (C₆₆ + C₁₁)),    r = hₙ/hₜ
 
@@ -73,7 +74,7 @@ class Layout:
 
     @cached_property
     def node_start(self) -> NDArray[np.int64]:
-        """(grids + 1,) first node of each grid, then the total number of nodes."""
+        """First node of each grid, then the total number of nodes, (grids + 1,)."""
         return np.cumsum([0, *(grid.nodes for grid in self.grids)])
 
     @property
@@ -101,7 +102,7 @@ class Layout:
 
     @cached_property
     def block_start(self) -> NDArray[np.int64]:
-        """(grids + 1,) first block of each grid, then the total number of blocks."""
+        """First block of each grid, then the total number of blocks, (grids + 1,)."""
         counts = [(x.size - 1) * (y.size - 1) for x, y in self.cuts]
         return np.cumsum([0, *counts])
 
@@ -138,7 +139,7 @@ class Layout:
         return _lines([y for _, y in self.cuts])
 
     def corner(self, block: Nodes) -> tuple[Nodes, Nodes, Nodes, Nodes]:
-        """Return the first column and row of nodes of each block, and their numbers.
+        """Return the position and the size of each block in the grid of nodes.
 
         The four results (k,) are the first column, the first row, the number of columns
         and the number of rows.

@@ -126,11 +126,11 @@ class ListedSubdivision:
     #: (k + 1,) index in `holders` of the first holder of each node, followed by l
     start: NDArray[np.int64]
     holders: Nodes  #: (l,) subdomains that contain each node, ascending
-    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, corners) as
-    #: indices into these nodes
+    #: function that returns the nodes (n,) of a subdomain, ascending, and its cells (E,
+    #: corners) as indices into these nodes
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
-    labelling: Callable[[], NDArray[np.int64]]  #: computes `label`
+    labelling: Callable[[], NDArray[np.int64]]  #: function that computes `label`
     positions: NDArray[np.int64] | None = None
 
     @property

@@ -2,7 +2,7 @@
 
 In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
 subdomain floats; supports, gluing and contact are rows of one matrix B. The kernel of
-every stiffness matrix is hence known in advance: the rigid motions.
+every stiffness matrix is therefore known in advance: the rigid motions.
 
 The torn unknowns v (N,) are the displacement components of all copies of all nodes, in
 the frames of their subdomains, numbered by subdomain and then by node. Subdomains that
@@ -191,7 +191,7 @@ class Subdomains:
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
-        """(S + 1,) first torn unknown of each subdomain, then their total number."""
+        """First torn unknown of each subdomain, then the total number N, (S + 1,)."""
         sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
@@ -283,7 +283,7 @@ class Clusters:
 
     @cached_property
     def coordinates(self) -> NDArray[np.int64]:
-        """(S + 1,) first coordinate of each subdomain, then their total number."""
+        """First coordinate of each subdomain, then the total number, (S + 1,)."""
         sizes = np.array([modes.shape[1] for modes in self.faces])
         return np.concatenate([[0], np.cumsum(sizes[self.domains.class_of])])
 
@@ -301,7 +301,7 @@ class Clusters:
 
     @cached_property
     def rows(self) -> NDArray[np.int64]:
-        """(clusters + 1,) first row of C of each cluster, then their total number."""
+        """First row of C of each cluster, then the number of rows, (clusters + 1,)."""
         subdomain = np.searchsorted(
             self.coordinates, self.joints.indices[self.joints.indptr[:-1]], side="right"
         )
@@ -448,7 +448,7 @@ class _Joined(NamedTuple):
     def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
         """Return M⁺ of this cluster from the blocks ΦᵀK⁺Φ of all classes."""
         S, (c, r) = self.product(compliance), self.CR.shape
-        # scale CK⁺Cᵀ to order one, the order of CR
+        # scale CK⁺Cᵀ to the magnitude of CR, which is of order one
         unit = float(np.trace(S)) / c if c else 1.0
         M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
         Z = block_diagonal(self.dependent, self.N)  # ker M
@@ -472,9 +472,9 @@ class DecomposedBodies:
 
     classes: tuple[SubdomainClass, ...]
     class_of: NDArray[np.int64]  #: (S,) class of each subdomain
-    spread: csr_array  #: T (N, n)
-    B: csr_array  #: (m, N), scaled
-    c: Vector  #: (m,), scaled
+    spread: csr_array  #: T (N, n), maps displacements to torn unknowns
+    B: csr_array  #: (m, N) constraint rows, scaled
+    c: Vector  #: (m,) right-hand side, scaled
     scale: Vector  #: positive factors of the contact rows
     f: Vector  #: (N,) torn load; Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first
@@ -482,12 +482,12 @@ class DecomposedBodies:
 
     @property
     def units(self) -> Subdomains | Clusters:
-        """Floating units that B glues: clusters if there are any, else subdomains."""
+        """Floating units that B glues: clusters, or subdomains without clusters."""
         return self.clusters or self.domains
 
     @property
     def start(self) -> NDArray[np.int64]:
-        """First torn unknown of each subdomain, then their total number, (S + 1,)."""
+        """First torn unknown of each subdomain, then the total number N, (S + 1,)."""
         return self.domains.start
 
     @cached_property

@@ -22,8 +22,8 @@ This row is orthogonal to the gluing rows.
 
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
-homogeneous, F = BK⁺Bᵀ is hence independent of E. In support and gluing rows, E may be
-multiplied by a factor for the shape of the cells (`problems.feti.structured`).
+homogeneous, F = BK⁺Bᵀ is therefore independent of E. In support and gluing rows, E may
+be multiplied by a factor for the shape of the cells (`problems.feti.structured`).
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: functions that return the weights (rows, m) of m copies, by the name of the gluing
+#: mapping from the name of the gluing to a function that returns the weights (rows, m)
+#: of m copies
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
@@ -90,7 +91,7 @@ GLUE: Mapping[str, Weights] = MappingProxyType(
 class Contact(NamedTuple):
     """Global contact rows followed by friction rows, replicated on every rank."""
 
-    rows: csr_array  #: (m_I, n) in components of the undivided bodies
+    rows: csr_array  #: (m_I, n) rows in components of the undivided bodies
     c: Vector  #: (m_I,) right-hand side
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows per tangential vector
@@ -114,16 +115,16 @@ class DecomposedProblem:
     layout: Subdivision  #: the S subdomains
     components: int  #: number of components per node; 1 for a scalar field
     material: Integers  #: (S,) material of each subdomain
-    #: assembles the class of a floating subdomain
+    #: function that assembles the class of a floating subdomain
     assemble_class: Callable[[SubdomainMesh], SubdomainClass]
     E: Vector  #: (bodies,) moduli for the scaling of rows
     names: tuple[str, ...]  #: names of the bodies
-    #: maps numbers of subdomains to a function that evaluates the factors of E at their
-    #: torn nodes, see `problems.feti.structured.Layout.shaping`; None if all factors
-    #: are 1
+    #: map from numbers of subdomains to a function that evaluates the factors of E at
+    #: their torn nodes, see `problems.feti.structured.Layout.shaping`; None if all
+    #: factors are 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
-    load: Callable[[Nodes], Vector]  #: maps global components (k,) to forces (k,)
-    fixed: Nodes  #: global components that are zero, in the order of their rows
+    load: Callable[[Nodes], Vector]  #: map from global components (k,) to forces (k,)
+    fixed: Nodes  #: global components prescribed as zero, in the order of their rows
     #: True to eliminate fixed components, as in FETI-1 (Farhat and Roux 1991), instead
     #: of adding rows to B. Subdomains with supports then do not float and keep the
     #: global axes
@@ -364,7 +365,8 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # looser than in `classify`
+            # a looser tolerance than in `classify`
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         candidates = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -388,7 +390,7 @@ class LocalSubdomains:
 
     @cached_property
     def motions(self) -> NDArray[np.int64]:
-        """Number of the first rigid motion of each subdomain, then the total, (S + 1,).
+        """First rigid motion of each subdomain, followed by the total number, (S + 1,).
 
         The subdomains of all ranks are included.
         """
@@ -540,7 +542,7 @@ class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
 
     number: Nodes  #: (t,) global numbers, ascending
-    B: csr_array  #: (t, N_p) in local torn unknowns
+    B: csr_array  #: (t, N_p) rows in local torn unknowns
     #: (t,) for a row of a tangential vector, the number of the first row of this
     #: vector; for any other row, its own number. All rows of a vector have the same
     #: owner
@@ -591,7 +593,7 @@ def _local_clusters(local: LocalSubdomains) -> Clusters:
     nodes. The modes Φ_s of subdomain s are its rigid motions, restricted to these nodes
     and orthonormalised. After rotation to global axes by Q_s, the modes of both
     subdomains span the same space: Q_1Φ_1 = Q_2Φ_2Tᵀ with an orthogonal matrix T. The
-    averages are hence equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
+    averages are therefore equal if Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0.
     """
     nodes, domains, d = local.nodes, local.domains, local.problem.components
     r = domains.classes[0].R.shape[1]

@@ -23,7 +23,8 @@ class LocalProblems:
     """
 
     torn: DecomposedBodies
-    components: int = 2  #: number per node; torn unknowns are numbered node by node
+    #: number of components per node; torn unknowns are numbered node by node
+    components: int = 2
 
     @property
     def spread(self) -> csr_array:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
 
-#: largest distance between points of congruent subdomains, relative to their radius
+#: largest distance between corresponding points of congruent subdomains, relative to
+#: the radius of the subdomains
 CONGRUENCE_TOL = 1e-11
 
 
@@ -118,7 +119,7 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
 
 
 def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """Label the cells of a structured mesh in space by blocks of compact shape.
+    """Label the cells of a structured mesh in 3D by blocks of compact shape.
 
     Let hₐ be the mean edge length of a block along direction a. The block may have
     most · min h / hₐ cells along a, rounded, and at least 1. A larger block is cut
@@ -237,7 +238,7 @@ def congruent(
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Find the images of the first of g point sets under rigid motions.
 
-    points : (g, n, dim)
+    points : (g, n, dim) point sets
 
     Returns
     -------

@@ -47,12 +47,13 @@ _EXPECTED = "an FCLIB file (HDF5)"
 _KINDS = ("fclib_local", "fclib_global")
 _COLUMNS, _ROWS = -1, -2  #: values of nz for compressed matrices
 
-Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by HDF5 path
+#: mapping from an HDF5 path to the array of a file
+Datasets = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """Contact problem, with the solution if the file contains one."""
+    """Contact problem of an FCLIB file, with its solution if the file contains one."""
 
     contact: FrictionalContact
     is_local: bool

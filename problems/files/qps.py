@@ -51,17 +51,19 @@ _NUMBER = re.compile(
 class _QPSModel:
     """Contents of the sections that have been read, by names of rows and columns."""
 
-    rows: dict[str, str] = field(default_factory=dict)  #: type N, L, G or E by name
+    #: type of each row: N, L, G or E
+    rows: dict[str, str] = field(default_factory=dict)
     columns: dict[str, int] = field(default_factory=dict)
-    entries: dict[tuple[str, str], float] = field(default_factory=dict)  #: row, column
+    #: coefficients by row and column
+    entries: dict[tuple[str, str], float] = field(default_factory=dict)
     rhs: dict[str, float] = field(default_factory=dict)
     ranges: dict[str, float] = field(default_factory=dict)
     lower: dict[str, float] = field(default_factory=dict)
     upper: dict[str, float] = field(default_factory=dict)
     triangle: dict[tuple[str, str], float] = field(default_factory=dict)
     whole: dict[tuple[str, str], float] = field(default_factory=dict)
-    sign: float = 1.0  #: −1 if the objective is maximised
-    objective: str = ""  #: the first N row
+    sign: float = 1.0  #: −1 if the objective is maximised, otherwise 1
+    objective: str = ""  #: name of the objective, the first row of type N
 
 
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:

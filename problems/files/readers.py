@@ -22,7 +22,7 @@ from mortarbench.problems.files.file_digest import format_of
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 
-#: (QP, scale, constant); the objective of the file is scale·(objective of the QP) +
+#: QP, scale and constant: the objective of the file is scale·(objective of the QP) +
 #: constant
 Loaded = tuple[QP, float, float]
 
@@ -118,7 +118,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
             raise InputError(f"{name} has shape {got}, expected {right}")
     for name, size in (("n", n), ("m", m)):
         if name in arrays and vector(arrays, name).tolist() != [size]:
-            raise InputError(f"{name} is not {size}, the size of the other variables")
+            raise InputError(f"{name} contradicts the other variables; expected {size}")
     bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
     rows = m - n if bounded else m
     return TwoSidedQP(

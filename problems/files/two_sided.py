@@ -17,14 +17,14 @@ MIN_INFINITE = 1e20  #: bounds of at least this magnitude count as infinite
 class TwoSidedQP(NamedTuple):
     """The problem  min ½xᵀPx + qᵀx + r  subject to  l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
 
-    P: Any  #: (n, n) sparse, with both triangles
-    q: Vector  #: (n,)
+    P: Any  #: (n, n) sparse Hessian, with both triangles
+    q: Vector  #: (n,) linear term
     r: float
-    A: Any  #: (m, n) sparse
-    l: Vector  #: (m,) lower limits; ≤ −1e20: no limit
-    u: Vector  #: (m,) upper limits; ≥ 1e20: no limit
-    lb: Vector  #: (n,) lower bounds; ≤ −1e20: no bound
-    ub: Vector  #: (n,) upper bounds; ≥ 1e20: no bound
+    A: Any  #: (m, n) sparse constraint matrix
+    l: Vector  #: (m,) lower limits; a value ≤ −1e20 means no limit
+    u: Vector  #: (m,) upper limits; a value ≥ 1e20 means no limit
+    lb: Vector  #: (n,) lower bounds; a value ≤ −1e20 means no bound
+    ub: Vector  #: (n,) upper bounds; a value ≥ 1e20 means no bound
 
 
 def one_sided(qp: TwoSidedQP) -> QP:
@@ -61,7 +61,7 @@ def one_sided(qp: TwoSidedQP) -> QP:
 
 
 def _limits(what: str, low: Vector, high: Vector) -> tuple[Vector, Vector]:
-    """Replace absent limits by ±inf; raise InputError if no value satisfies them."""
+    """Replace absent limits by ±inf; raise InputError if they exclude every value."""
     low = np.where(low <= -MIN_INFINITE, -np.inf, low)
     high = np.where(high >= MIN_INFINITE, np.inf, high)
     bad: NDArray[np.bool_] = (

@@ -113,7 +113,7 @@ def bodies(
     """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells.
 
     depth : number of layers across the thickness; 0 for plane bodies
-    sides : condition on the end faces in space, "free" or "plane-strain"
+    sides : condition on the end faces in 3D, "free" or "plane-strain"
     """
     grids = _grids(Nr, Nh, radial)
     shape: Shape = StructuredGrids(grids)
@@ -123,7 +123,7 @@ def bodies(
             tuple(solids), tuple((*grid.divisions, depth) for grid in grids)
         )
     by_name = shape.sides
-    # in the plane, these are m_E = 2(Nr + 1) + 4(radial + 1) components
+    # in 2D, these are m_E = 2(Nr + 1) + 4(radial + 1) components
     clamped = [
         dofs_of(nodes_of_side(by_name[b]), shape.dim)
         for b in ("left", "left_foot", "right_foot")
@@ -164,7 +164,7 @@ def _tip(shape: Shape) -> tuple[Nodes, Vector]:
 
     Returns
     -------
-    components (dim·k,) of the k nodes of the corner (an edge in space), and the
+    components (dim·k,) of the k nodes of the corner (an edge in 3D), and the
     fraction (k,) of the load that acts on each node
 
     """

@@ -46,15 +46,15 @@ from mortarbench.problems.fem.mesh import (
     rectangle,
 )
 
-LENGTH = 1.0  #: L, m
+LENGTH = 1.0  #: length L, m
 E = 10e6  #: modulus of rubber, Pa
 
 
 class Elastica(NamedTuple):
     """Displacement of the loaded end of the elastica."""
 
-    deflection: float  #: w/L in the direction of the load
-    shortening: float  #: u/L towards the clamp
+    deflection: float  #: deflection w/L in the direction of the load
+    shortening: float  #: displacement u/L towards the clamp
 
 
 def elastica(load: float) -> Elastica:

@@ -36,7 +36,7 @@
     [[contacts]]
     slave = "foot"             # side against a rigid body, whose lengths are in m:
     rigid = { shape = "plane", point = [0, -1], normal = [0, 1] }
-    # or { shape = "cylinder", centre = [0, -1], radius = 0.5 }; in space also
+    # or { shape = "cylinder", centre = [0, -1], radius = 0.5 }; in 3D also
     # { shape = "cylinder", centre = [0, 0, -1], axis = [0, 1, 0], radius = 0.5 } or
     # { shape = "sphere", centre = [0, 0, -1], radius = 0.5 }
 
@@ -118,7 +118,8 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
-#: keys of each shape of rigid bodies, by dimension; all except radius are vectors
+#: mapping from the dimension to the keys of each shape of rigid bodies; all keys except
+#: radius are vectors
 _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
     2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
     3: {
@@ -127,7 +128,7 @@ _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
         "sphere": ("centre", "radius"),
     },
 }
-#: units of length by name, m
+#: mapping from the name of a unit of length to its size in m
 LENGTH_UNITS = {
     "m": 1.0,
     "cm": 1e-2,
@@ -307,7 +308,7 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
 
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
-    """Return the nodal forces (N, dim) of a load: N/m in the plane, N in space."""
+    """Return the nodal forces (N, dim) of a load: N/m in 2D, N in 3D."""
     checked.only_keys(entry, (*_PLACES, *_LOADS))
     kinds = [kind for kind in _LOADS if kind in entry]
     if len(kinds) != 1:
@@ -316,9 +317,9 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     vector = _vector(kinds[0], entry[kinds[0]], named.dim)
     nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
-    if facets.size and named.dim == 3:  # ∫N over the boundary, m²
+    if facets.size and named.dim == 3:  # ∫N_j over the boundary, m²
         nodes, weights[nodes] = nodal_areas(named.points, facets)
-    elif facets.size:  # in the plane, m
+    elif facets.size:  # ∫N_j in 2D, m
         lengths = np.linalg.norm(np.diff(named.points[facets], axis=1)[:, 0], axis=1)
         np.add.at(weights, facets, lengths[:, None] / 2)
     elif kinds == ["traction"]:
@@ -466,7 +467,7 @@ def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
     radius = physical("radius", checked.positive("radius", entry["radius"]))
     if "axis" in vectors:
         return RigidCylinder(vectors["centre"], vectors["axis"], radius)
-    return RigidSphere(vectors["centre"], radius)  # in the plane a cylinder
+    return RigidSphere(vectors["centre"], radius)  # in 2D a cylinder
 
 
 def _check_faces(

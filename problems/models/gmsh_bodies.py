@@ -55,7 +55,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     ------
     InputError
         If the load of a body cannot be balanced, or if there are several load steps or
-        linearisations although neither supports nor friction prevent a rigid motion.
+        linearisations although supports and friction allow a rigid motion.
 
     """
     p: Any = params
@@ -70,8 +70,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
             f"{p['path']}: supports and friction allow a rigid motion of some body, "
-            "which is not built for several load steps or re-linearisations; expected "
-            "steps=1 and relin=1"
+            "which is not supported with several load steps or linearisations; "
+            "expected steps=1 and relin=1"
         )
     return contact_problem
 
@@ -94,7 +94,8 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
     if not elastic.is_supported:
         whole = elastic.whole
         rows = keyed_linearisation(p)(whole, laws)(np.zeros(whole.mesh.dofs))
-        with located(p["path"]):  # friction can act in both directions
+        # the friction force of a tangential row can act in both directions
+        with located(p["path"]):
             check_balance(whole, vstack([rows.B, rows.T, -rows.T]))
         stages = tuple(
             replace(stage, begin=with_normal_forces(stage.begin, whole_load))

@@ -11,7 +11,7 @@ are the tangential displacements of five points of the contact side, ±5 %, and 
 normal force at x = 38.75 mm for 32 cells per side (GRECO working group on friction; see
 document V6.04.128 of Code_Aster).
 
-In space (dim=3) the square is extruded along z into layers of cubes. The end faces have
+In 3D (dim=3) the square is extruded along z into layers of cubes. The end faces have
 u_z = 0; the solution in every layer of nodes is therefore that of plane strain.
 """
 
@@ -52,23 +52,25 @@ from mortarbench.problems.fem.mesh import (
 SIDE = 0.04  #: side length of the square, m
 MATERIAL = Material(E=1.3e11, nu=0.2)
 TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
-FORCE = TOP * SIDE  #: F₀, N/m
-PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
-PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x at PLACES, m
-FORCE_AT = 38.75e-3  #: x of the published normal force, m
+FORCE = TOP * SIDE  #: unit of force F₀, N/m
+#: positions x of the published points, m
+PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])
+#: published u_x at PLACES, m
+PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])
+FORCE_AT = 38.75e-3  #: position x of the published normal force, m
 
 
 class Plate(NamedTuple):
     """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
 
     shape: StructuredGrids | StructuredSolids
-    ground: Nodes  #: side y = 0, without its nodes on x = 40 mm
+    ground: Nodes  #: contact side y = 0, without its nodes on x = 40 mm
     top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
-    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths (areas)
+    left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths, m (areas, m²)
     right: Nodes  #: nodes of x = 40 mm
     corner: Nodes  #: nodes of x = 40 mm, y = 0
-    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in the plane
-    thickness: float  #: thickness, m; 1 in the plane
+    ends: Nodes  #: nodes of the end faces, on which u_z = 0; empty in 2D
+    thickness: float  #: thickness, m; 1 in 2D
 
 
 def plate(n: int) -> Plate:
@@ -112,7 +114,7 @@ def extruded_plate(n: int, depth: int) -> Plate:
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the problem of the plate with n × n cells, or n × n × depth in space."""
+    """Return the problem of the plate with n × n cells, or n × n × depth in 3D."""
     p: Any = params
     dim, n = p["dim"], p["n"]
     body = plate(n) if dim == 2 else extruded_plate(n, p["depth"])
@@ -162,7 +164,7 @@ def published_quantities(
 ) -> dict[str, Any]:
     """Return the published quantities, interpolated linearly between nodes.
 
-    In space, displacements are means over z, and forces are sums over z divided by the
+    In 3D, displacements are means over z, and forces are sums over z divided by the
     thickness. The keys are `displacement`, u_x at `PLACES` in m; `published_error`, the
     largest relative deviation from the published values; `normal_force`, the nodal
     force at 38.75 mm in N/m; and `tangential_sum`, the magnitude of the total friction

@@ -8,7 +8,7 @@ with the pressure
 
 Bodies are half discs under a uniform pressure on the flat side. The force is
 prescribed, since the theory does not determine the approach. Contact alone supports the
-upper body vertically; hence the form ``dual-bounds`` does not exist.
+upper body vertically; therefore, the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
 Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
@@ -81,7 +81,7 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
-RADIUS = 8e-3  #: R of the upper cylinder, m
+RADIUS = 8e-3  #: radius R of the upper cylinder, m
 NAMES = ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
@@ -254,9 +254,9 @@ def _programme(
 
 
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
-    """Return the cylinders, with n cells per a on the upper one and m on the lower one.
+    """Return the cylinders, with n (upper) and m (lower) cells per half width a.
 
-    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower one is
+    The upper cylinder has R = 8 mm and E = 200 GPa. The radius of the lower cylinder is
     multiplied by `radius`, and its modulus by `ratio`. If Hertz's a exceeds a radius,
     because the bodies are too soft for the theory, the mesh is that for a = radius, so
     that the uniform part of the arc does not exceed the half disc.
@@ -353,7 +353,8 @@ def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
     if p["programme"] == "proportional":
-        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a ∝ √P grows evenly
+        # a ∝ √P grows by equal increments
+        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2
         return [(part, part * p["Q"]) for part in parts]
     return [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
 
@@ -384,7 +385,7 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
 def graded_points(h: float, uniform: float, total: float) -> Vector:
     """Divide [0, total] into cells of size h up to `uniform`, then growing by GROWTH.
 
-    If `uniform` covers the interval, all cells have the same size of at most h.
+    If `uniform` covers the interval, all cells have the same size, which is at most h.
     """
     equal = h * np.arange(np.ceil(uniform / h) + 1)
     if equal[-1] >= total:

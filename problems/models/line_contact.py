@@ -62,8 +62,8 @@ class TangentialContact:
 
     normal: LineContact
     mu: float
-    Q: float  #: tangential force over μP, between −peak and peak
-    peak: float  #: largest tangential force so far over μP; Q without unloading
+    Q: float  #: tangential force in units of μP, between −peak and peak
+    peak: float  #: largest tangential force so far in units of μP; Q without unloading
 
     @property
     def before(self) -> TangentialContact:

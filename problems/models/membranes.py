@@ -6,9 +6,9 @@ use as a benchmark. Under unit tension,
 
     min Σ_b ∫ ½|∇u_b|² − f_b u_b,    u_1 = 0 on x = 0,   u_1 ≤ u_2 on x = 1
 
-on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 for y > ¾,
-f_2 = −1 for y < ¼, and both are zero elsewhere. The second membrane floats and is
-supported by the first one alone; hence the sum of the contact forces is its load, ¼.
+on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 for y > ¾, f_2
+= −1 for y < ¼, and both are zero elsewhere. The second membrane floats and is supported
+by the first one alone; therefore, the sum of the contact forces is its load, ¼.
 
 Elements are bilinear. Each membrane is decomposed into S × S congruent squares of n × n
 cells.
@@ -195,7 +195,7 @@ class Membranes:
         return supported_inverse(self.qp.P, free, self.rigid)
 
     def quantities(self, s: Solution) -> dict[str, Any]:
-        """Return counts, energy, contact force and lowest height of a primal solution.
+        """Return counts, energy, contact force and least height of a primal solution.
 
         Energy and force are divided by the tension.
         """

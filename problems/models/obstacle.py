@@ -70,11 +70,13 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.membranes import membrane_class
 
-HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
-LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
+HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω for each shape, m
+LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: load q for each shape, 1/m
 TANGENT_RADIUS = 0.9  #: radius r beyond which ψ is continued by its tangent, m
-CONTACT_RADIUS = 0.697965148223374  #: a, root of a²(ln 2 − ln a) = 1 − a², m
-SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
+#: contact radius a, the root of a²(ln 2 − ln a) = 1 − a², m
+CONTACT_RADIUS = 0.697965148223374
+#: coefficient A of the solution, m
+SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)
 
 
 def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
@@ -157,7 +159,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
 
 
 def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
-    """Return the decomposed problem of a string, from its whole mesh."""
+    """Return the decomposed problem of a string; the whole mesh is generated."""
     n = p["n"]
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
@@ -269,7 +271,7 @@ class Problem:
     shape: str  #: "flat" (ψ = 0) or "hemisphere"
     x: Vector  #: (N, dim) nodes, m
     cells: int  #: number of cells
-    lift: Vector  #: w (N,), m
+    lift: Vector  #: lift w (N,), m
     qp: QP
 
     def factorise(self) -> GeneralisedInverse:

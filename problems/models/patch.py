@@ -11,10 +11,10 @@ A contact discretisation passes the test if it reproduces this solution, that is
 transfers constant pressures exactly (Taylor and Papadopoulos 1991). Mortar methods
 pass. One-pass node-to-segment contact fails: its error in σ_y is of order one and does
 not vanish with the mesh size. Friction has no effect if the blocks are of the same
-material. The upper block is supported by contact alone; hence the form
+material. The upper block is supported by contact alone; therefore, the form
 ``dual-bounds`` does not exist.
 
-In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
+In 3D (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
 −p. Hexahedra represent linear displacements exactly even if they are distorted (key
 `distort`).
 
@@ -78,8 +78,9 @@ from mortarbench.problems.ranges import MIN_STRETCH
 
 LENGTH, HEIGHT = 1.0, 0.5  #: size of each block, m
 NAMES = ("lower", "upper")
-PRESSURE = 1e6  #: p, Pa
-E_UPPER, NU = 10e6, 0.3  #: modulus of the upper block, Pa, and ν of both
+PRESSURE = 1e6  #: pressure p, Pa
+#: modulus of the upper block, Pa, and Poisson's ratio of both blocks
+E_UPPER, NU = 10e6, 0.3
 
 
 @cached_problem
@@ -90,7 +91,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     D = elasticity_matrices(elastic.materials, elastic.plane)
 
     def error(answer: ContactSolution) -> dict[str, Any]:
-        """Return the largest |σ_y + p|/p (in space |σ_z + p|/p) at Gauss points."""
+        """Return the largest |σ_y + p|/p (in 3D |σ_z + p|/p) at Gauss points."""
         largest = 0.0
         for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)
@@ -115,10 +116,10 @@ class Homogeneous(NamedTuple):
 
     lateral: float  #: stretch λ₁ along x
     stretch: float  #: stretch λ₂ along y
-    nominal: float  #: P₂₂, force per reference length and thickness, Pa
-    cauchy: float  #: σ_y, Pa
-    energy: float  #: W per reference area, Pa
-    stiffness: float  #: dP₂₂/dλ₂ with P₁₁ = 0, Pa
+    nominal: float  #: nominal stress P₂₂, force per reference length and thickness, Pa
+    cauchy: float  #: Cauchy stress σ_y, Pa
+    energy: float  #: strain energy W per reference area, Pa
+    stiffness: float  #: derivative dP₂₂/dλ₂ at P₁₁ = 0, Pa
 
 
 def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
@@ -335,5 +336,5 @@ def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
 
 
 def _divisions(n: int) -> tuple[int, int]:
-    """Return the numbers of cells along x and y, such that cells are nearly square."""
+    """Return numbers of cells along x and y for which cells are nearly square."""
     return n, -(-n // 2)

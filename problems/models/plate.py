@@ -4,8 +4,9 @@ A plate of `width` × `height` is clamped at its left edge and pulled down by 1 
 of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some
 subdomains, the modulus is multiplied by `jump`: in every other subdomain
 (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
-contact; hence the dual has equality constraints only. Condition numbers of the dual
-measure the scalability of the method independently of load, stopping test and units.
+contact; therefore, the dual has equality constraints only. Condition numbers of the
+dual measure the scalability of the method independently of load, stopping test and
+units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
@@ -14,7 +15,7 @@ Supports are rows of B as in all families (Total FETI), or they are ``eliminated
 the latter case, subdomains at the clamped edge do not float, as in FETI-1 (Farhat and
 Roux 1991).
 
-In space (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
+In 3D (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
 is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or
 at its corner of largest y and z (``point``).
 """
@@ -88,7 +89,7 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
-LOAD = 1e6  #: F₀, the load, N/m; in space, N
+LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
 STEEL = Material(E=210e9, nu=0.3)
 #: preconditioner and scaling for each spectrum; None means no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
@@ -148,12 +149,12 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 class Plate:
     """Plate for one set of keys; K, f and moduli are in units of l and F₀."""
 
-    volume: float  #: width × height, m²; volume in space, m³
+    volume: float  #: width × height in m² (2D), or volume in m³ (3D)
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
     moduli: Vector  #: (k,) moduli of the materials, the modulus of steel first
-    plane: Plane | None  #: None in space
+    plane: Plane | None  #: plane state; None in 3D
     D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
     parts: DecomposedProblem
@@ -353,7 +354,7 @@ def _stiffness(p: Mapping[str, Any]) -> tuple[Vector, NDArray[np.float64]]:
 
 
 def _plane(p: Mapping[str, Any]) -> Plane | None:
-    """Return the plane state; None in space."""
+    """Return the plane state; None in 3D."""
     return p["plane"] if p["dim"] == 2 else None
 
 
@@ -386,7 +387,7 @@ def _tip(nodes: int, dim: int) -> Nodes:
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
     """Return counts, the energy in J/m, and the tip displacement in m.
 
-    The tip is the upper right corner. In space, the energy is in J, and the tip is the
+    The tip is the upper right corner. In 3D, the energy is in J, and the tip is the
     corner with the largest x, y and z.
     """
     mesh = plate.mesh

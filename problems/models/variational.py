@@ -17,7 +17,7 @@ from scipy.sparse import csc_array, diags_array, eye_array, kron
 
 from mortarbench.harness import QP, Case, Solution, Vector, no_rows
 
-HALF_WIDTH = 10.0  #: b of the journal bearing's rectangle (0, 2π) × (0, 2b)
+HALF_WIDTH = 10.0  #: half width b of the journal bearing's rectangle (0, 2π) × (0, 2b)
 
 
 def string(n: int) -> Case:

@@ -3,7 +3,8 @@
 Sources: Puso and Laursen, "A mortar segment-to-segment contact method for large
 deformation solid mechanics", Comput. Methods Appl. Mech. Engrg. 193 (2004) 601-629, for
 the auxiliary plane; Popp, Gitterle, Gee and Wall, Int. J. Numer. Meth. Engng 83 (2010)
-1428-1465, for the dual basis. In the plane see `problems.contact.mortar`.
+1428-1465, for the dual basis. The two-dimensional method is in
+`problems.contact.mortar`.
 
 *Triangles.* A quadrilateral face is divided into four triangles about the mean of its
 corners. Its shape functions N_k are linear on each triangle and ¼ at the centre. (With
@@ -24,7 +25,7 @@ fixed planes and overlaps,
     D_jk = Σ_e n_e ∫_e Φ_j N_k,   M_jl = Σ_e n_e ∫_e Φ_j N^m_l,   g̃_j = Σ_e ∫_e Φ_j g.
 
 *Balance.* At each point of an overlap, a row exerts the force Φ_j n_e on the slave and
-−Φ_j n_e on the master, on the same line along n_e. The forces of a row are hence in
+−Φ_j n_e on the master, on the same line along n_e. The forces of a row are therefore in
 equilibrium and have no moment.
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is Φ = A N on each face with A = D_e M_e⁺,
@@ -83,8 +84,8 @@ class Overlaps(NamedTuple):
     N_j are the shape functions of the slave face, N^m_l those of the master face.
     """
 
-    slave: Nodes  #: (p,) slave face
-    master: Nodes  #: (p,) master face
+    slave: Nodes  #: (p,) slave face of each pair
+    master: Nodes  #: (p,) master face of each pair
     area: NDArray[np.float64]  #: (p, 4) ∫N_j, m²
     own: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N_k, m²
     other: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N^m_l, m²
@@ -152,7 +153,8 @@ def face_mortar(
         axes = s.tangents  # (v, 2, 3)
         stacked = [rows(axes[j, axis]) for axis in range(2)]
         row = np.repeat(np.arange(active.size), 2)
-        order = np.arange(2 * active.size).reshape(2, -1).T.ravel()  # row by row
+        # both tangents of a row in succession
+        order = np.arange(2 * active.size).reshape(2, -1).T.ravel()
         T = csr_array(vstack(stacked).tocsr()[order])
     return ContactRows(
         B, gap[active] / cover[active] + B @ u, T, row, cover[active], active
@@ -224,7 +226,7 @@ def _integrals(
     """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
     t_s, pair = slave.of_faces(e)
     t_m, place = master.of_faces(m[pair])
-    # pair all triangles of one face with all triangles of the other
+    # pair all triangles of the slave face with all triangles of the master face
     t_s, pair = t_s[place], pair[place]
     # coordinates in the auxiliary plane, and height above it
     frame = np.concatenate(
@@ -236,7 +238,7 @@ def _integrals(
         )
         for side, t in ((slave, t_s), (master, t_m))
     )
-    on_m = on_m[:, ::-1]  # opposite faces run clockwise on the plane
+    on_m = on_m[:, ::-1]  # corners run clockwise on the plane
     meets = (on_s.max(axis=1) > on_m.min(axis=1))[:, :2].all(axis=1)
     meets &= (on_m.max(axis=1) > on_s.min(axis=1))[:, :2].all(axis=1)
     meets &= _double_area(on_m) > 0

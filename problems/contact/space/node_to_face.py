@@ -1,6 +1,6 @@
-"""Node-to-face non-penetration in space, linearised at a given displacement.
+"""Node-to-face non-penetration in 3D, linearised at a given displacement.
 
-Each slave node stays on the outer side of the master, as in the plane
+Each slave node stays on the outer side of the master, as in 2D
 (`problems.contact.node_to_segment`). With the closest point x_c = Σ N_a x_a on the
 master faces and the outward normal n at x_c, the condition is B u ≤ c with
 B = [−n at s, +N_a n at a] and c = g + B u^k.
@@ -25,8 +25,8 @@ from mortarbench.problems.contact.space.triangles import FaceTriangles, triangul
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
-#: closest points on two faces coincide, on a common edge, if their distance relative to
-#: the radius of a face is below this value
+#: the closest points on two faces are the same point of a common edge if their
+#: distance, relative to the radius of a face, is below this value
 SAME_POINT = 1e-9
 
 
@@ -88,9 +88,10 @@ def node_to_face(
 def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     """Return the closest points of x (s, 3) on faces, with outward normals."""
     tree = KDTree(faces.centre)
-    # faces contain their centres, so the closest point is at most `nearest` away; the
-    # centre of the face with this point is farther away by at most the radius of the
-    # face
+    # `nearest` is the distance to the closest centre of a face. Faces contain their
+    # centres, so the distance to the closest point is at most `nearest`. The distance
+    # to the centre of the face that contains this point is larger by at most the radius
+    # of the face
     nearest, _ = tree.query(x)
     found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
     candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
@@ -101,7 +102,7 @@ def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     distance = np.linalg.norm(at - x[node], axis=1)
     order = np.lexsort([distance, node])
     best = order[np.unique(node[order], return_index=True)[1]]
-    # faces that meet at the closest point: their normals are averaged
+    # average the normals of all faces that meet at the closest point
     same = np.linalg.norm(at - at[best][node], axis=1)
     meets = same <= SAME_POINT * faces.radius[faces.face[t]]
     touching = np.unique(np.stack([node, faces.face[t]])[:, meets], axis=1)

@@ -1,4 +1,4 @@
-"""Faces of contact sides in space, divided into triangles.
+"""Faces of contact sides in 3D, divided into triangles.
 
 A quadrilateral face is divided into four triangles about the mean of its corners. Its
 shape functions are linear on each triangle and ¼ at the centre. Thus the surface is
@@ -22,19 +22,21 @@ _CORNERS = np.eye(4)
 _QUAD = np.array(
     [[_CORNERS[k], _CORNERS[(k + 1) % 4], np.full(4, 0.25)] for k in range(4)]
 )
-#: (3, 4) shape functions at the vertices of a triangle, which repeats its last corner
+#: (3, 4) shape functions at the vertices of a triangular face, which is stored with its
+#: last corner repeated
 _TRIANGLE = _CORNERS[:3]
 
 
 class FaceTriangles(NamedTuple):
-    """Triangles of the faces of a contact side in space."""
+    """Triangles of the faces of a contact side in 3D."""
 
     surface: Surface
     centre: Points  #: (f, 3) means of the corners of each face, m
     radius: Vector  #: (f,) largest distance of a corner from the centre, m
     number: Nodes  #: (f,) number of triangles of each face, 1 or 4
     face: Nodes  #: (t,) face of each triangle, ascending
-    shape: NDArray[np.float64]  #: (t, 3, 4) shape functions of the face at its vertices
+    #: (t, 3, 4) shape functions of the face at the vertices of the triangle
+    shape: NDArray[np.float64]
     vertices: Points  #: (t, 3, 3) positions of the vertices, m
 
     def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:

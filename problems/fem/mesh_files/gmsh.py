@@ -70,8 +70,9 @@ def read_msh_sets(path: Path) -> FileMesh:
                     name, [np.zeros(0, dtype=np.int64) for _ in blocks]
                 )
                 rows[k] = np.flatnonzero(tag == number)
-    # cells with tag 0 beside named groups: the file was saved with Mesh.SaveAll = 1;
-    # otherwise gmsh omits entities without a physical group if any group exists
+    # in a file with named groups, cells with tag 0 show that the file was saved with
+    # Mesh.SaveAll = 1; without this option, gmsh omits entities without a physical
+    # group if any group exists
     is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
     more = f"; or, if they belong to no body, save {_SAVED}" if is_all else ""
     return FileMesh(
@@ -90,8 +91,8 @@ def read_msh_sets(path: Path) -> FileMesh:
 def _read(path: Path) -> Any:
     if path.suffix.lower() == ".geo":
         raise InputError(
-            f"{path}: a drawing, not a mesh; mesh it first: gmsh -2 {path.name} writes "
-            f"{path.with_suffix('.msh').name}"
+            f"{path}: a drawing, not a mesh; generate a mesh first: "
+            f"gmsh -2 {path.name} writes {path.with_suffix('.msh').name}"
         )
     with opened(path, "a .msh file") as file:
         size = os.fstat(file.fileno()).st_size
@@ -114,11 +115,11 @@ def _read(path: Path) -> Any:
 def _parse(path: Path) -> Any:
     """Parse a file with meshio, admitting entities without a physical group.
 
-    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2
-    they have tag 0. In format 4.1 they have no tag, and meshio fails; tag 0 is then
-    inserted into a copy of the text.
+    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. In format 2.2,
+    these cells have tag 0. In format 4.1, these cells have no tag, and meshio fails; in
+    this case, tag 0 is inserted into a copy of the text.
     """
-    import meshio  # imported here: workers and other families do not need it
+    import meshio  # imported here, because workers and other families do not need it
 
     try:
         return meshio.gmsh.read(path)  # meshio.read would print errors and exit
@@ -155,7 +156,7 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
     # skip the end of the section's title and the line with the counts
     lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]
     numbers: list[int] = []
-    remaining = 0  # cells of the current block, in format 4
+    remaining = 0  # number of remaining cells of the current block, in format 4
     for fields in (list(map(int, line.split())) for line in lines):
         if not fields:
             continue

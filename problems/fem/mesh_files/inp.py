@@ -44,7 +44,8 @@ _WORDS = Words(
     linear="C3D4, C3D6, C3D8, or CPE3, CPE4 in the plane; choose linear (first order) "
     "elements in the program that wrote the file, in gmsh -order 1",
 )
-#: dimension of element types, by the letters before their number of nodes
+#: mapping from the letters of an element type, which precede its number of nodes, to
+#: its dimension
 _FAMILIES = {
     "C3D": 3,
     "DC3D": 3,
@@ -74,7 +75,8 @@ _FACES: Mapping[str, Sequence[Sequence[int]]] = {
     ),
 }  # fmt: skip
 _FLAT = "expected a file of *NODE, *ELEMENT, *NSET, *ELSET and *SURFACE alone"
-#: keywords that would change the mesh and are rejected, with the remedy in the message
+#: mapping from a rejected keyword, which would change the mesh, to the remedy in the
+#: message
 _REFUSED = {
     "INCLUDE": "other files are not opened; expected all data in this file",
     "PART": f"{_FLAT}: in Abaqus/CAE, Model, Edit Attributes, Do not use parts and "
@@ -118,7 +120,7 @@ class _Sets:
         members = np.unique(np.append(before, members))
         self._limit -= members.size
         if self._limit < 0:  # nested sets could grow exponentially
-            raise InputError("sets repeat their members too often; expected fewer sets")
+            raise InputError("the sets have too many members; expected fewer sets")
         self._members[name.upper()] = name, members
 
     def resolve(self, fields: Iterable[str], where: str) -> Nodes:
@@ -168,7 +170,8 @@ class _Sets:
 class _Elements(NamedTuple):
     """All elements of a file, with one table of cells for each kind of cell."""
 
-    cells: Mapping[str, Nodes]  #: tables of corners by kind, as indices into the nodes
+    #: table of corners for each kind, as indices into the nodes
+    cells: Mapping[str, Nodes]
     number: Nodes  #: (k,) element numbers, sorted
     kind: NDArray[np.str_]  #: (k,) kind of each element
     row: Nodes  #: (k,) row of each element in the table of its kind

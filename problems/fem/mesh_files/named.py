@@ -36,22 +36,23 @@ class Words(NamedTuple):
     body: str = "body"
     boundary: str = "boundary"
     point: str = "point"
-    naming: str = "a name for every body"  #: how to name a body
-    linear: str = "linear cells"  #: how to obtain cells of first order
+    naming: str = "a name for every body"  #: instruction for naming a body
+    linear: str = "linear cells"  #: instruction for obtaining cells of first order
 
 
 class FileMesh(NamedTuple):
     """Content of a mesh file: cells of any dimension, and sets of cells and nodes."""
 
     path: Path
-    points: NDArray[np.float64]  #: (N, 2) or (N, 3)
+    points: NDArray[np.float64]  #: (N, 2) or (N, 3) positions of the nodes
     #: cells by kind, with meshio's names; node numbers start at 0
     blocks: Sequence[tuple[str, NDArray[Any]]]
     #: sets of cells by dimension and name; for each block, a set lists the rows of its
     #: cells
     cell_sets: Mapping[int, Mapping[str, Sequence[Nodes]]]
     node_sets: Mapping[str, Nodes]
-    vocabulary: Mapping[int, Words]  #: terms by the dimension of the bodies
+    #: mapping from the dimension of the bodies to the terms
+    vocabulary: Mapping[int, Words]
 
     @property
     def dim(self) -> int:
@@ -91,15 +92,15 @@ class FileMesh(NamedTuple):
 
 
 class NamedMesh(NamedTuple):
-    """A mesh with named bodies and boundaries, in the plane or in space."""
+    """A mesh with named bodies and boundaries, in 2D or 3D."""
 
-    points: NDArray[np.float64]  #: (N, dim)
+    points: NDArray[np.float64]  #: (N, dim) positions of the nodes
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in space)
-    #: edges (k, 2) of each named curve, with the body on their left; in space, faces
+    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in 3D)
+    #: edges (k, 2) of each named curve, with the body on their left; in 3D, faces
     #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
-    #: nodes of each named point or set of nodes and, in space, of each named curve
+    #: nodes of each named point or set of nodes and, in 3D, of each named curve
     spots: Mapping[str, Nodes]
     words: Words = Words()
 
@@ -399,8 +400,8 @@ def _check_apart(
     for i, name in enumerate(names):
         if (count := np.unique(part[owner == i]).size) > 1:
             raise InputError(
-                f"{path}: body {name!r} falls into {count} parts; expected one "
-                f"{words.body} for each"
+                f"{path}: body {name!r} consists of {count} disconnected parts; "
+                f"expected one {words.body} for each part"
             )
 
 

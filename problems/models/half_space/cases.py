@@ -62,7 +62,8 @@ ROUGH_SHARE = 0.6
 SIDE = "sphere on sphere"
 YOUNG = 200e9  #: modulus of both spheres, Pa
 RADIUS = 8e-3  #: radius of each sphere, m
-LOAD = 100.0  #: P, N; p₀ = 2.5 GPa for nu = 0.3, as in steel bearings
+#: force P, N; the peak pressure is 2.5 GPa for nu = 0.3, as in steel bearings
+LOAD = 100.0
 _CURVE_POINTS = 601  #: number of points for plots of exact tractions
 
 
@@ -209,11 +210,11 @@ class _Loading:
 
     exact: PointContact
     nu: float
-    normal: Vector  #: (k,) normal forces over P
-    bound: Vector  #: (k,) friction bounds over F₀
-    delta: float  #: tangential displacement along x over F₀/(πGa)
-    unit: float  #: F₀, N
-    sheared: ShearedPointContact | None = None  #: exact solution, if known
+    normal: Vector  #: (k,) normal forces in units of P
+    bound: Vector  #: (k,) friction bounds in units of F₀
+    delta: float  #: tangential displacement along x in units of F₀/(πGa)
+    unit: float  #: unit of force F₀, N
+    sheared: ShearedPointContact | None = None  #: exact solution; None if unknown
 
 
 def _coulomb(normal: Vector, exact: PointContact, p: Mapping[str, Any]) -> _Loading:
@@ -270,8 +271,8 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
         """Evaluate stick area, resultant and energies; compare with the exact solution.
 
         A radius is that of a disc with the same area as the cells in the zone.
-        `c_over_a` is the stick radius over the exact contact radius; `energy` is the
-        elastic energy and `dissipation` is Σ bound·|slip|, both in J. Errors are
+        `c_over_a` is the stick radius divided by the exact contact radius; `energy` is
+        the elastic energy and `dissipation` is Σ bound·|slip|, both in J. Errors are
         relative; the error of the shear traction is in the l² norm over the centres of
         the cells. Cattaneo and Mindlin's solution is exact only for nu = 0.
         """

@@ -40,7 +40,8 @@ NAME = "half-space"  #: name in `problems.OPERATORS`, stored in files
 #: Errors of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, which is 4e-15·‖C‖ for
 #: M = 8192
 EIGENVALUE_ROUNDING = 1e-12
-_STRIP_BYTES = 2**19  #: size of a strip of transforms; small enough for the cache
+#: size of a strip of transforms, bytes; small enough for the cache
+_STRIP_BYTES = 2**19
 
 Array = NDArray[np.float64]
 
@@ -107,7 +108,7 @@ class Influence:
             [scipy.fft.rfft2(K, axes=(1, 0)).real / h for K in kernels]
         )
         self._shape = 1 if nu is None else 2, m0, m1
-        self._places = i * m1 + j  # in the bounding grid of m0 × m1 cells
+        self._places = i * m1 + j  # indices in the bounding grid of m0 × m1 cells
 
     def __call__(self, x: Array) -> Array:
         """Multiply F by a vector (n,) or by a matrix (n, k)."""

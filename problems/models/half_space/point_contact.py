@@ -63,7 +63,7 @@ class ShearedPointContact:
     normal: PointContact
     mu: float
     nu: float
-    Q: float  #: tangential force over μP, below 1
+    Q: float  #: tangential force in units of μP, below 1
 
     @property
     def G(self) -> float:

@@ -32,7 +32,7 @@ MATERIAL = Material(E=2e4, nu=0.33)
 SIDE = 1.0  #: side length of the cube, m
 PRESSURE = 465.0  #: pressure on the top, Pa
 GAP = 1e-3  #: gap between cube and wall, m
-FORCE = PRESSURE * SIDE**2  #: F₀, N
+FORCE = PRESSURE * SIDE**2  #: unit of force F₀, N
 WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 
 

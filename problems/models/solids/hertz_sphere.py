@@ -10,11 +10,11 @@ tractions of Hertz's pressure is O((a/ρ)²). A whole sphere is not suitable, be
 overall compression, which the theory neglects, is of order a/R relative to the
 approach, 6 % for a/R = 0.08.
 
-The upper body is supported by contact alone; hence the form ``dual-bounds`` does not
-exist. A support of the lower body along z has no reaction. The displacement far from
-the contact is that of the half-space minus the approach of distant points to the plane
-z = 0. The approach is evaluated at the side opposite the contact and summed over the
-bodies.
+The upper body is supported by contact alone; therefore, the form ``dual-bounds`` does
+not exist. A support of the lower body along z has no reaction. The displacement far
+from the contact is that of the half-space minus the approach of distant points to the
+plane z = 0. The approach is evaluated at the side opposite the contact and summed over
+the bodies.
 
 In Cattaneo and Mindlin's problem, a tangential force Q acts along x on two blocks of
 double width, for which only y = 0 is a plane of symmetry. The tractions of Q on the cut
@@ -85,7 +85,7 @@ UNIFORM = 1.25  #: half width of the uniformly meshed part, in units of a
 #: R from the axis
 MAX_RATIO = 1 / 8
 GROUND = RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-#: names of the bodies by the key `against`
+#: mapping from the value of the key `against` to the names of the bodies
 NAMES: Mapping[str, tuple[str, ...]] = {
     "plane": ("sphere",),
     "sphere": ("upper", "lower"),
@@ -97,7 +97,7 @@ class _Block(NamedTuple):
 
     mesh: Mesh
     cells: tuple[int, int, int]
-    up: int  #: 1 above the plane z = 0, −1 below
+    up: int  #: 1 for a block above the plane z = 0, −1 for one below
     copies: int  #: number of blocks around the axis: 4, or 2 of double width
 
     @property
@@ -298,7 +298,8 @@ def _far_forces(
     the contact, so that the resultant and the moment about y vanish despite quadrature
     errors and the curved side.
 
-    stress : returns the stress (k, 3, 3) at points (k, 3) for the unit force
+    stress : function that returns the stress (k, 3, 3) at points (k, 3) for the unit
+        force
     axis : axis of the point force, 0 (x) or 2 (z)
     """
     mesh, mirror = block.mesh, np.array([1, 1, block.up])
@@ -336,7 +337,7 @@ def _approach(
     material: Material,
     length: float,
 ) -> float:
-    """Return the approach of distant points of a body to z = 0, m.
+    """Return the approach of distant points of a body to the plane z = 0, m.
 
     The approach is averaged over the side opposite the contact.
     """
@@ -438,12 +439,12 @@ def _shear_quantities(
     """Compare stick zone and tangential force of full spheres with the exact solution.
 
     `tangential_force` is the force along x on the lower sphere in N. `stick_area` is
-    the sum of the nodal areas of sticking nodes in m². `stick_radius` is
-    √(5∫sr²dA/2∫s dA) in m, with s = μp − q at sticking nodes. This radius is exact for
-    Cattaneo and Mindlin's traction q, because s is then distributed like Hertz's
-    pressure on a disc of radius c. `c_over_a` is the stick radius over the exact
-    contact radius. `c_over_a_moment` follows from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which
-    also holds for Cattaneo and Mindlin's q.
+    the sum of the nodal areas of sticking nodes in m². `stick_radius` is √(5∫sr²dA/2∫s
+    dA) in m, with s = μp − q at sticking nodes. This radius is exact for Cattaneo and
+    Mindlin's traction q, because s is then distributed like Hertz's pressure on a disc
+    of radius c. `c_over_a` is the stick radius divided by the exact contact radius.
+    `c_over_a_moment` follows from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), which also holds for
+    Cattaneo and Mindlin's q.
     """
     (side,) = contact_sides(*solution.sides)
     assert side.friction_force is not None

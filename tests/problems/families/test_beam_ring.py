@@ -294,7 +294,7 @@ def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
     ("bad", "message"),
     [
         ({"Nr": 0}, "Nr=0 must be at least 1"),
-        ({"steps": 3, "step": 4}, "step=4 must be in 1..steps=3"),
+        ({"steps": 3, "step": 4}, "step=4 must be at most steps=3"),
         (
             {"plane": "curved"},
             "plane='curved' is unknown, expected 'strain' or 'stress'",

@@ -318,7 +318,7 @@ def test_every_tresca_problem_of_a_fixed_point_is_available():
 
 @pytest.mark.parametrize(
     ("keys", "message"),
-    [("Q=0.5", "friction=none with a tangential force; expected friction=coulomb"),
+    [("Q=0.5", "friction=none is not supported with a tangential force"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
      ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a fraction of μP"),
      ("friction=coulomb/mu=0/Q=0.5", "mu=0.0 must be positive"),
@@ -326,7 +326,7 @@ def test_every_tresca_problem_of_a_fixed_point_is_available():
      ("friction=coulomb/mu=0.3/Q=0.5/ratio=2", "expected ratio=1.0, or no Q"),
      ("friction=coulomb/mu=0.3/programme=proportional", "proportional requires Q > 0"),
      ("friction=coulomb/mu=0.3/Q=0.2/peak=0.4/programme=proportional",
-      "proportional requires Q > 0"),
+      "proportional requires Q > 0 and peak=Q"),
      ("friction=coulomb/mu=0.3/Q=0.5/steps=5", "expected programme=proportional"),
      ("friction=coulomb/mu=0.3/Q=0.2/peak=0.5/loading=static",
       "peak=0.5 is not used by loading=static"),

@@ -231,7 +231,10 @@ def test_a_tangential_force_leaves_the_middle_sticking():
         ("against=spher/dual", "against='spher' is unknown, expected 'plane' or 'sph"),
         ("contact=nts/dual", "contact=nts is not used by against=plane; expected aga"),
         ("basis=standard/dual", "basis=standard is not used by against=plane"),
-        ("Q=0.5/dual", "Q=0.5 with against=plane; expected against=sphere"),
+        (
+            "Q=0.5/dual",
+            "Q=0.5 is not supported with against=plane; expected against=sphere",
+        ),
         ("against=sphere/Q=1/dual", "Q=1.0 must be at least 0 and below 1, a fraction"),
         ("against=sphere/mu=0.2/dual", "mu=0.2 is not used without a tangential force"),
         ("dual-bounds", "dual-bounds"),

@@ -403,7 +403,7 @@ def test_older_names_of_p_and_q_are_accepted(written):
         ({"q": np.full(4, np.nan)}, "q contains NaN"),
         ({"q": "text"}, "q is not a matrix of numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
-        ({"m": 7}, "m is not 5"),
+        ({"m": 7}, "m contradicts the other variables; expected 5"),
         ({"u": np.ones(4)}, "u has shape (4,), expected (5,)"),
         ({"A": None}, "A is missing"),
         ({"G": np.eye(4)}, "h is missing"),
