@@ -155,13 +155,13 @@ class ContactSide:
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
     length: Vector  #: (s,) length of the undeformed side attributed to each node, m
-    #: (s, dim) force of this contact on each slave node: N/m in the plane, N in space
+    #: (s, dim) force of this contact on each slave node: N/m in 2D, N in 3D
     force: NDArray[Any]
     pressure: Vector  #: (s,) contact pressure, Pa, positive in compression
     gap: Vector  #: (s,) m, positive if open; NaN at nodes without an opposite side
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    #: (s,) tangential traction on the side, Pa; in space its magnitude
+    #: (s,) tangential traction on the side, Pa; in 3D its magnitude
     shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; "" at nodes without a contact row. Old
     #: files contain "open" in place of both `SLIDING` and ""
@@ -200,9 +200,11 @@ class Fields:
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, dim) displacement of each node, m
-    nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
+    nodal: Mapping[str, Vector] = field(
+        default_factory=dict
+    )  #: nodal results by name, e.g. von_mises (N,), Pa
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
-    #: (c, dim) force on each slave node: N/m in the plane, N in space
+    #: (c, dim) force on each slave node: N/m in 2D, N in 3D
     contact_forces: NDArray[Any] | None = None
     #: contact sides, one for each pair of bodies
     contacts: tuple[ContactSide, ...] = ()
@@ -239,7 +241,9 @@ class Case:
     fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0
     constant: float = 0.0
-    matrices: Mapping[str, Any] = field(default_factory=dict)  #: exported with the QP
+    matrices: Mapping[str, Any] = field(
+        default_factory=dict
+    )  #: matrices by name that are exported with the QP
     #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
@@ -291,7 +295,7 @@ class Family(ABC):
     name: str  #: first component of the names of its cases
     #: default values of all keys, in the order of keys in canonical names
     defaults: Mapping[str, Value]
-    forms: tuple[str, ...]  #: forms of the QPs
+    forms: tuple[str, ...]  #: names of the forms of the QP, such as "primal" and "dual"
     path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
     #: reason why the energy diverges under refinement; empty if it converges
     singular: str = ""

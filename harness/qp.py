@@ -92,12 +92,12 @@ class QP:
 
     """
 
-    P: Matrix  #: (n, n) symmetric positive semidefinite
-    q: Vector  #: (n,)
-    A: Matrix  #: (m, n)
-    b: Vector  #: (m,)
-    G: Matrix  #: (p, n)
-    h: Vector  #: (p,)
+    P: Matrix  #: (n, n) matrix of the quadratic term, symmetric positive semidefinite
+    q: Vector  #: (n,) coefficients of the linear term
+    A: Matrix  #: (m, n) matrix of the equality constraints
+    b: Vector  #: (m,) right-hand sides of the equality constraints
+    G: Matrix  #: (p, n) matrix of the inequality constraints
+    h: Vector  #: (p,) right-hand sides of the inequality constraints
     sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, followed by the other sets
     #: data that a solver may use but must not require
     structure: Structure | None = None
@@ -562,7 +562,7 @@ def _rows(
 
 
 def _freeze(M: Matrix) -> None:
-    """Set the buffers of a dense or sparse matrix read-only."""
+    """Mark the buffers of a dense or sparse matrix as read-only."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]
     for buffer in buffers:
         if isinstance(buffer, np.ndarray):

@@ -287,7 +287,7 @@ _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 def in_space(quantities: Mapping[str, Any]) -> bool:
     """Return True if the quantities belong to three-dimensional bodies.
 
-    Forces are then in N and energies in J, instead of N/m and J/m in the plane.
+    Forces are then in N and energies in J, instead of N/m and J/m in 2D.
     """
     nodes, dofs = quantities.get("nodes"), quantities.get("dofs")
     return isinstance(nodes, int) and nodes > 0 and dofs == 3 * nodes

@@ -63,7 +63,8 @@ COPIES = "copies"  #: role of a spec that `SolverSpec.copies` returns
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
-#: Modules that a plug-in does not import from its folder, even if they exist there.
+#: Names of modules that a plug-in does not import from its folder, even if they exist
+#: there.
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
 #: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
@@ -162,7 +163,7 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    #: functions that build operators, see `harness.operators`
+    #: functions that build operators, by name; see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=dict)
     origin: str = ""  #: path of the plug-in file, or "entry points"
 
@@ -198,7 +199,7 @@ class Registry(Mapping[str, T]):
     """Mapping of names to objects, each imported at its first access."""
 
     def __init__(self, entries: Mapping[str, Entry | T]) -> None:
-        self.entries = dict(entries)  #: objects, or references to them
+        self.entries = dict(entries)  #: objects, or references to objects, by name
         self._loaded: dict[str, T] = {}
 
     def __getitem__(self, name: str) -> T:
@@ -370,7 +371,7 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
             if what == "solver"
             else "rename the new one, or load one of the two"
         )
-        raise InputError(f"{what} {both[0]!r} of the plug-in exists; {remedy}")
+        raise InputError(f"{what} {both[0]!r} of the plug-in already exists; {remedy}")
     if isinstance(known, Registry):
         return Registry({**known.entries, **new}) if new else known
     return {**known, **new}
@@ -525,7 +526,9 @@ class _Imports(ast.NodeTransformer):
             if full != alias.name:
                 first = alias.name.partition(".")[0]
                 names = [ast.alias(full, bound or first)]
-                if bound is None and first != alias.name:  # `import a.b` binds a
+                if (
+                    bound is None and first != alias.name
+                ):  # `import a.b` binds the name a
                     names += [ast.alias(self._full(first), first)]
             statements += [ast.Import([name]) for name in names]
         return [
@@ -666,14 +669,14 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 raise InputError(f"{at} is a class; expected an instance")
             if not isinstance(key, str) or not _has(parts, thing):
                 raise InputError(
-                    f"{at} is of type {_type(thing)}; "
-                    f"expected a {kind}, under a name, with {', '.join(parts)}"
+                    f"{at} is of type {_type(thing)}; expected a string as key and a "
+                    f"{kind} with {', '.join(parts)}"
                 )
     for key, family in problems.items():
         if family.name != key:
             raise InputError(
-                f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; "
-                "expected the same name twice"
+                f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; expected equal "
+                "names"
             )
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
     families = {name: as_family(offered) for name, offered in problems.items()}

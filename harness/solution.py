@@ -76,15 +76,18 @@ class Solution:
     """
 
     status: Status
-    x: Vector  #: (n,)
+    x: Vector  #: (n,) primal variables
     y: Vector  #: (m,) multipliers of A x = b
     z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
     #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
     z_box: Vector
     iterations: int | None = None  #: None if the solver does not report the number
-    counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
+    counts: Mapping[str, int] = field(
+        default_factory=dict
+    )  #: numbers of operations by name, e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record
-    #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
+    #: other data from the solver by name, e.g. {"linear_solver": "qdldl",
+    #: "setup_seconds": 0.01}
     reported: Mapping[str, float | str] = field(default_factory=dict)
     #: columns of equal length, a row per iteration; see `harness.solution`
     history: History = field(default_factory=dict)
@@ -142,7 +145,7 @@ def usable_history(history: object) -> tuple[History, str]:
     """
     try:
         return checked_history(history), ""
-    except Exception as e:  # reading an object of a solver may raise any exception
+    except Exception as e:  # raised while an object of the solver is read
         return {}, f"history dropped: {e}"
 
 

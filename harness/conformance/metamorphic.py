@@ -44,7 +44,8 @@ class Equivalent(NamedTuple):
     qp: QP
     #: maps a point of the transformed QP to a point of the original QP
     recover: Callable[[Solution], Solution]
-    scale: float = 1.0  #: original objective = scale·transformed objective + constant
+    #: factor s in: original objective = s·(transformed objective) + constant
+    scale: float = 1.0
     constant: float = 0.0
 
     def followed_by(self, change: Callable[[QP], Equivalent]) -> Equivalent:

@@ -46,8 +46,8 @@ class Assessment:
     without mechanics, fields that require the mechanics are None.
     """
 
-    error: float  #: ‖u − u*‖
-    equilibrium_error: float | None  #: ‖u_λ − u*‖
+    error: float  #: ‖u − u*‖, error of the displacement
+    equilibrium_error: float | None  #: ‖u_λ − u*‖, error of the contact forces
     energy: float  #: J(u) − J(u*), where J is the potential energy
     #: max (Bu − c)₊ of all contact rows, divided by the mesh size
     penetration: float | None

@@ -228,7 +228,7 @@ def _refutations(a: Answer) -> Iterable[str]:
         return
     if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
         most = brief(a.allowed)
-        yield f"off the proven optimum by {brief(a.optimum_error)} > {most}"
+        yield f"error relative to the proven optimum {brief(a.optimum_error)} > {most}"
     elif a.verdict is not Verdict.VERIFIED:
         name = max(a.residuals, key=lambda n: nan_last(a.residuals[n]))
         yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
@@ -236,7 +236,7 @@ def _refutations(a: Answer) -> Iterable[str]:
         return
     plain = a.assessment.equilibrium_error is None  # a QP without mechanics
     off = [
-        f"{what} off by {brief(error)}"
+        f"error of {what} {brief(error)}"
         for what, error in (
             ("x" if plain else "displacement", a.assessment.error),
             ("contact forces", a.assessment.equilibrium_error),

@@ -67,11 +67,11 @@ ROUNDING = 1e-8
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """Sizes of the solution on one mesh."""
+    """Norm, energy and error bound of the solution on one mesh."""
 
     case: str  #: canonical name
     unknowns: int  #: number of unknowns
-    energy: float  #: potential energy J_h, J/m in the plane, J in space
+    energy: float  #: potential energy J_h, J/m in 2D, J in 3D
     norm: float  #: energy norm of u_h, in the square root of the unit of energy
     #: certified relative error of the reference solve on this mesh
     bound: float
@@ -91,8 +91,8 @@ class Discretisation:
 
     case: str  #: canonical name without the form
     kind: str
-    error: float | None = None  #: relative to ‖û‖, in the energy norm
-    change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
+    error: float | None = None  #: error relative to ‖û‖, in the energy norm
+    change: float | None = None  #: relative change ‖u_h − u_{h/2}‖/‖û‖ on the next mesh
     rate: float | None = None  #: observed rate q of the squared error
     #: for the kind "limit", the geometry to which the meshes converge; for other kinds,
     #: the reason why there is no limit

@@ -369,7 +369,7 @@ def _with_mix_ups(
         )
         if not name:
             return a
-        text = f"its contact forces are those of {name}"
+        text = f"its contact forces equal those of {name}"
         return replace(a, remarks=(*a.remarks, text))
 
     return [

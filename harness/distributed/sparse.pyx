@@ -450,7 +450,8 @@ def factor_above(M, double share, L_0):
     which contains no subtraction and therefore preserves the lower bound.
 
     M : (k, k) symmetric
-    share : small positive factor of the lower bound L_0 : (k, k) lower triangular L₀
+    share : small positive factor of the lower bound
+    L_0 : (k, k) lower triangular L₀
     """
     cdef Py_ssize_t k = len(M)
     L = np.array(M, dtype=np.float64, order="F")

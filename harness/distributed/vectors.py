@@ -252,7 +252,9 @@ class DistributedVector(np.ndarray):
         plain = [_slice(i) for i in inputs]
         if ufunc is np.matmul:
             return _contracted(self.ranks, *plain)
-        if method == "reduce" and how.get("axis") == 1:  # within rows (k, d)
+        if (
+            method == "reduce" and how.get("axis") == 1
+        ):  # each row of a matrix (k, d) is on one rank
             return _rewrap(self.ranks, ufunc.reduce(*plain, **how))
         if method == "__call__":
             if "out" in how:
@@ -420,8 +422,8 @@ Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 class Distributable(Protocol):
     """A product x ↦ Px that can be distributed over ranks.
 
-    The function that builds an operator (`harness.operators`) may return an object of
-    this kind.
+    The function that builds an operator (`harness.operators`) may return such a
+    product.
     """
 
     @property

@@ -154,8 +154,8 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
         raise
     except MemoryError:
         raise InputError(
-            f"{path}: would take more than {room // MIB} MiB of memory, while its size "
-            "and its head declare less; expected a file that is not damaged"
+            f"{path}: needs more than {room // MIB} MiB of memory, although its size "
+            "and its header declare less; expected an undamaged file"
         ) from None
     except Exception:  # damaged files cause many types of exceptions
         raise InputError(f"{path}: {wrong}") from None

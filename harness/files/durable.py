@@ -20,7 +20,8 @@ from mortarbench.harness.errors import InputError
 
 #: pattern of the names of files that are not yet complete
 _UNFINISHED = ".mortarbench-*.tmp"
-#: patterns of the names of incomplete files in older versions and in case folders
+#: patterns of the names of incomplete files of older versions, and of incomplete files
+#: in case folders
 _OTHERS = ("*.tmp", "*.new", ".*.new")
 #: incomplete files in result folders of older versions
 _OLD = ("suite.tmp", "environment.tmp")

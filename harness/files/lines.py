@@ -46,7 +46,7 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
             else:
                 raise InputError(
                     f"{path}, line {number}: longer than {MAX_LINE_BYTES >> 20} MiB; "
-                    f"expected {expected}, as a run appends it"
+                    f"expected {expected} written by a run"
                 )
 
 
@@ -140,8 +140,8 @@ class Lines:
             is_same = digest.digest() == self._digest.digest()
         if not is_same:
             raise InputError(
-                f"{self._path} was changed by another program while the run wrote it; "
-                "the same command continues with its present content"
+                f"{self._path} was changed by another program during the run; the "
+                "same command continues with the present content of the file"
             )
         # the content is unchanged; the file was only touched, linked or deleted
         self._times = _times(held)

@@ -114,7 +114,7 @@ def read_mat(path: Path) -> dict[str, Any]:
         for element in elements:
             name, value = _variable(element)
             if name in variables:
-                raise ValueError(f"{name} is there twice")
+                raise ValueError(f"{name} occurs twice")
             variables[name] = value
         return variables
 
@@ -195,7 +195,7 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # the tag itself contains the data, of up to four bytes
+        if kind >> 16:  # a short element, whose data of up to four bytes are in the tag
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:

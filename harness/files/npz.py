@@ -163,11 +163,11 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order (True: Fortran) and dtype from the header of an npy file."""
+    """Return shape, order (True for Fortran order) and dtype of an npy file."""
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in readers:
-        raise ValueError(f"an npy header of version {version}; expected 1.0 or 2.0")
+        raise ValueError(f"the npy header has version {version}; expected 1.0 or 2.0")
     shape, fortran, dtype = readers[version](file)
     if dtype.hasobject:
         raise _PickledError
@@ -183,5 +183,7 @@ def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
     """
     count = prod(shape)  # Python integers, unlike NumPy integers, do not overflow
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
-        raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
+        raise ValueError(
+            f"the file has {there} bytes left; expected {count} values of {dtype}"
+        )
     return count

@@ -156,7 +156,9 @@ def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # written by a program that does not align arrays
+        except (
+            ValueError
+        ):  # the arrays are not aligned, since another program wrote the file
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -177,7 +179,8 @@ def _expected(
         Exception
     ):  # zipfile raises many types of exceptions for texts, pickles and damaged files
         raise InputError(
-            f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
+            f"{path}: not an npz file of plain arrays; expected a file written by "
+            "numpy.savez"
         ) from None
     if missing := [name for name in expected if name not in arrays]:
         raise InputError(f"{path}: {', '.join(missing)} missing")
@@ -223,7 +226,7 @@ def _as_stored(
     path = _path(folder, digest)
     arrays = read_arrays(path, expected)
     if digest_of(arrays) != digest:
-        raise InputError(f"{path}: its content is not what was stored")
+        raise InputError(f"{path}: its content does not match its digest")
     return path, arrays
 
 

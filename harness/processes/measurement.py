@@ -181,7 +181,8 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-        # rank 0 measures its own memory, the parent the memory of all ranks
+        # rank 0 measures only its own memory, the parent measures the memory of all
+        # ranks
     ):
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
@@ -271,8 +272,8 @@ def _caching_notes(
         (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
     ]
     return [
-        f"took {slow:.3g} s the first time and {fast:.3g} s later: results are cached "
-        f"between {these}, or something was loaded the first time"
+        f"the first solve took {slow:.3g} s and a later one {fast:.3g} s: results are "
+        f"cached between {these}, or something was loaded in the first solve"
         for slow, fast, gain, these in compared
         if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
     ]

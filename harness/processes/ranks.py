@@ -87,8 +87,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    # The supervisor bound this process to one CPU, and its parent, a sub-reaper, to the
-    # other CPUs.
+    # Use all CPUs of this worker again: the supervisor bound this process to one CPU,
+    # and its parent, a sub-reaper, to the other CPUs.
     with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
@@ -132,7 +132,7 @@ class _RankExits:
         self._rank_of: dict[int, int] = {}  # rank by pidfd of its process
         # first rank that ended, or the message of its failure; None before any exit
         self._first: int | str | None = None
-        self._exit_description: dict[int, str] = {}  # by rank
+        self._exit_description: dict[int, str] = {}  # descriptions of exits by rank
         self._events = epoll()
         self._events.register(record, EPOLLIN)
 
@@ -296,9 +296,11 @@ class RankCosts(NamedTuple):
     The tables are empty for a solve in a single process.
     """
 
-    seconds: Mapping[str, tuple[float, float]] = {}  #: times by phase
+    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by phase
     counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
-    network: Mapping[str, tuple[float, float]] = {}  #: speed measured at the start
+    network: Mapping[
+        str, tuple[float, float]
+    ] = {}  #: speed of communication, measured at the start
 
     def fields(self) -> dict[str, Any]:
         """Return the tables as fields of a record."""

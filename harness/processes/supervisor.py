@@ -63,7 +63,8 @@ SETTLE_SECONDS = 0.5
 #: CPU time of a worker between an answer and the next request, relative to wall time,
 #: above which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-#: CPU time between an answer and the next request that is ignored
+#: largest CPU time, in s, between an answer and the next request that does not count as
+#: busy
 MIN_BUSY_CPU_SECONDS = 0.01
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
@@ -77,7 +78,7 @@ _LOCK = ForkSafeLock()  #: held while a thread starts, stops, ends or queries a 
 
 REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: bits in the ID of a CPU clock; see clock_getcpuclockid(3)
+_CPUCLOCK_SCHED = 2  #: bits of the ID of a CPU clock; see clock_getcpuclockid(3)
 #: Signals that solvers do not send to themselves. If such a signal ends a worker before
 #: a solve, the worker was killed from outside.
 _EXTERNAL_SIGNALS = {
@@ -593,7 +594,13 @@ class WorkerProcess:
 
         The description includes the last line of the worker's output.
         """
-        how, number = "ended, and other code of this process took its exit code", 0
+        how, number = (
+            (
+                "ended, but other code of this process reaped it, so that its "
+                "exit code is unknown"
+            ),
+            0,
+        )
         with suppress(ChildProcessError):
             how, number = _describe_exit(self._reaper_fd)
         last = ""
@@ -640,7 +647,7 @@ class WorkerProcess:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        """Close a file descriptor and forget it: its number may be used again."""
+        """Close a file descriptor and forget it, since its number may be used again."""
         fd: int = getattr(self, name)
         setattr(self, name, -1)
         if fd != -1:

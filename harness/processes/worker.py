@@ -108,7 +108,7 @@ class _SolverHost:
         self._solver = solver
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
-        self._last_step = -1  # last step of the sequence
+        self._last_step = -1  # index of the last measured step of the sequence
         # inode, size and modification time of each verified file, by the digest of its
         # content
         self._verified_files: dict[str, tuple[int, ...]] = {}
@@ -152,7 +152,7 @@ class _SolverHost:
         # often they are measured (Mytkowicz et al., ASPLOS 2009). A varying alignment
         # converts this bias into scatter, which confidence intervals include.
         self._ballast = np.empty(0)
-        with suppress(AttributeError):  # glibc only
+        with suppress(AttributeError):  # malloc_trim exists only in glibc
             # otherwise the allocator would reuse freed blocks at their old addresses
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
@@ -258,7 +258,10 @@ def _begin_sequence(
     if hasattr(solver, "tightening"):
         varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
         return varying
-    why = "its chain() has one tolerance for all steps; tightening() would take several"
+    why = (
+        "chain() uses one tolerance for all steps; expected tightening() for several "
+        "tolerances"
+    )
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 

@@ -46,9 +46,15 @@ JOURNAL = "merged"  #: name of the only journal of a merged folder
 class _Union:
     """Union of the measurements of several folders."""
 
-    records: dict[str, Record] = field(default_factory=dict)  # by run_id, in order
-    _keys: set[tuple[str, str]] = field(default_factory=set)  # run_id, environment
-    _contents: set[str] = field(default_factory=set)  # digests without run_id
+    records: dict[str, Record] = field(
+        default_factory=dict
+    )  #: measurements by run_id, in order
+    _keys: set[tuple[str, str]] = field(
+        default_factory=set
+    )  # (run_id, environment) of each measurement
+    _contents: set[str] = field(
+        default_factory=set
+    )  # digests of the records without run_id
 
     def add(self, record: Record) -> bool:
         """Add a measurement; return True if it is a duplicate."""
@@ -166,8 +172,8 @@ def _refuse_nested(source: Path, out: Path) -> None:
     for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
             raise InputError(
-                f"--out {out}: {inner} lies inside of {outer}; expected a folder apart "
-                "from those to merge"
+                f"--out {out}: {inner} lies inside of {outer}; expected a folder "
+                "outside the folders to merge"
             )
 
 

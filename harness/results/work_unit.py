@@ -73,8 +73,8 @@ class BuildFailure:
     """Outcome of a block whose case, or one of whose cases, could not be built."""
 
     block: WorkUnit
-    reason: str  #: one line
-    trace: str = ""  #: traceback of the exception, if raised by the family's code
+    reason: str  #: reason in one line
+    trace: str = ""  #: traceback of the exception if the family's code raised it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +82,7 @@ class MeasurementFault:
     """Outcome of a measurement that the harness or the machine prevented."""
 
     record: Record  #: incomplete record of the missing measurement
-    reason: str  #: one line
+    reason: str  #: reason in one line
     tried_again: bool  #: True if the measurement is repeated and has another outcome
 
 

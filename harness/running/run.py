@@ -269,8 +269,8 @@ def _check_same(
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} contains {record.case}, which is no longer in the suite; cases "
-                f"may be added, and --case narrows a run; {REMEDY}"
+                f"{out} contains {record.case}, which is no longer in the suite; "
+                f"cases may only be added; --case selects cases of a run; {REMEDY}"
             )
         today = configured.get(record.solver, record.options)
         for key in today.keys() | record.options.keys():

@@ -27,7 +27,7 @@ from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
 
-Cell = tuple[str, str, float]  #: mode, case and tolerance
+Cell = tuple[str, str, float]  #: mode, name of the case, and tolerance
 
 
 @dataclass(eq=False, kw_only=True)
@@ -43,10 +43,14 @@ class Schedule:
     unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
     #: records by cell; empty unless the suite sets a precision
     _records: dict[Cell, list[Record]] = field(default_factory=dict)
-    _declined: set[tuple[str, Cell]] = field(default_factory=set)  # solver and cell
+    _declined: set[tuple[str, Cell]] = field(
+        default_factory=set
+    )  # solver and cell of each declined case
     #: solver and cell of answers that were not verified, in series of growing sizes
     _ended: set[tuple[str, Cell]] = field(default_factory=set)
-    _done: set[str] = field(default_factory=set)  # run IDs in the journal
+    _done: set[str] = field(
+        default_factory=set
+    )  # run IDs of the measurements in the journal
     _next: int = 0  # number of the next new block
     # new block number by the original block number and the number of the part
     _parts: dict[tuple[int, int], int] = field(default_factory=dict)

@@ -57,8 +57,8 @@ class Blocks(ABC):
         bad = np.flatnonzero(~(np.isfinite(sizes) & (sizes >= 0)))
         if bad.size:
             raise InputError(
-                f"{kind}: {size}[{bad[0]}] = {sizes[bad[0]]}; expected finite numbers "
-                "that are not negative"
+                f"{kind}: {size}[{bad[0]}] = {sizes[bad[0]]}; expected finite "
+                "nonnegative numbers"
             )
         object.__setattr__(self, "index", whole)
         object.__setattr__(self, size, sizes.astype(float))

@@ -1,4 +1,4 @@
-"""Bounds of variables as a convex set."""
+"""Bounds on variables as a convex set."""
 
 from __future__ import annotations
 

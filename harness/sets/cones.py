@@ -1,4 +1,4 @@
-"""Second-order cones ‖x_T‖ ≤ μ x_N of contact forces: Coulomb's law in space."""
+"""Second-order cones ‖x_T‖ ≤ μ x_N of contact forces: Coulomb's law in 3D."""
 
 from __future__ import annotations
 

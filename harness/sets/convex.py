@@ -29,7 +29,8 @@ class Limits(NamedTuple):
 
     slack: Vector  #: distance to the limit, negative if violated
     size: Vector  #: absolute value of the limit
-    terms: Vector  #: sum of the absolute terms of the variables in the slack
+    #: sum of the absolute values of those terms of the slack that contain variables
+    terms: Vector
     sized: Callable[[Vector], Vector]  #: maps absolute values (n,) to `terms`
 
 

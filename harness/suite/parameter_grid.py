@@ -171,8 +171,8 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
     if paths := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
         return paths
     raise InputError(
-        f"params.path = {shown(pattern)} matches no file; expected a pattern of files, "
-        "from here or from the folder of the suite"
+        f"params.path = {shown(pattern)} matches no file; expected a pattern relative "
+        "to the working directory or to the folder of the suite"
     )
 
 
@@ -208,7 +208,7 @@ def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, st
     if not kinds:
         return "", ""
     if len(kinds) > 1:
-        raise InputError("sequence and growing: expected one of the two")
+        raise InputError("sequence and growing are both set; expected only one of them")
     (kind,) = kinds
     key = table[kind]
     values = params.get(checked.text(kind, key))
@@ -245,7 +245,7 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
             zipped[key] = group
         if len({len(columns[key]) for key in group}) > 1:
             lengths = ", ".join(f"{key} has {len(columns[key])}" for key in group)
-            raise InputError(f"zip: {lengths} values; expected equally many")
+            raise InputError(f"zip: {lengths} values; expected lists of equal length")
     axes = []
     for key in columns:
         together = zipped.get(key, [key])

@@ -371,8 +371,8 @@ def _on_ranks(
         raise InputError(f"copies = {shown(copies)}; expected true or false")
     if copies and counts == [1]:
         raise InputError(
-            "copies = true: copies are compared with ranks; expected several ranks, "
-            "such as ranks = [1, 2]"
+            "copies = true needs a number of ranks above 1; expected, for instance, "
+            "ranks = [1, 2]"
         )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
@@ -431,8 +431,8 @@ def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...
         set(thetas)
     ) < len(thetas):
         raise InputError(
-            f"tighten = {shown(thetas)}; expected distinct numbers from 0 (each step "
-            "to the tolerance) to below 1"
+            f"tighten = {shown(thetas)}; expected distinct numbers θ with 0 ≤ θ < 1, "
+            "where 0 means a constant tolerance"
         )
     if any(thetas) and not sequences:
         raise InputError(

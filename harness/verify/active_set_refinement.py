@@ -46,7 +46,7 @@ _EPS = Real(np.finfo(Real).eps)
 class ActiveSet(NamedTuple):
     """States of the rows, and the multipliers of rows that are not closed."""
 
-    states: States  #: (m,)
+    states: States  #: (m,) state of each row
     limits: Extended  #: (m,) multipliers on the boundary of Λ; unused for closed rows
 
     @property
@@ -74,7 +74,7 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
         step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
-    return u - step, left  # the u for which the last residual was computed
+    return u - step, left  # the last residual was computed for this u
 
 
 def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:

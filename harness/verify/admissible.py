@@ -74,8 +74,8 @@ def admissible(
 class _Rows(NamedTuple):
     """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
 
-    B: Any  #: (m, n) in extended precision
-    c: Extended  #: (m,)
+    B: Any  #: (m, n) rows in extended precision
+    c: Extended  #: (m,) right-hand sides
     contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
 
 
@@ -347,7 +347,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
 
 def relative(multipliers: Extended) -> Extended:
-    """Divide multipliers by the largest one; return ones if none is positive."""
+    """Divide multipliers by the largest one; return ones if none is > 0."""
     largest = multipliers.max(initial=Real(0))
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 

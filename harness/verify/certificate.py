@@ -1,4 +1,4 @@
-"""Proven bound of the error of an answer, without trust in the solver.
+"""Proven bound on the error of an answer, without trust in the solver.
 
 Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the displacement
 in equilibrium with λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
@@ -130,9 +130,9 @@ class Certificate:
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: the frictional part of `work`, its second term
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
-    stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
+    stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
     claimed: float  #: bound (3) of the error of the answer
-    least: float  #: lower bound of ‖u*‖
+    least: float  #: lower bound on ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
     seminorm: bool  #: True if bodies can move rigidly; see module docstring
 
@@ -153,7 +153,7 @@ class Certificate:
 
     @property
     def bound(self) -> float:
-        """Bound of the relative errors of û, u_λ and the answer, in the energy norm.
+        """Bound on the relative errors of û, u_λ and the answer, in the energy norm.
 
         The bound is infinite if the solution is not proven to be nonzero.
         """
@@ -161,7 +161,7 @@ class Certificate:
 
     @property
     def error(self) -> float:
-        """Bound of the energy norms of the errors of û, of u_λ and of the answer."""
+        """Bound on the energy norms of the errors of û, of u_λ and of the answer."""
         return max(self.pair * self.stretch, self.claimed)
 
     @property
@@ -189,13 +189,13 @@ class EigenvalueCertificate(NamedTuple):
 
     x: Vector  #: x̂ (n,), in the sets
     z: Vector  #: (n,) normal to the sets at x̂
-    distance: float  #: ‖r‖/√μ, bound of ‖x̂ − x*‖_P, including the rounding of r
+    distance: float  #: ‖r‖/√μ, bound on ‖x̂ − x*‖_P, including the rounding of r
     moved: float  #: ‖x − x̂‖_P, distance of the answer from x̂
-    norm: float  #: ‖x̂‖_P, less rounding
+    norm: float  #: lower bound on ‖x̂‖_P, reduced by rounding errors
 
     @property
     def error(self) -> float:
-        """Bound of the error ‖x − x*‖_P of the answer."""
+        """Bound on the error ‖x − x*‖_P of the answer."""
         return self.moved + self.distance
 
     @property
@@ -219,7 +219,9 @@ class EigenvalueCertificate(NamedTuple):
         return length / least if least > 0 else np.inf
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
+@np.errstate(
+    all="ignore"
+)  # a point may contain 1e300; an overflow raises UncertifiableError
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
@@ -229,7 +231,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     for the radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ.
     The rounding term of the residual covers this distance (docs/certificates.md).
 
-    least : μ > 0, a proven lower bound of the eigenvalues of P
+    least : μ > 0, a proven lower bound on the eigenvalues of P
 
     Raises
     ------
@@ -263,7 +265,9 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     return certificate
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
+@np.errstate(
+    all="ignore"
+)  # a point may contain 1e300; an overflow raises UncertifiableError
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
@@ -326,7 +330,7 @@ def sharpest(
 
 
 def _least_norm(split: Undivided) -> float:
-    """Return a lower bound of ‖u*‖ from a pair that does not depend on an answer."""
+    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer."""
     mechanics = split.mechanics
     u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
@@ -519,7 +523,7 @@ def _charge(
 ) -> float:
     """Bound the rounding terms (R3) of (4) by a fixed-point iteration.
 
-    The rounding terms depend on the bounds of the errors, which depend on the rounding
+    The rounding terms depend on the bounds on the errors, which depend on the rounding
     terms. Each iterate is increased by 1 %, so that the iteration ends above the fixed
     point.
 
@@ -541,7 +545,7 @@ def _charge(
 
 
 class _Reach(NamedTuple):
-    """Bounds of the rigid part of û − u*, as functions of the errors of û and u_λ."""
+    """Bounds on the rigid part of û − u*, as functions of the errors of û and u_λ."""
 
     gaps: Vector  #: (h,) constant terms, due to open gaps
     error: Vector  #: (h,) coefficients of ‖û − u*‖

@@ -73,7 +73,7 @@ class Ray(NamedTuple):
 
     rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
     centre: Any  #: (k,) fractions, approximate multipliers
-    radius: Any  #: (k,) fractions, bounds of |multipliers − centre|
+    radius: Any  #: (k,) fractions, bounds on |multipliers − centre|
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 
@@ -131,7 +131,9 @@ def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | Non
     w[qp.b.size :] = np.maximum(w[qp.b.size :], 0)
     sizes = abs(M) @ diags_array(column)
     largest = np.asarray(sizes.max(axis=1).toarray()).ravel()
-    size = np.abs(w) * np.where(largest > 0, largest, 1.0)  # rows 0·x ≤ −1 are empty
+    size = np.abs(w) * np.where(
+        largest > 0, largest, 1.0
+    )  # a row 0·x ≤ −1 has no entries
     if not 0 < size.max() < np.inf:
         return None
     w = w * 2.0 ** -np.floor(np.log2(size.max()))
@@ -179,11 +181,13 @@ def _corrected(
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
         if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
-            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
+            order = np.lexsort(
+                [-np.abs(w), rows >= qp.b.size]
+            )  # the pivots: equations, then large multipliers
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
-            assert solve is not None  # 0 is a solution
+            assert solve is not None  # w = 0 is a solution
             corrected = exact.copy()
             corrected[order] = solve(exact[order])
             yield Ray(rows, corrected, zero, vanish)
@@ -193,7 +197,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
     """Bound a change of w (k,) after which Mᵀw = 0 holds exactly; None if unproven.
 
     Columns are scaled by their terms and rows by w. Let X be an approximate right
-    inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
+    inverse of Mᵀ, and α < 1 a bound on ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
     regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δᵢ| ≤ Σⱼ|Xᵢⱼ|·‖c‖∞/(1 − α).
 
     M : (k, n) columns of the variables with cⱼ = 0
@@ -239,7 +243,7 @@ def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
             if np.isinf(bound):
                 return None
             products.append(-end * Fraction(bound))
-        value += max(products)  # convex in cⱼ: the maximum is at an end
+        value += max(products)  # the term is convex in cⱼ, so its maximum is at an end
         terms += max(map(abs, products))
     return float(-value / terms) if -value > Fraction(MIN_MARGIN) * terms else None
 

@@ -77,8 +77,8 @@ def measure(
         answer is the answer of the first solve. The times are means over the
         repetitions, because the first solve runs with cold caches. Every repetition
         receives a QP of new objects, so that the solver cannot recognise the QP by
-        identity starts, ends : called just before the clock starts and just after it
-        stops
+        identity
+    starts, ends : called just before the clock starts and just after the clock stops
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
@@ -262,7 +262,9 @@ def memory_mib(key: str, process: int | str = "self") -> float | None:
 def reset_peak() -> bool:
     """Reset VmHWM to the resident memory; return False on failure."""
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # proc(5)
+        Path("/proc/self/clear_refs").write_text(
+            "5"
+        )  # the code 5 resets VmHWM, see proc(5)
     except OSError:
         return False
     return True

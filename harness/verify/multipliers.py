@@ -71,7 +71,7 @@ class _Scales(NamedTuple):
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300
+@np.errstate(all="ignore")  # entries of a point may be as large as 1e300
 def with_multipliers(
     qp: QP,
     x: Vector,
@@ -140,9 +140,9 @@ class _Linearisation:
     sets: Sequence[ConvexSet]
     #: (n,) mask of the variables of the sets; all False if z_box is prescribed
     block: NDArray[np.bool_]
-    x: Vector  #: (n,)
+    x: Vector  #: (n,) point x
     tau: float  #: step τ of the natural map
-    force: Vector | None = None  #: (n,); None: sets balance any force
+    force: Vector | None = None  #: (n,) force f; None if the sets balance any force
     #: True for damped steps, which apply the derivative also to the residual. Damped
     #: steps converge more slowly than Newton's method, but from more distant points
     is_careful: bool = True
@@ -235,7 +235,7 @@ def _fitted(
             z[rows] = pull[: rows.size]
     r = g + qp.A.T @ (y - s.y) + qp.G.T @ (z - s.z)
     z_box = s.z_box
-    if "z_box" in unknown:  # each component separately
+    if "z_box" in unknown:  # fit each component separately
         balanced = _share(np.maximum(r, 0), lower, scales)
         z_box = _share(np.maximum(-r, 0), upper, scales) - balanced
         z_box[is_fixed] = -r[is_fixed]
@@ -275,7 +275,7 @@ def _least_squares(
         except RuntimeError:
             raise InputError(
                 "multipliers: the least-squares iteration did not end; expected y, z "
-                "and z_box beside x"
+                "and z_box in addition to x"
             ) from None
     y = np.zeros(free.shape[1])
     y[pivots[:rank]] = solve_triangular(R, Q.T @ (target - C @ zeta))

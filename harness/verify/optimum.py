@@ -83,7 +83,7 @@ class Optimum:
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
-    #: bound of the error of f*, plus the rounding of f at an exact solution
+    #: bound on the error of f*, plus the rounding of f at an exact solution
     doubt: float
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
@@ -213,12 +213,14 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
         # an error of 100·tol times this scale is half of the error that `kkt_residuals`
         # allows
         scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
-    elif work > NEGLIGIBLE * least:  # f* vanishes
+    elif work > NEGLIGIBLE * least:  # f* is zero up to rounding
         scale = magnitude = work
-    else:  # x* vanishes
+    else:  # x* is zero up to rounding
         scale = magnitude = generous
     rounding = min(ROUNDING * size, NEGLIGIBLE * magnitude)
-    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # 0 if all terms vanish
+    if not (
+        scale > 0 and doubt <= NEGLIGIBLE * scale
+    ):  # the scale is 0 if all terms vanish
         return None
     return Optimum(
         qp=qp,
@@ -307,10 +309,10 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
 class _ExactPoint(NamedTuple):
     """A primal-dual point in fractions."""
 
-    x: Any  #: (n,)
-    y: Any  #: (m,)
-    z: Any  #: (p,)
-    z_box: Any  #: (n,)
+    x: Any  #: (n,) primal variables
+    y: Any  #: (m,) multipliers of equality rows
+    z: Any  #: (p,) multipliers of inequality rows
+    z_box: Any  #: (n,) multipliers of bounds
 
 
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:

@@ -47,14 +47,14 @@ class UnsolvedError(Exception):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReferencePoint:
-    """A solution of the elastic problem, and a certified bound of its error."""
+    """A solution of the elastic problem, and a certified bound on its error."""
 
     u: Extended  #: (n,) admissible displacement
     multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
     equilibrium: Extended  #: u_λ (n,), in equilibrium with the multipliers
     states: States  #: (m,) states of the rows: closed, or multiplier at a bound
     norm: float  #: ‖u‖_K
-    bound: float  #: certified bound of the relative error; see `Certificate.bound`
+    bound: float  #: certified bound on the relative error; see `Certificate.bound`
 
     @property
     def active(self) -> NDArray[np.bool_]:

@@ -25,7 +25,7 @@ the diagonal matrix W of the stiffnesses of all copies,
 where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all other
 components. The range of Z contains the gluing and support forces. Then K_T d = b is a
 small Neumann problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three
-rows per plane subdomain. The matrix is singular along motions of whole bodies that only
+rows per subdomain in 2D. The matrix is singular along motions of whole bodies that only
 contact resists; λ̂ balances the load along these motions
 (`harness.verify.admissible.balanced`). The multipliers of gluing and supports in an
 answer are not used.
@@ -143,7 +143,7 @@ class Rounding(NamedTuple):
     """Effect of E along h rigid motions R."""
 
     strain: Vector  #: (h,) dual norms of the columns of ER
-    curvature: NDArray[np.float64]  #: (h, h) upper bounds of |RᵀER|
+    curvature: NDArray[np.float64]  #: (h, h) upper bounds on |RᵀER|
 
     def work(self, size: float, gamma: Vector, theta: float) -> float:
         """Bound |eᵀEe| for e = e' + Rγ by ‖e'‖, |γ| (h,) and |e'ᵀEe'| ≤ θ‖e'‖²."""
@@ -160,7 +160,7 @@ class Neighbour(NamedTuple):
 
     d: Extended  #: (N,) computed approximation
     Kd: Extended  #: (N,) K_T d
-    left: float  #: bound of the energy norm of the error of d
+    left: float  #: bound on the energy norm of the error of d
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
@@ -174,8 +174,9 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
     The last correction is not added; it bounds the error instead. If the norm of each
-    correction is at most q times that of the previous one, the norms of the omitted
-    corrections sum to at most size/(1 − q), where `size` is the norm of the last one.
+    correction is at most q times the norm of the previous correction, the norms of the
+    omitted corrections sum to at most size/(1 − q), where `size` is the norm of the
+    last correction.
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
@@ -333,7 +334,7 @@ class Undivided(_Stored):
         return self.free(sample(variances, deformed, np.arange(u.size), Real))
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Return bounds of ER, which is KR up to the projection P."""
+        """Return bounds on ER, which is KR up to the projection P."""
         motions = self.mechanics.motions
         along = np.abs(
             supported.T @ np.asarray(motions.constrained.T @ motions.KR) @ supported
