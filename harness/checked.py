@@ -15,7 +15,7 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown, unknown
 
-MAX_COUNT = 1_000_000  #: default upper limit of an integer
+MAX_COUNT = 1_000_000  #: default upper limit in `at_least_one`
 
 
 @contextmanager

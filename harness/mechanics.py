@@ -330,7 +330,7 @@ class AdmissibleForces:
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return lower and upper bounds (m,) of each λᵢ for fixed other multipliers."""
+        """Return lower and upper bounds (m,) on each λᵢ, with all others fixed."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -541,7 +541,9 @@ class Mechanics:
     #: maps a solution of the emitted QP to x = u, the multipliers y of the supports,
     #: and the multipliers z of the contact and friction rows
     to_primal: Callable[[Solution], Solution]
-    factorise: Callable[[], Inverse]  #: factorises K, returns K⁺; called at most once
+    factorise: Callable[
+        [], Inverse
+    ]  #: factorises K and returns K⁺; called at most once
     #: cell size of the contact side, in the unit of length of `primal`
     mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, for checks of

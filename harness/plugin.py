@@ -267,7 +267,7 @@ class SourceFile:
 class Family(ABC):
     """A parametrised family of problems; in practice a frozen dataclass.
 
-    A method raises `InputError` if a value is outside the range of the family.
+    Methods raise `InputError` if the value of a key is not supported.
 
     Examples
     --------
@@ -289,7 +289,6 @@ class Family(ABC):
     ...         )
     >>> Spring().complete({})
     {'k': 2.0}
-
     """
 
     name: str  #: first component of the names of its cases
@@ -332,7 +331,7 @@ class Family(ABC):
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the geometry that `refined` does not refine; "" if all is refined.
+        """Describe the geometry that `refined` does not refine; "" if there is none.
 
         The text is appended to an estimate of the discretisation error, for instance
         "of the bodies as they are meshed".

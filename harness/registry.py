@@ -669,8 +669,8 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 raise InputError(f"{at} is a class; expected an instance")
             if not isinstance(key, str) or not _has(parts, thing):
                 raise InputError(
-                    f"{at} is of type {_type(thing)}; expected a string as key and a "
-                    f"{kind} with {', '.join(parts)}"
+                    f"{at} is of type {_type(thing)}; expected a {kind} with "
+                    f"{', '.join(parts)}, keyed by a string"
                 )
     for key, family in problems.items():
         if family.name != key:

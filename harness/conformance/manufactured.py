@@ -39,7 +39,7 @@ def manufactured(
 
     The point, its multipliers and the active set are drawn at random, and q follows
     from stationarity. The entries of the matrices are of order one. Some constraints of
-    every kind in the shape are active. The minimiser is unique except for the shape
+    every type in the shape are active. The minimiser is unique except for the shape
     "singular".
 
     shape : a key of `SHAPES`
@@ -47,7 +47,6 @@ def manufactured(
     >>> qp, point = manufactured("equalities")
     >>> bool(np.allclose(qp.P @ point.x + qp.q + qp.A.T @ point.y, 0))
     True
-
     """
     store: Callable[[Matrix], Matrix] = np.asarray if dense else csr_array
     return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])

@@ -4,8 +4,8 @@
 A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, or a composition
 of other maps. Operators of decomposed bodies, and the rows of their coarse problem, are
 implemented as linear maps. For short vectors, a product takes less time than the
-overhead of a library call, and less than another pass over the vectors for a linear
-combination. The module is compiled when the package is installed. `sparse.pyi` declares
+overhead of a library call. Products that are combined with a linear combination save
+another pass over the vectors. The module is compiled when the package is installed. `sparse.pyi` declares
 its types for Python, `sparse.pxd` for compiled callers.
 """
 
@@ -224,7 +224,7 @@ cdef class CompressedRows(LinearMap):
     cdef void combine(
         self, double s, const double *v, double t, const double *x, double *y
     ) noexcept:
-        """y ← sv + tMx; y may be v."""
+        """y ← sv + tMx; y and v may be the same array."""
         cdef Py_ssize_t i, j
         cdef double y_i
         cdef const double *data = self.data

@@ -1,4 +1,4 @@
-"""Checks of the fitness of a machine for measuring times, with advice on changes."""
+"""Checks whether a machine is fit for timing measurements, with advice on changes."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def content_digest(*paths: Path) -> str:
 
 
 def is_copy(name: str) -> bool:
-    """Return True if this module writes files of that name to ``files/``."""
+    """Return True if `name` has the form of the names of copies in ``files/``."""
     return name == LIST or _COPY.fullmatch(name) is not None
 
 

@@ -117,7 +117,7 @@ def _listed() -> dict[str, int]:
 
 
 def _sum(tree: list[int], file: str, *groups: tuple[str, ...]) -> tuple[float, ...]:
-    """Return, for each group of keys, the sum of its values over all processes, in MiB.
+    """Return, for each group of keys, the sum of the values over all processes, in MiB.
 
     file : file in /proc/PID with lines like "RssAnon: 12 kB"
     """

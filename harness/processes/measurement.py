@@ -303,9 +303,9 @@ def single_worker(
     """Provide a worker for one measurement; the worker ends with the context.
 
     command : starts the worker; two file descriptors are appended
-    serve : main function of the worker as a fork of this process. If forking is safe,
-        the worker is forked at once, before this process loads data that the worker
-        does not need. Otherwise, `command` starts the worker
+    serve : main function of a forked worker. If forking is safe, the worker is forked
+        from this process at once, before this process loads data that the worker does
+        not need. Otherwise, `command` starts the worker
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")

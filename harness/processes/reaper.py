@@ -4,7 +4,7 @@ Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, the script starts COMMAND 
 session, bound to one CPU, and exits with the same code or signal. The script is run by
 an interpreter without site packages, which starts faster, since every worker has a
 sub-reaper. A *sub-reaper* adopts each descendant whose parent ends, see prctl(2), so
-that neither a double fork nor setsid(2) removes a process from its tree. The tree is
+that neither a double fork nor setsid(2) removes a process from the tree. The tree is
 killed
 
 * when COMMAND ends, and

@@ -97,7 +97,7 @@ _MACHINE_FAILURE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """The parent's times of a measurement, which bound the times of the worker."""
+    """Times of a measurement on the parent's clock, which bound the worker's times."""
 
     min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
     elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"

@@ -403,7 +403,7 @@ def _refuse_unguarded_script() -> None:
 
 @contextmanager
 def _delay_interrupt() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the context, and shield processes started in it.
+    """Delay Ctrl-C to the end of the block, and shield processes started in the block.
 
     A terminal sends SIGINT to all processes of its group, and each Dask process would
     print a traceback. Dask processes inherit the signal mask of this thread, which

@@ -57,7 +57,7 @@ class Schedule:
 
     @property
     def cells(self) -> int:
-        """Largest number of measurements of the suite."""
+        """Largest possible number of measurements of the suite."""
         s = self.suite
         return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
 

@@ -79,13 +79,12 @@ def with_multipliers(
     z: Vector | None = None,
     z_box: Vector | None = None,
 ) -> Solution:
-    """Return a solution in which multipliers that are None are replaced by the best.
+    """Return a solution; multipliers that are None are fitted to the KKT conditions.
 
     Raises
     ------
     InputError
         If the least-squares problem would have more than `MAX_ENTRIES` entries.
-
     """
     given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
     unknown = {name for name, (v, like) in given.items() if v is None and like.size}
@@ -198,7 +197,7 @@ def _fitted(
     unknown: set[str],
     linearised: _Linearisation,
 ) -> Solution:
-    """Minimise both sums over the unknown multipliers; the others are those of `s`.
+    """Minimise both sums over the unknown multipliers, with all others as in `s`.
 
     g : (n,) Px + q + Aᵀy + Gᵀz + z_box with the multipliers of `s`
     """

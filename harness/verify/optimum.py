@@ -79,7 +79,7 @@ MAX_RESIDUAL = 1e-14
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Optimum:
-    """Optimal value of a QP, and the scales of errors relative to it."""
+    """Optimal value of a QP, and the scales by which errors are divided."""
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*

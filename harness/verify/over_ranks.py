@@ -2,9 +2,9 @@
 
 The method is described in `harness.verify.substructured`; MPI reductions complete the
 sums. Each rank stores the components of its subdomains. A component that several ranks
-store has the same value on all of them. The contact and friction rows and the coarse
-problem are replicated on all ranks. The number of these rows is similar to the number
-of nodes of the contact sides.
+store has the same value on all these ranks. The contact and friction rows and the
+coarse problem are replicated on all ranks. The number of these rows is similar to the
+number of nodes of the contact sides.
 
 If only contact supports a body, its rigid motions are the few columns of a distributed
 matrix R, and products with Rᵀ are reductions in extended precision. The equilibrium of
@@ -219,7 +219,7 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which obtain the same bound.
 
-    The pairs are those of `harness.verify.certificate.certify`, except the pair that
+    The pairs of `harness.verify.certificate.certify` are tried, except the pair that
     results from an exchange of closed rows.
 
     Parameters
@@ -235,7 +235,6 @@ def certify_over_ranks(
     ------
     UncertifiableError
         If the answer contains NaN or inf, or no admissible pair is found near it.
-
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:

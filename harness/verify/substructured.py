@@ -100,7 +100,7 @@ class Split(Protocol):
         """Return the sums Tᵀb (n,) over the copies of each component."""
 
     def averaged(self, v: Extended) -> Extended:
-        """Average the copies v (N,) of components (n,), after `Sharing.matched`."""
+        """Return the averages (n,) of the copies v (N,), after `Sharing.matched`."""
 
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
