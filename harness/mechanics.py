@@ -115,7 +115,7 @@ class Friction:
     """
 
     T: csr_array  #: (k, n) tangential rows, d consecutive rows per contact row
-    bound: Vector  #: (k,) g ≥ 0, a force
+    bound: Vector  #: (k,) bound g ≥ 0 on the tangential force
     start: Vector  #: (k,) s, the value of T u from which slip is measured, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
@@ -349,7 +349,7 @@ class Exact(NamedTuple):
     over friction vectors; otherwise, σ(v) is infinite.
     """
 
-    f: Extended  #: (n,) load
+    f: Extended  #: (n,) load vector
     B: Any  #: (m, n) sparse rows of contact and friction
     c: Extended  #: (m,) right-hand side: initial gaps, then the `start` of friction
     forces: AdmissibleForces  #: set Λ of admissible multipliers
@@ -401,13 +401,13 @@ class RigidMotions(NamedTuple):
     which are relevant if bodies move far; see `harness.verify.certificate`.
     """
 
-    constrained: Any  #: (n, p) sparse; motions that change gaps or slip
+    constrained: Any  #: (n, p) sparse matrix of the motions that change gaps or slip
     free: Any  #: (n, q) sparse; motions that change gaps and slip only by rounding
-    G: Extended  #: (m, p)  B·constrained
+    G: Extended  #: (m, p) product B·constrained
     #: (n, p) `constrained` with each nonzero replaced by the largest absolute value of
     #: its column
     largest: Any
-    KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
+    KR: Extended  #: (n, p) product K·constrained, zero on prescribed components
 
 
 #: Names of first-order cells in meshio, by dimension and number of corners.

@@ -125,13 +125,14 @@ class About:
     title: str
     method: str  #: class of methods, e.g. "interior point"
     licence: str
-    linear_solver: str  #: solver used for its linear systems
+    linear_solver: str  #: solver used for the linear systems of the method
     #: work that is timed as preparation, and work that is timed as solution
     phases: str
     #: package to install; its module has the same name unless `module` is set
     package: str = ""
     module: str = ""  #: name of the module, if it differs from that of the package
-    sequence: str = ""  #: work reused from one QP to the next; empty if none is reused
+    #: work that is reused from one QP to the next, or "" if no work is reused
+    sequence: str = ""
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
     @property
@@ -157,8 +158,9 @@ class ContactSide:
     length: Vector  #: (s,) length of the undeformed side attributed to each node, m
     #: (s, dim) force of this contact on each slave node: N/m in 2D, N in 3D
     force: NDArray[Any]
-    pressure: Vector  #: (s,) contact pressure, Pa, positive in compression
-    gap: Vector  #: (s,) m, positive if open; NaN at nodes without an opposite side
+    pressure: Vector  #: (s,) contact pressure in Pa, positive in compression
+    #: (s,) gap in m, positive if open; NaN at nodes without an opposite side
+    gap: Vector
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
     #: (s,) tangential traction on the side, Pa; in 3D its magnitude
@@ -195,7 +197,7 @@ class ContactSide:
 class Fields:
     """A deformed state of all bodies, for plots and VTK files, in SI units."""
 
-    points: NDArray[Any]  #: (N, dim) reference positions, m
+    points: NDArray[Any]  #: (N, dim) reference positions of the nodes, m
     #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
@@ -219,7 +221,8 @@ class Fields:
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
         """Cells grouped by type, with the type names of meshio."""
-        from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
+        # imported here, since this import loads NumPy
+        from mortarbench.harness.mechanics import cell_blocks
 
         return cell_blocks(self.cells, self.dim)
 
@@ -247,7 +250,7 @@ class Case:
     #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
-    remarks: tuple[str, ...] = ()  #: warnings about the input, one line each
+    remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
     #: relative residual of the fixed-point iteration to which the QP belongs, such as
     #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
     #: the residual. 0 if there is no iteration
@@ -291,7 +294,7 @@ class Family(ABC):
     {'k': 2.0}
     """
 
-    name: str  #: first component of the names of its cases
+    name: str  #: name of the family, the first component of the names of its cases
     #: default values of all keys, in the order of keys in canonical names
     defaults: Mapping[str, Value]
     forms: tuple[str, ...]  #: names of the forms of the QP, such as "primal" and "dual"

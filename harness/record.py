@@ -260,7 +260,7 @@ class Record(Measurement):
             if a field has a wrong type or an invalid value.
 
         """
-        import msgspec  # measuring processes do not need it
+        import msgspec  # imported here, since measuring processes do not need msgspec
 
         try:
             try:

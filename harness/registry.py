@@ -323,7 +323,8 @@ def entry_point_plugins() -> Plugin:
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
     if not _some_package_offers():
         return Plugin(origin="entry points")
-    from importlib.metadata import entry_points  # loads slowly and is seldom needed
+    # imported here, since this module loads slowly and is seldom needed
+    from importlib.metadata import entry_points
 
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
@@ -475,7 +476,7 @@ def _imported(path: Path) -> ModuleType:
         raise InputError(f"{path}: not a Python file; its name must end in .py")
     _forget(name)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look up their module there
+    sys.modules[name] = module  # dataclasses look up their module in sys.modules
     try:
         with redirect_stdout(sys.stderr):
             spec.loader.exec_module(module)

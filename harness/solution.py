@@ -42,7 +42,7 @@ _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 class Status(StrEnum):
     """Outcome of a solve as claimed by the solver."""
 
-    SOLVED = "solved"  #: the solver claims that the point meets its tolerance
+    SOLVED = "solved"  #: the solver claims that its point satisfies the tolerance
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     #: the solver claims that the feasible set is empty or the objective is unbounded

@@ -35,7 +35,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector
 from mortarbench.harness.solution import Solution
 
-Order = NDArray[Any]  #: array of indices, or a mask
+Order = NDArray[Any]  #: array of indices or mask that selects unknowns or rows
 
 
 class Equivalent(NamedTuple):

@@ -65,7 +65,8 @@ class Deviation(NamedTuple):
     """Difference of an answer from the reference, divided by ‖u*‖; see `distances`."""
 
     u: Vector  #: (n,) difference of u, or of x for a QP without mechanics
-    equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
+    #: (n,) difference of the displacements u_λ; None without mechanics
+    equilibrium: Vector | None
 
 
 def energy_allowed(tol: float) -> float:
@@ -164,7 +165,7 @@ def distances(
     V = np.stack(points, axis=1)
     V = V - kernel @ (kernel.T @ V)
     gram = V.T @ np.asarray(P @ V)
-    norms = np.diag(gram)  # squares of the norms
+    norms = np.diag(gram)  # squared norms of the points
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
     lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
     np.fill_diagonal(lengths, 0)  # inf − inf would be NaN

@@ -87,7 +87,7 @@ class Pair(NamedTuple):
 
     a: int  #: index of the first answer
     b: int  #: index of the second answer
-    distance: float  #: ‖u − u'‖ in the energy norm
+    distance: float  #: distance ‖u − u'‖ of the displacements in the energy norm
     #: ‖Bᵀ(λ − λ')‖, distance of the contact forces in the dual norm; None without
     #: mechanics
     equilibrium: float | None
@@ -103,7 +103,8 @@ class Problem:
     #: origin of the reference point: "reference", or the solver and form of the best
     #: answer; empty if there is no reference point
     truth: str
-    doubt: float | None  #: bound on the relative error of the reference, energy norm
+    #: bound on the relative error of the reference in the energy norm
+    doubt: float | None
     closed: int | None  #: number of closed rows at the reference point
     answers: tuple[Answer, ...]
     pairs: tuple[Pair, ...]  #: pairs of answers at equal tolerances

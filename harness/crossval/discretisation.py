@@ -48,7 +48,8 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Family, Reference
 from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
-FILE = "discretisation.json"  #: name of the file in the result folder
+#: name of the file with the estimates in the result folder
+FILE = "discretisation.json"
 SCHEMA = 1  #: version of the format of the file
 MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 #: Assumed ratio of the numbers of unknowns after and before the first halving of the
@@ -69,8 +70,8 @@ ROUNDING = 1e-8
 class Level:
     """Norm, energy and error bound of the solution on one mesh."""
 
-    case: str  #: canonical name
-    unknowns: int  #: number of unknowns
+    case: str  #: canonical name of the case
+    unknowns: int  #: number of unknowns on the mesh
     energy: float  #: potential energy J_h, J/m in 2D, J in 3D
     norm: float  #: energy norm of u_h, in the square root of the unit of energy
     #: certified relative error of the reference solve on this mesh
@@ -99,7 +100,8 @@ class Discretisation:
     note: str = ""
     #: levels; the first is the coarsest mesh, which is the mesh of the case
     levels: tuple[Level, ...] = ()
-    params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
+    #: values of all keys of the case
+    params: Mapping[str, object] = field(default_factory=dict)
 
     def __str__(self) -> str:
         """Describe the error, or the reason why it is unknown."""
@@ -238,7 +240,7 @@ class _Halving:
     family: Family
     reference: Reference
     references: Path
-    end: float  #: deadline, in seconds of `perf_counter`
+    end: float  #: deadline on the clock `perf_counter`, in s
     why: str = ""  #: reason why there is no finer mesh
     late: bool = False  #: True if the reason is the deadline
     _coarse: tuple[Grid, Extended] | None = None

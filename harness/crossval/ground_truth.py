@@ -63,7 +63,7 @@ class GroundTruth(NamedTuple):
     closed: int | None  #: number of closed contact rows; None without mechanics
     #: computes the errors of an answer relative to this point
     assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
-    P: Matrix  #: (n, n) matrix of the norm: the stiffness, or P of the QP
+    P: Matrix  #: (n, n) matrix that defines the norm: the stiffness K, or P of the QP
     kernel: NDArray[np.float64]  #: (n, r) rigid motions, whose norm is zero
     note: str = ""  #: reason why an answer replaces the reference solution
 

@@ -28,8 +28,9 @@ class Row:
     answers: int  #: number of answers with a stored point
     refuted: int  #: number of refuted claims
     unanswered: int  #: number of measurements without a claim of success
-    error_median: float | None  #: median bound on the relative error, energy norm
-    error_worst: float | None  #: largest bound on the relative error, energy norm
+    #: median of the bounds on the relative error in the energy norm
+    error_median: float | None
+    error_worst: float | None  #: largest bound on the relative error in the energy norm
     worst_case: str  #: case with the error `error_worst`
     penetration: float | None  #: largest penetration relative to the mesh size
     balance: float | None  #: largest relative resultant force or moment on a body

@@ -334,7 +334,8 @@ def _true_forces(
     mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
-    point = reference_point(mechanics, solve, references)  # from the cache
+    # the reference point is in the cache
+    point = reference_point(mechanics, solve, references)
     return np.asarray(point.multipliers, dtype=float)
 
 

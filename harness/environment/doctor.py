@@ -30,7 +30,7 @@ class Level(StrEnum):
 
     OK = "ok"
     WARN = "warn"
-    UNKNOWN = "unknown"  #: the system does not provide the value
+    UNKNOWN = "unknown"  #: the operating system does not report the value
 
 
 _SWITCH = {True: "on", False: "off", None: None}

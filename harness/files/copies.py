@@ -62,8 +62,8 @@ def is_copy(name: str) -> bool:
 class _Entry(NamedTuple):
     """Entry of ``copies.json``."""
 
-    path: str  #: path as in the names of cases
-    sha256: str  #: first digits of the SHA-256
+    path: str  #: path of the file as it occurs in the names of cases
+    sha256: str  #: first digits of the SHA-256 of the content
     size: int  #: size of the file in bytes
 
 

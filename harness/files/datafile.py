@@ -25,7 +25,7 @@ from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
-MIB = 2**20  #: bytes in a mebibyte
+MIB = 2**20  #: number of bytes in a mebibyte
 
 _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
@@ -125,7 +125,8 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
                 return whole.read(size)
-        except (OSError, EOFError, zlib.error):  # not gzip, truncated, or damaged
+        # the content is not gzip data, is truncated, or is damaged
+        except (OSError, EOFError, zlib.error):
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None

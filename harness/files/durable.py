@@ -129,7 +129,8 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
     with report_full_disk(folder):
         path = folder / _UNFINISHED.replace("*", token_hex(8))
         try:
-            with suppress(FileNotFoundError), path.open("xb") as file:  # no such folder
+            # raised if the folder does not exist
+            with suppress(FileNotFoundError), path.open("xb") as file:
                 file.write(bytes(_PROBE_BYTES))
         finally:
             path.unlink(missing_ok=True)

@@ -53,7 +53,8 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(stored))
             member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             start = file.tell() + _LOCAL_HEADER + len(member.filename.encode()) + 4
-            padding = -start % ALIGNMENT  # the npy header fills multiples of 64
+            # NumPy pads the npy header to a multiple of 64 bytes
+            padding = -start % ALIGNMENT
             member.extra = _PADDING + padding.to_bytes(2, "little") + bytes(padding)
             archive.writestr(member, header.getvalue() + stored.tobytes())
 

@@ -29,7 +29,8 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
-_SIDE = "side_{}_"  #: prefix of the arrays of a contact side, with its number
+#: prefix of the names of the arrays of a contact side, with the number of the side
+_SIDE = "side_{}_"
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
 #: optional arrays of a contact side
 _SOME = ("push", "shear", "friction", "friction_force", "exact")

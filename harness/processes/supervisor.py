@@ -709,7 +709,8 @@ class _WorkerEndError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # `START_SECONDS` expired, not the suite's limit
+            # the limit `START_SECONDS` has expired, not the limit of the suite
+            verdict = Verdict.FAILED
         self.verdict = verdict
         self.signal = number
         self.is_fault = False  #: True if the worker reported a fault of the harness

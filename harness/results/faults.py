@@ -38,7 +38,7 @@ class Fault:
     run_id: str  #: run_id of the prevented measurement
     case: str  #: canonical name
     solver: str  #: label of the solver
-    what: str  #: reason, one line
+    what: str  #: reason of the fault in one line
     tried_again: bool  #: True if the same run repeated the measurement after the fault
 
     def to_json(self) -> str:

@@ -275,7 +275,8 @@ class _Cluster:
         """Yield the outcomes of a finished turn; submit the next turn of its block."""
         from distributed import CancelledError
 
-        if (active := self._active.get(future)) is None:  # its worker was lost
+        # the worker of this block was lost
+        if (active := self._active.get(future)) is None:
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)

@@ -22,7 +22,8 @@ class Blocks(ABC):
 
     prefix: ClassVar[str]  #: prefix of the names of arrays in files
     least: ClassVar[int]  #: smallest number d of variables in a block
-    columns: ClassVar[str]  #: meaning of the columns of `index`, for messages
+    #: text for messages that states the meaning of the columns of `index`
+    columns: ClassVar[str]
     #: True for sets distributed over ranks: a rank without blocks keeps an empty set
     may_be_empty: ClassVar[bool] = False
 

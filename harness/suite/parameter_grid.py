@@ -24,7 +24,7 @@ class Growth:
     """Position of a case in a series of growing sizes."""
 
     smaller: str  #: name of the next smaller case of the series; empty for the smallest
-    warm_up: CaseId  #: the same case, but with the default size of its family
+    warm_up: CaseId  #: the same case with the default size of the family
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

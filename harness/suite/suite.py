@@ -86,7 +86,7 @@ class Suite:
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
     cases: tuple[CaseId, ...]  #: distinct cases, solved without results of other cases
-    text: str  #: TOML of the suite, with the limits that apply
+    text: str  #: TOML text of the suite, including the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: positions of cases in series of growing sizes, by name of the case

@@ -128,7 +128,7 @@ class Certificate:
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
-    sliding: float  #: the frictional part of `work`, its second term
+    sliding: float  #: second term of `work`, which is due to friction
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
     stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
     claimed: float  #: bound (3) of the error of the answer
@@ -487,7 +487,8 @@ def proven(
     further = np.abs(supported.T @ split.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
-    if off is not None:  # K_T has no energy in bodies that move with their supports
+    # the energy in K_T of bodies that move together with their supports is zero
+    if off is not None:
         turned = np.abs(supported.T @ split.along(off[0])[:p]).astype(np.float64)
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
@@ -611,7 +612,8 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Return y ≥ 0 with columns·y = target (p,); inf if no such y is found."""
-    from scipy.optimize import nnls  # loads slowly, and workers do not need it
+    # imported here, since scipy.optimize loads slowly and workers do not need it
+    from scipy.optimize import nnls
 
     try:
         y, left = nnls(columns, target)

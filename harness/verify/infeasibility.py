@@ -281,7 +281,8 @@ def _solved(
         rows are equations
     reach : bounds of larger absolute value are omitted
     """
-    from scipy.optimize import linprog  # imported here because it loads slowly
+    # imported here, since scipy.optimize loads slowly
+    from scipy.optimize import linprog
 
     n, k = M.shape[1], M.shape[0]
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))

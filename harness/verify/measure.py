@@ -44,9 +44,10 @@ _VECTORS = ("x", "y", "z", "z_box")
 class Timed(NamedTuple):
     """A solution, and the cost of computing it."""
 
-    solution: Solution  #: its vectors are floats of the right shapes
+    solution: Solution  #: solution, whose vectors are float arrays of the right shapes
     cost: Measurement  #: times and memory
-    first_seconds: float | None = None  #: time of the first solve, if it was repeated
+    #: time of the first solve in s; None if the solve was not repeated
+    first_seconds: float | None = None
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
@@ -233,7 +234,7 @@ def _fresh_copy(qp: QP) -> QP:
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
     """Copy a dataclass, and apply `other` to each attribute of the copy."""
-    new = copy(whole)  # skip __init__: its checks may take longer than a solve
+    new = copy(whole)  # skip __init__, whose checks may take longer than a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 

@@ -250,7 +250,8 @@ def _least_squares(
     y is eliminated with an orthonormal basis of the range of w·free. Linearly dependent
     columns of `free` receive the multiplier zero.
     """
-    from scipy.optimize import nnls  # loads slowly; workers do not need it
+    # imported here, since scipy.optimize loads slowly and workers do not need it
+    from scipy.optimize import nnls
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)

@@ -81,7 +81,7 @@ MAX_RESIDUAL = 1e-14
 class Optimum:
     """Optimal value of a QP, and the scales by which errors are divided."""
 
-    qp: QP  #: the QP that was solved, with P as a matrix
+    qp: QP  #: QP that was solved, in which P is a matrix
     value: float  #: f*
     #: bound on the error of f*, plus the rounding of f at an exact solution
     doubt: float
@@ -420,7 +420,8 @@ def proves(solve: Reference) -> Proves:
     optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
-        if id(qp) not in optima:  # storing the QP keeps its id unique
+        # the cache also stores the QP, so that its id is not reused
+        if id(qp) not in optima:
             optima[id(qp)] = qp, proven_optimum(qp, solve)
         return optima[id(qp)][1]
 

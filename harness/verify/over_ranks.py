@@ -69,7 +69,7 @@ from mortarbench.harness.verify.substructured import (
 class Contact:
     """Contact rows, then friction rows with a positive bound; replicated on ranks."""
 
-    rows: csr_array  #: (m, n) rows, with global components as columns
+    rows: csr_array  #: (m, n) rows; the columns are the global components
     c: Vector  #: (m,) right-hand sides
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows of each tangential vector

@@ -36,7 +36,8 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-MAX_CACHED_BOUND = 1e-7  #: cached states that yield a larger bound are discarded
+#: largest error bound of a cached result; a result with a larger bound is discarded
+MAX_CACHED_BOUND = 1e-7
 #: Names and types of the cached arrays.
 STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 
