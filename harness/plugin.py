@@ -130,7 +130,7 @@ class About:
     phases: str
     #: package to install; its module has the same name unless `module` is set
     package: str = ""
-    module: str = ""  #: name of the module, if it differs from that of the package
+    module: str = ""  #: name of the module, if it differs from the name of the package
     #: work that is reused from one QP to the next, or "" if no work is reused
     sequence: str = ""
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
@@ -176,12 +176,12 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Return the mask (s,) of the nodes in contact.
 
-        With friction, a node is in contact if it sticks or slips. A force is not a
-        sufficient criterion, since under Tresca's law forces also act without contact.
-        Without friction, a node is in contact if its `push`, or the norm of its force
-        if `push` is None, exceeds `least` (N/m). The norm of the force is a less
-        accurate criterion, because on a curved side a mortar row also causes tangential
-        forces at adjacent nodes.
+        With friction, a node is in contact if the node sticks or slips. A force is not
+        a sufficient criterion, since under Tresca's law forces also act without
+        contact. Without friction, a node is in contact if its `push`, or the norm of
+        its force if `push` is None, exceeds `least` (N/m). The norm of the force is a
+        less accurate criterion, because on a curved side a mortar row also causes
+        tangential forces at adjacent nodes.
         """
         mask: NDArray[Any]
         if self.friction is not None:

@@ -246,7 +246,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return the diagonal of P (n,), or None if P is an operator without it."""
+        """Return the diagonal of P (n,), or None if P is an operator without one."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -274,11 +274,11 @@ class QP:
         return sizes
 
     def with_bounds(self, lb: Vector, ub: Vector) -> QP:
-        """Return the same QP with other bounds (n,)."""
+        """Return a copy of the QP with the given bounds (n,)."""
         return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
 
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
-        """Return the same QP with its sparse matrices in another storage format.
+        """Return a copy of the QP with sparse matrices in another storage format.
 
         convert : maps a sparse matrix to an equal one in that format; it is not applied
             to dense matrices and operators

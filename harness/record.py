@@ -41,7 +41,7 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Verdict on a measurement: the claim of the solver, and whether it is true."""
+    """Verdict on a measurement: states whether the claim of the solver is true."""
 
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
     #: claimed infeasible, and proven infeasible; see `harness.verify.infeasibility`

@@ -3,8 +3,8 @@
 A registry maps names to solvers or families. In a registry of solvers, the entry
 ``"PREFIX:*"`` represents all backends of a generic adapter. In the name
 ``PREFIX:BACKEND``, the text after the last colon is the value of the adapter's field
-``backend``. A method ``backends()`` of the adapter, if it exists, returns the installed
-backends.
+``backend``. If the adapter has a method ``backends()``, the method returns the
+installed backends.
 
 A plug-in file is loaded as a separate Python package, whose path is the folder of the
 file. The plug-in can import the modules and packages in this folder, which are called

@@ -69,7 +69,7 @@ def _plant(
     y = rng.standard_normal(m)
     # multipliers of active rows are at least 0.5: complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of each four variables, one is at its lower bound, one is at its upper bound, and
+    # of every four variables, one is at its lower bound, one is at its upper bound, and
     # two are between their bounds
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)

@@ -84,7 +84,8 @@ class Level:
 class Discretisation:
     """Discretisation error of one physical case.
 
-    kind : meaning of `error`. For "limit", it is the extrapolated distance to the limit
+    kind : meaning of `error`. For "limit", `error` is the extrapolated distance to the
+        limit
         of fine meshes; for "change", the distance to the solution on the next mesh; for
         "rounding", an upper bound at the level of rounding errors. For "unknown", there
         is no estimate, and `note` states the reason

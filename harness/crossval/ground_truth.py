@@ -109,7 +109,7 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return the reference point, its origin, and a note if it is an answer.
+    """Return the reference point, its origin, and a note if the point is an answer.
 
     Without a reference point, return a message with the reason instead.
     """

@@ -30,7 +30,7 @@ class NoiseFloor:
     clock_seconds: float  #: smallest observed step of the clock
     kernel_seconds: float  #: median time of the kernel
     pairs: int  #: number of pairs of times
-    ratio: float  #: median ratio of the times of arm A to those of arm B
+    ratio: float  #: median ratio of the time of arm A to the time of arm B
     low: float  #: lower end of the 95 % bootstrap interval of `ratio`
     high: float  #: upper end of the 95 % bootstrap interval of `ratio`
     one_pair: float  #: relative difference that 95 % of single pairs do not exceed

@@ -1,6 +1,6 @@
 """Files that grow line by line, such as a journal.
 
-Such a file contains whole lines. If its writer was killed, it may also contain a
+Such a file contains whole lines. If the writer was killed, the file may also contain a
 partial last line. Readers skip the partial line, and the next writer removes it.
 Readers limit the size of the file and the length of its lines.
 """
@@ -158,7 +158,8 @@ class Lines:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            # An edit within the resolution of the time stamps does not change them.
+            # Compare the content again, since an edit within the resolution of the time
+            # stamps does not change the time stamps.
             if error is None:
                 self._refuse_changed()
         finally:

@@ -1,6 +1,6 @@
 """One QP in one .mat file, for MATLAB and Octave.
 
-The names of the variables are those of `harness.files.qpfile`. The vectors ``q, h, b,
+The variables have the same names as in `harness.files.qpfile`. The vectors ``q, h, b,
 lb, ub`` are columns, the matrices ``P, G, A`` are sparse, and ``meta`` is a JSON text.
 Indices of sets, such as ``disc_index``, start at 0. A case may add further arrays, for
 instance the arrays F, d, B, c and R of the paper's dual QP.

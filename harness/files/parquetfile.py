@@ -4,9 +4,9 @@ Each row of the table is a problem. The columns are ``P, q, G, h, A, b, lb, ub``
 of doubles) and ``name``. All matrices are dense and stored row by row; their number of
 columns is the number of components of q. Absent constraints and bounds are null.
 qpbenchmark's ``ParquetTestSet`` reads exactly these columns [1]_. Sets other than
-bounds, such as discs, are stored in further columns, which qpbenchmark ignores. The
-names of these columns are those of `harness.sets.arrays`; index arrays are stored row
-by row.
+bounds, such as discs, are stored in further columns, which qpbenchmark ignores. These
+columns have the names of the arrays in `harness.sets.arrays`; index arrays are stored
+row by row.
 
 The meta data of `harness.files.qpfile` are stored in the metadata of the schema under
 the key ``mortarbench``, which other readers ignore.

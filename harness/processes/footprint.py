@@ -4,7 +4,8 @@ Resident memory (VmRSS) includes shared memory only if a process has mapped and 
 it. A file in /dev/shm, however, occupies memory even if no process has mapped it or the
 process that created it has ended. Each such file is therefore counted once, and it is
 removed when the tree has ended. Libraries that share arrays between processes (joblib,
-multiprocessing, MPI) would otherwise leave these files behind if they are killed.
+multiprocessing, MPI) would otherwise leave these files behind if their processes are
+killed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Meter of the memory of a process tree and of the shared files that it created."""
+    """Meter of the memory of a process tree, including the shared files of the tree."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())

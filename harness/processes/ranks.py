@@ -71,9 +71,10 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
     A parent process of each rank records how the rank ended
-    (`harness.processes.reaper`). If one rank ends while others are running, the others
-    are ended, whatever the exit code. The message therefore names the rank that ended
-    first. The output of the ranks is not parsed, since its lines may be interleaved.
+    (`harness.processes.reaper`). If one rank ends while others are running, the other
+    ranks are ended, whatever the exit code. The message therefore names the rank that
+    ended first. The output of the ranks is not parsed, since its lines may be
+    interleaved.
 
     command : command line; its last two elements are file descriptors, which the ranks
         inherit
@@ -101,7 +102,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         env=os.environ | {RECORD: str(write)},
     )
     # Close this process's copies of the pipe ends. Otherwise, readers would not receive
-    # end of file after the ranks or the parent have closed theirs.
+    # end of file after the ranks or the parent have closed their copies.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)
@@ -454,7 +455,7 @@ def _emit_on_ranks(
     Raises
     ------
     InputError
-        If the family raises it on every rank.
+        If the family raises an InputError on every rank.
     RankFailedError
         If some ranks fail with another error.
 

@@ -1,4 +1,4 @@
-"""Sub-reaper: parent of a worker that ends all processes the worker started.
+"""Sub-reaper: a parent of a worker, which ends all processes that the worker started.
 
 Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, the script starts COMMAND in a new
 session, bound to one CPU, and exits with the same code or signal. The script is run by
@@ -20,9 +20,10 @@ descriptor RECORD, and exits with the same code or signal. Until its exit, the s
 keeps the inherited descriptors open, so that mpiexec does not end the other ranks
 before the record is written.
 
-The process of the run is not a sub-reaper itself, for three reasons. If it were killed,
-it could not clean up. The trees of two workers would be indistinguishable. In a Python
-session that imports this package, it would adopt unrelated processes.
+The process of the run is not a sub-reaper itself, for three reasons. If the process of
+the run were killed, it could not clean up. The trees of two workers would be
+indistinguishable. In a Python session that imports this package, a sub-reaper would
+adopt unrelated processes.
 """
 
 from __future__ import annotations

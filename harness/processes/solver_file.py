@@ -53,7 +53,7 @@ def write_solver(path: Path, solver: Solver) -> None:
 
 
 def read_solver(path: Path) -> Any:
-    """Load a solver that `write_solver` has stored.
+    """Load a solver from a file written by `write_solver`.
 
     The file is unpickled, so it must have been written by a process of the same user.
 

@@ -56,7 +56,7 @@ POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 #: longest time between the closing of the pipe of requests and the exit of a worker,
 #: after which the worker is killed
 CLOSE_SECONDS = 1.0
-#: longest time between the end of its descendants and the exit of a sub-reaper
+#: longest time between the end of all descendants of a sub-reaper and its own exit
 END_SECONDS = 1.0
 #: longest time for which idle threads of pools may spin after an answer
 SETTLE_SECONDS = 0.5
@@ -355,7 +355,7 @@ class WorkerProcess:
                 self._spawn(memory_limit)
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
-        """Start a process: a fork that calls `serve` or, if it is None, the command."""
+        """Start a fork that calls `serve`, or the command if `serve` is None."""
         usable = os.sched_getaffinity(0)
         self._cpu = max(usable)
         self._footprint = Footprint()
@@ -367,7 +367,7 @@ class WorkerProcess:
         try:
             self._log.write_bytes(b"")
             # In append mode, the worker writes at the new end of the file after
-            # `_trim_log`. Without it, a write at the old offset would restore the old
+            # `_trim_log`. Otherwise, a write at the old offset would restore the old
             # length of the file.
             with self._log.open("ab") as log:
                 if serve is not None:
@@ -508,7 +508,7 @@ class WorkerProcess:
         return [process for process in self._tree() if process != self._worker]
 
     def _cpu_seconds(self) -> float:
-        """Return the CPU time of all threads of the worker, as the kernel counts it."""
+        """Return the CPU time, counted by the kernel, of all threads of the worker."""
         with suppress(OSError):  # the worker may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0

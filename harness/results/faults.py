@@ -2,8 +2,8 @@
 
 A fault prevents a measurement, but implies nothing about the solver. Faults are
 therefore written to a separate file instead of the journal, with a JSON object on each
-line. The measurement counts as missing until it is in the journal. If the same run
-command is given again, it repeats missing measurements.
+line. The measurement counts as missing until its record is in the journal. If the same
+run command is given again, the new run repeats missing measurements.
 """
 
 from __future__ import annotations

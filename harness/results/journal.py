@@ -1,7 +1,7 @@
 """Journal of a result folder: append-only, with one fsynced line per measurement.
 
 If a process is killed while it writes, the journal ends with a partial line. Readers
-ignore this line, and the next writer removes it.
+ignore the partial line, and the next writer removes it.
 """
 
 from __future__ import annotations

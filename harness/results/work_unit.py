@@ -92,11 +92,11 @@ Outcome = Result | BuildFailure | MeasurementFault
 class Engine(Protocol):
     """Function that executes blocks, on this machine or on the nodes of a cluster.
 
-    An engine may take several blocks from the iterator before it yields outcomes. It
-    may yield outcomes of several blocks in any order, and it may yield the outcomes of
-    a lost block again. A block is created when the engine takes it, and the decision on
-    further repeats depends only on outcomes that were yielded before. An engine should
-    therefore take as few blocks as possible in advance.
+    An engine may take several blocks from the iterator before it yields outcomes. An
+    engine may yield outcomes of several blocks in any order, and may yield the outcomes
+    of a lost block again. A block is created when the engine takes it, and the decision
+    on further repeats depends only on outcomes that were yielded before. An engine
+    should therefore take as few blocks as possible in advance.
     """
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:

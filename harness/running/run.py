@@ -172,7 +172,7 @@ class _Recorder:
             If the folder has been moved, or another run has locked it.
         OSError
             If the result cannot be written, for instance because the disk is full; the
-            journal then has no line for it.
+            journal then has no line for this result
 
         """
         match outcome:

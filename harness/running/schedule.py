@@ -101,7 +101,7 @@ class Schedule:
     def block_of_part(self, block: int, part: int) -> int:
         """Return the new block number of a part measured later or on another machine.
 
-        Times are paired within blocks, so such a part needs a separate block number.
+        Times are paired within blocks, so this part needs a separate block number.
         """
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next

@@ -169,7 +169,7 @@ def feasible_at_rows(
 ) -> FeasiblePoint | None:
     """Find a feasible point, moving only components on which the rows depend.
 
-    The algorithm is that of `_feasible_near`.
+    The algorithm is the same as in `_feasible_near`.
 
     Parameters
     ----------
@@ -355,7 +355,7 @@ def relative(multipliers: Extended) -> Extended:
 def supported_and_floating(
     G: Extended, w: Extended
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split the space of rigid motions (p,) into supported and floating ones.
+    """Split the space of rigid motions (p,) into supported and floating motions.
 
     Rows resist a motion ν through the change Gν (m,) of their gaps, with weights w (m,)
     ≤ 1. A motion of unit norm is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times

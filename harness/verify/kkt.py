@@ -192,8 +192,8 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
 
     * `natural_map` is ‖x − Π(x − g/L)‖·L/‖q‖ with g = Px + q + Aᵀy + Gᵀz, the
       projection Π onto all sets and an estimate L of the largest eigenvalue of P. It
-      does not depend on z_box. If q = 0, it is relative to the larger of ‖Px‖ and
-      ‖Aᵀy + Gᵀz‖.
+      does not depend on z_box. If q = 0, the value is relative to the larger of ‖Px‖
+      and ‖Aᵀy + Gᵀz‖.
     * `normal_distance` is the largest Euclidean distance of z_box on a disc or cone
       from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
       ‖Aᵀy + Gᵀz + z_box‖∞.

@@ -286,7 +286,7 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, are those of the
+    File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, refer to the
     innermost call in the file that defines the class of the solver. They are omitted if
     the traceback does not contain this file.
     """

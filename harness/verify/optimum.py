@@ -143,7 +143,7 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Return a mask (n,) of variables that P, a row or a set couples to others."""
+    """Return a mask (n,) of variables that are coupled by P, rows or sets."""
     is_coupled = np.zeros(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         is_coupled[one.block] = True
@@ -437,7 +437,7 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
     Equality rows, fixed variables, and rows and bounds with a nonzero multiplier in `s`
     receive multipliers λᵢ. These minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute
-    terms of row i. A row whose multiplier would change its sign is left out. `s` is
+    terms of row i. A row is omitted if its multiplier would change sign. `s` is
     returned unchanged if the remaining rows do not balance the gradient up to a
     negligible part, or if the QP has sets other than bounds.
     """

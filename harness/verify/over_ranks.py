@@ -94,7 +94,7 @@ class LocalBodies:
     """Subdomains of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    #: local subdomains; their T has a column for each local component
+    #: local subdomains; the matrix T has a column for each local component
     parts: Substructures
     components: NDArray[np.int64]  #: (n,) global numbers of components, ascending
     shared: NDArray[np.bool_]  #: (n,) mask of components that are also on other ranks
@@ -179,7 +179,7 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of components `at` (w,), and a mask of local ones."""
+        """Return local positions of components `at` (w,), and a mask of local `at`."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at
@@ -376,7 +376,7 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions into those that change gaps, and free ones.
+    """Split the rigid motions into motions that change gaps and free motions.
 
     at : (w,) global components in the rows
     """
