@@ -319,7 +319,7 @@ class Family(ABC):
         """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
     def instead_of(self, key: str) -> str:
-        """Return the key to use instead of a key of other families, "" if unknown.
+        """Return the key to use instead of a key of other families, or "" if unknown.
 
         The text is the end of the message about an unknown key.
         """

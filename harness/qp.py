@@ -32,7 +32,8 @@ _MIN_CURVATURE = -1e-6
 #: Smallest diagonal entry used for scaling, relative to the largest entry of P. Smaller
 #: entries may consist mostly of rounding errors.
 _MIN_DIAGONAL = 1e-4
-_STRIP_ROWS = 256  #: rows of P that are compared with Pᵀ at a time, to save memory
+#: number of rows of P that are compared with Pᵀ at a time, to save memory
+_STRIP_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

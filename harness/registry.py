@@ -508,7 +508,7 @@ class _PluginLoader(SourceFileLoader):
 
 
 class _Imports(ast.NodeTransformer):
-    """Replacement of module names in import statements of a plug-in by full names."""
+    """Transformer that replaces module names in imports of a plug-in by full names."""
 
     def __init__(self, package: str, folder: str) -> None:
         self._package = package

@@ -59,7 +59,8 @@ class Answer:
     claimed: str
     stored: Verdict  #: verdict that the run stored
     verdict: Verdict  #: verdict on the stored point, evaluated again
-    residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
+    #: the four residuals of `harness.verify.kkt` by name
+    residuals: Mapping[str, float]
     #: error relative to a proven optimum, which decides instead of the residuals
     optimum_error: float | None
     allowed: float  #: largest residual of a verified answer

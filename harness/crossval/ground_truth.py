@@ -155,7 +155,7 @@ def _best_certified(
 def _plain_truth(
     answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
-    """Return the reference point of a QP without mechanics, or the reason why not.
+    """Return the reference point of a QP without mechanics, or why it is missing.
 
     The error of the point is bounded by √(2r), where r is its largest KKT residual. The
     errors of verified answers have the same bound.

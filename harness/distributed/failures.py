@@ -30,7 +30,7 @@ PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other 
 #: ranks report failures to `harness.processes.ranks`, separately from the output of
 #: solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
-#: interval at which a failed rank tests if the other ranks have arrived, s
+#: interval at which a failed rank tests whether other ranks have arrived, s
 _POLL_SECONDS = 1e-3
 _MESSAGE_BYTES = 500  #: length to which descriptions of failures are truncated
 

@@ -28,7 +28,7 @@ _OLD = ("suite.tmp", "environment.tmp")
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: number of bytes that are written to test if a disk is full
+_PROBE_BYTES = 2**16  #: number of bytes that are written to test whether a disk is full
 _MIB = 2**20
 
 

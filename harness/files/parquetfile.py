@@ -136,7 +136,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     """Read the columns and the text of the meta data in a separate process.
 
-    A damaged file may crash Arrow; the separate process protects this one.
+    A damaged file may crash Arrow; the separate process protects this process.
 
     Raises
     ------

@@ -122,7 +122,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def read_point(path: Path, status: Status) -> Solution:
-    """Read a file that `write_point` wrote, as a `Solution` that claims `status`."""
+    """Read a file written by `write_point` as a `Solution` that claims `status`."""
     arrays = read_arrays(path, _POINT)
     x, y, z, z_box = (arrays[name] for name in _POINT)
     history = _history(path, arrays)

@@ -147,12 +147,13 @@ class WorkerProcess:
         self._worker = 0  # process ID of the worker, once it is ready
         self._reaper_fd = self._worker_fd = -1  # pidfds; -1 if there is no process
         self._cpu = -1
-        self._requests = self._replies = -1  # this process's ends of the two pipes
+        # file descriptors of the two pipes in this process
+        self._requests = self._replies = -1
         self._unread = bytearray()
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
-        # time on the parent's clock and CPU time of the worker at its last answer
+        # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
         self._facts: dict[str, Any] = {}  # number of threads, CPU; see `_facts`
         self._footprint = Footprint()

@@ -102,7 +102,7 @@ def serve(
 
 
 class _SolverHost:
-    """Solver with the state that persists between requests, such as its sequence."""
+    """Solver with the state that persists between requests, such as a sequence."""
 
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver

@@ -1,4 +1,4 @@
-"""Executor of blocks: the processes of a run on one machine."""
+"""Executor of blocks, which manages the processes of a run on one machine."""
 
 from __future__ import annotations
 

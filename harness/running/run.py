@@ -58,7 +58,8 @@ class Missing:
     """Measurements that are missing after a run; the same command repeats them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
-    faults: list[Fault]  #: measurements prevented by something other than the solver
+    #: faults of the harness or the machine that prevented measurements
+    faults: list[Fault]
 
 
 def run(

@@ -95,8 +95,8 @@ class Suite:
     #: for each value; 0 means constant tolerances
     tighten: tuple[float, ...] = (0.0,)
     #: requested relative half-width of confidence intervals; no further repeats are
-    #: measured when every ratio to the fastest solver attains it. If None, the number
-    #: of repeats is `repeats`
+    #: measured when the half-width of every ratio to the fastest solver is at most this
+    #: value. If None, the number of repeats is `repeats`
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     #: largest time per case and tolerance in s, if a precision is set

@@ -120,7 +120,7 @@ def predicted(
     push = multipliers[discs.index] * soft + v[discs.index]
     size = norms(push)[:, None]
     slips = size >= discs.radius[:, None] * soft
-    # if λ + v/D is zero, slip has the direction of λ
+    # if λ + v/D is zero, the direction of λ is used as the direction of slip
     limits[discs.index] = np.where(
         size > 0,
         push / np.where(size > 0, size, 1) * discs.radius[:, None],

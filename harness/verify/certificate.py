@@ -131,7 +131,7 @@ class Certificate:
     sliding: float  #: second term of `work`, which is due to friction
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
     stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
-    claimed: float  #: bound (3) of the error of the answer
+    claimed: float  #: bound (3) on the error of the answer
     least: float  #: lower bound on ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
     seminorm: bool  #: True if bodies can move rigidly; see module docstring
@@ -148,7 +148,7 @@ class Certificate:
 
     @property
     def pair(self) -> float:
-        """√(2g), bound (2) of the errors of û and u_λ together."""
+        """√(2g), bound (2) on the errors of û and u_λ together."""
         return _root(2 * self.gap)
 
     @property
@@ -185,7 +185,7 @@ class Certificate:
 
 
 class EigenvalueCertificate(NamedTuple):
-    """Bound (5) of the error of an answer, in the norm ‖·‖_P."""
+    """Bound (5) on the error of an answer, in the norm ‖·‖_P."""
 
     x: Vector  #: x̂ (n,), in the sets
     z: Vector  #: (n,) normal to the sets at x̂
@@ -364,7 +364,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
-    """Return the certificate of the pair near zero, or the reason why it has none."""
+    """Return the certificate of the pair near zero, or the reason why it is missing."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))

@@ -72,8 +72,8 @@ class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
     rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
-    centre: Any  #: (k,) fractions, approximate multipliers
-    radius: Any  #: (k,) fractions, bounds on |multipliers − centre|
+    centre: Any  #: (k,) approximate multipliers, as fractions
+    radius: Any  #: (k,) bounds on |multipliers − centre|, as fractions
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 

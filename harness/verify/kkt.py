@@ -679,7 +679,7 @@ def _excess(
     scale: Vector | float,
     most_rounding: float = NEGLIGIBLE,
 ) -> float:
-    """Subtract rounding from errors; return the largest ratio to their scales.
+    """Subtract rounding from errors, and return the largest ratio of error to scale.
 
     size : sum of the absolute terms of the error
     most_rounding : largest fraction of the scale that is subtracted as rounding

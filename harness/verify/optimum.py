@@ -249,7 +249,7 @@ def _reference_point(qp: QP, solve: Reference) -> Solution | None:
 
 
 class ExactOptimum(NamedTuple):
-    """An optimum without rounding."""
+    """Optimum computed in rational arithmetic."""
 
     value: Fraction  #: f*
     solution: Solution  #: rounded to double precision

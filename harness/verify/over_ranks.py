@@ -349,7 +349,7 @@ class _RigidMotions:
     """
 
     #: (n, r) sparse, at local components. The first p motions change gaps
-    #: ("constrained"); the others ("free") change gaps by rounding only
+    #: ("constrained"); the other ("free") motions change gaps only by rounding
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in subdomain motions
