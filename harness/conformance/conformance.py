@@ -64,9 +64,8 @@ DEGENERATE_TOLERANCES = (1e-6, 1e-8)
 INVARIANCE_PREFIX = "keeps its answer"
 #: advice for solvers that need the entries of P
 _DECLINE_OPERATORS = (
-    "if the solver needs the entries of P, add the line `if reason := "
-    "needs_matrices(qp): return reason` to declines(self, qp) (from harness import "
-    "needs_matrices)"
+    "if the solver needs the entries of P, add to declines(self, qp) the line `if "
+    "reason := needs_matrices(qp): return reason` (from harness import needs_matrices)"
 )
 #: Largest gradient that counts as rounding, relative to its largest term. Dual
 #: residuals use the same value.
