@@ -6,7 +6,7 @@ cells.
 
 A family that reads problems from files has the key ``path``, and its attribute
 ``path_suffix`` is the suffix of these files. The name of such a case is
-``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes; it ends at the first
+``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes, and ends at the first
 component with the suffix. If ``path_suffix`` is empty, PATH is the rest of the name,
 ``FAMILY:PATH``, and the family has a single form.
 """

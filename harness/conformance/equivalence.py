@@ -64,7 +64,7 @@ def same_answer(
     """Solve the unchanged and the changed string problem, and compare the answers.
 
     change : a key of `CHANGES`
-    old : the answer to the unchanged QP; None to solve it
+    old : the answer to the unchanged QP; None to compute this answer
 
     Returns
     -------

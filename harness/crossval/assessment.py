@@ -188,9 +188,9 @@ def _balance(mechanics: Mechanics, s: Solution) -> float | None:
     """Return the largest relative resultant force or moment on a body, or None.
 
     Resultants are Rᵀ(f − B_Eᵀy − Bᵀλ), where R contains the rigid motions of the
-    bodies, B_E the rows of the supports, and B the rows of contact and friction. They
-    are relative to the sum of the absolute forces on the body. The value is None if
-    there are no rigid motions.
+    bodies, B_E the rows of the supports, and B the rows of contact and friction.
+    Resultants are divided by the sum of the absolute forces on the body. The value is
+    None if there are no rigid motions.
     """
     R, primal = mechanics.rigid, mechanics.primal
     if not R.shape[1]:

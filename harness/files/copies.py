@@ -1,7 +1,7 @@
 """Copies of the input files of cases: ``FOLDER/files/DIGEST.SUFFIX``.
 
-To make a result folder self-contained, each file that defines a QP is copied into it,
-unless the file is too large. Files with equal content share one copy. The list
+To make a result folder self-contained, each file that defines a QP is copied into the
+folder, unless the file is too large. Files with equal content share one copy. The list
 ``files/copies.json`` contains the paths that occur in the names of cases, including the
 paths of files that were too large to copy. Readers compare these paths with the names
 of cases and never open them.

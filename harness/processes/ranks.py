@@ -9,7 +9,7 @@ are ended.
 
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
-each rank returns its slice of the same solution.
+the ranks return slices of one solution.
 
 As a baseline, the ranks can also solve copies: each rank solves the entire QP
 independently, at the same time as the other ranks. The slowest rank determines the

@@ -1,8 +1,8 @@
 """Process that executes all measurements of one solver.
 
-The process follows `harness.processes.protocol`. Its warm-up solves tiny QPs, so that
-imports during the first solve of a solver are not timed. It answers three kinds of
-requests:
+The process follows `harness.processes.protocol`. In its warm-up, the process solves
+tiny QPs, so that imports during the first solve of a solver are not timed. The process
+answers three kinds of requests:
 
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are

@@ -7,8 +7,8 @@ precision, further blocks are measured after the prescribed repeats. The ratio o
 time of each verified solver to the time of the fastest solver has a confidence interval
 (`harness.running.pairs`). No further blocks are measured when all these intervals are
 narrow enough, or when a limit is reached. This stopping rule is fixed in the suite
-before the first measurement. It depends only on the journal, so that a resumed run
-stops at the same block as an uninterrupted run.
+before the first measurement. The rule depends only on the journal, so that a resumed
+run stops at the same block as an uninterrupted run.
 """
 
 from __future__ import annotations

@@ -188,9 +188,10 @@ def _located(
 ) -> dict[str, object]:
     """Return the keys of a case, with a path that leads to its file.
 
-    If the path does not exist relative to the working directory, it is interpreted
-    relative to the folder of the suite. If the file is also missing in this folder, and
-    exactly one copy in the result folder matches, the path of the copy is returned.
+    If the path does not exist relative to the working directory, the path is
+    interpreted relative to the folder of the suite. If the file is also missing in this
+    folder, and exactly one copy in the result folder matches, the path of the copy is
+    returned.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():

@@ -16,19 +16,19 @@ solution, bounds both errors:
 Friction with bounds g_t adds the work Σ g_t‖v‖ of the slip v to the energy, and its
 multipliers satisfy ‖λ̂_t‖ ≤ g_t. The left-hand side of (1) then has the further terms
 Σ(g_t‖v*‖ − λ̂_tᵀv*) and Σ(g_t‖v̂‖ − λ_t*ᵀv̂), which are nonnegative. The right-hand
-side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of friction at its bound less
+side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of friction at its bound minus
 the work of λ̂_t. For Coulomb's law, g_t is fixed: the certificate holds for the last
 Tresca problem of the fixed-point iteration.
 
-The gap g is not evaluated as J − D: the difference would consist of rounding if the
-error is below 1e-8, since J and D then agree in all digits. The midpoint M of û and u_λ
+The gap g is not evaluated as J − D. If the error is below 1e-8, J and D agree in all
+digits, and their difference consists of rounding errors. The midpoint M of û and u_λ
 satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). Hence, for any other point u,
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
 where the right-hand side is at most √(2g) if u is û or u_λ.
 
-Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ less the root in (3).
+Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ minus the root in (3).
 This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its

@@ -287,7 +287,7 @@ def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
     File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, refer to the
-    innermost call in the file that defines the class of the solver. They are omitted if
+    innermost call in the file that defines the class of the solver. Both are omitted if
     the traceback does not contain this file.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")

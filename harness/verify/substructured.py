@@ -173,10 +173,10 @@ def without_rigid_motion(split: Split, v: Extended) -> Extended:
 def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
-    The last correction is not added; it bounds the error instead. If the norm of each
-    correction is at most q times the norm of the previous correction, the norms of the
-    omitted corrections sum to at most size/(1 − q), where `size` is the norm of the
-    last correction.
+    The last correction is not added to d, but is used to bound the error. If the norm
+    of each correction is at most q times the norm of the previous correction, the norms
+    of the omitted corrections sum to at most size/(1 − q), where `size` is the norm of
+    the last correction.
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
