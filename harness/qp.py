@@ -176,8 +176,8 @@ class QP:
 
         Matrices may be dense or sparse; sparse matrices are stored by columns. A vector
         may also be a matrix with one row or column. A single row of G or A may be a
-        vector, with a scalar right-hand side. Equal bounds may be a scalar. Absent
-        constraints and bounds are None.
+        vector, with a scalar right-hand side. If all lower or all upper bounds are
+        equal, a scalar suffices. Absent constraints and bounds are None.
 
         Parameters
         ----------

@@ -85,10 +85,9 @@ class Discretisation:
     """Discretisation error of one physical case.
 
     kind : meaning of `error`. For "limit", `error` is the extrapolated distance to the
-        limit
-        of fine meshes; for "change", the distance to the solution on the next mesh; for
-        "rounding", an upper bound at the level of rounding errors. For "unknown", there
-        is no estimate, and `note` states the reason
+        limit of fine meshes; for "change", the distance to the solution on the next
+        mesh; for "rounding", an upper bound at the level of rounding errors. For
+        "unknown", there is no estimate, and `note` states the reason
     """
 
     case: str  #: canonical name without the form
@@ -163,7 +162,7 @@ def discretisation_errors(
     If the time does not suffice for all meshes of a case, an earlier estimate from more
     meshes is kept.
 
-    cases : cases; the error of cases that differ only in form is estimated once
+    cases : cases to estimate; cases that differ only in form are estimated once
     folder : result folder, with the cache of reference points in ``references``
     budget : time for all cases, s; a mesh is skipped if its expected time exceeds the
         remaining time

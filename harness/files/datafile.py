@@ -2,9 +2,9 @@
 
 A small file can declare huge data, for instance an archive that expands a thousandfold,
 or a matrix with a billion columns and no entries. Readers therefore compute the
-required memory from the headers. If it exceeds the limit, they refuse the file before
-they read its data. The environment variable ``MORTARBENCH_MOST_MIB`` sets the limit in
-MiB; the default is 2048.
+required memory from the headers. If the required memory exceeds the limit, readers
+refuse the file before they read the data. The environment variable
+``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is 2048.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class Lines:
         self._times = _times(os.fstat(self._fd))
 
     def restore(self) -> None:
-        """Write the file again if it was deleted or replaced since it was opened.
+        """Restore the file if it was deleted or replaced after it was opened.
 
         Missing lines are restored from the old content, to which the open descriptor
         still refers. Lines that only the replacement file contains are kept.

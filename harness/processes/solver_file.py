@@ -1,10 +1,10 @@
 """Solver objects stored in files, from which worker processes load copies.
 
 Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
-notebook) with their code. It stores only the names of functions and classes of other
-modules. A worker would not find plug-ins or modules in the folder of the script, since
-workers do not search the working directory. Such modules are therefore also stored with
-their code.
+notebook) with their code. For functions and classes of other modules, cloudpickle
+stores only the names. A worker would not find plug-ins or modules in the folder of the
+script, since workers do not search the working directory. Such modules are therefore
+also stored with their code.
 """
 
 from __future__ import annotations

@@ -102,8 +102,8 @@ def judged(
 
     prove : returns the proven optimum of `qp`; called if residuals do not decide the
         verdict
-    values : residuals and objective as evaluated by ranks; None to evaluate them
-        here
+    values : residuals and objective that ranks have evaluated; None to evaluate them in
+        this function
     """
     record = record.replace(
         sizes=qp.sizes,
