@@ -67,8 +67,8 @@ _DECLINE_OPERATORS = (
     "if the solver needs the entries of P, add to declines(self, qp) the line `if "
     "reason := needs_matrices(qp): return reason` (from harness import needs_matrices)"
 )
-#: Largest gradient that counts as rounding, relative to its largest term. Dual
-#: residuals use the same value.
+#: Largest gradient that counts as rounding, relative to the largest term of the
+#: gradient. The dual residual uses the same value.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
@@ -85,7 +85,7 @@ class Grade(StrEnum):
 
 
 class Result(NamedTuple):
-    """Result of a check: its grade, and the reason for it or a remark."""
+    """Result of a check: the grade, and a reason or a remark."""
 
     grade: Grade
     message: str = ""

@@ -67,7 +67,7 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
-    # multipliers of active rows are at least 0.5: complementarity is strict
+    # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
     # of every four variables, one is at its lower bound, one is at its upper bound, and
     # two are between their bounds
@@ -234,12 +234,12 @@ FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 def strings(form: str) -> QP:
     """Return a small frictionless contact problem: a loaded string above a softer one.
 
-    The upper string has 24 cells, the lower one 16. The unknown is the deflection u at
-    their 25 + 17 nodes; K is the stiffness and f the load. The primal problem is
-    min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends. Each row of
-    G u ≤ h keeps an inner node of the upper string above the lower string. The entries
-    of the row are −1 at this node and interpolation weights at two nodes of the lower
-    string.
+    The upper string has 24 cells, and the lower string has 16 cells. The unknown is the
+    deflection u at the 25 + 17 nodes; K is the stiffness and f the load. The primal
+    problem is min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends.
+    Each row of G u ≤ h keeps an inner node of the upper string above the lower string.
+    The entries of the row are −1 at this node and interpolation weights at two nodes of
+    the lower string.
 
     form : "primal" is the primal problem. "dual", with B = [A; G], c = [0; h] and an
         orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to RᵀBᵀλ

@@ -212,7 +212,8 @@ def _contradiction(a: Answer) -> str:
     """Describe an error that exceeds the bound certified in the run, or return "".
 
     The result is "" for a point with remarks, and for a point whose new verdict differs
-    from the stored one. In both cases, the point may differ from the certified point.
+    from the stored verdict. In both cases, the point may differ from the certified
+    point.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""

@@ -57,7 +57,7 @@ MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 GROWTH = 4.0
 #: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: number of meshes, the smallest from which a rate can be determined
+MAX_LEVELS = 3  #: number of meshes, the smallest number that determines a rate
 #: smallest q for extrapolation; for a smaller q, 1/(1 − 2^−q) exceeds 3.4
 MIN_RATE = 0.5
 #: Smallest assumed relative error of u_h, even if its certificate proves a smaller
@@ -74,7 +74,7 @@ class Level:
     unknowns: int  #: number of unknowns on the mesh
     energy: float  #: potential energy J_h, J/m in 2D, J in 3D
     norm: float  #: energy norm of u_h, in the square root of the unit of energy
-    #: certified relative error of the reference solve on this mesh
+    #: certified bound on the relative error of the reference solve on this mesh
     bound: float
     #: energy norm of the difference from the previous level; None on the first level
     distance: float | None = None

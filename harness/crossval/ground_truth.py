@@ -45,7 +45,7 @@ class StoredAnswer:
     """A stored answer, with the case that was rebuilt for it."""
 
     record: Record
-    label: str  #: label of the solver; for a sequence, it contains the mode
+    label: str  #: label of the solver; for a sequence, the label contains the mode
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
@@ -55,7 +55,7 @@ class StoredAnswer:
 
 
 class GroundTruth(NamedTuple):
-    """A reference point, and the norm in which distances to it are measured."""
+    """A reference point, and the norm in which distances to this point are measured."""
 
     #: origin of the point: "reference", or the solver and form of an answer
     name: str

@@ -188,7 +188,7 @@ def _headline(
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
         parts.append(
-            f"{_many(counts['unresolved'], 'pair')} too far apart, neither refuted"
+            f"{_many(counts['unresolved'], 'pair')} with too large a distance, neither refuted"
         )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")

@@ -40,7 +40,7 @@ from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
-_CHANGED = "the stored point is not the one that was measured: its file was changed"
+_CHANGED = "the file of the stored point was changed after the measurement"
 #: Largest relative difference (Euclidean norm) of contact forces that count as equal.
 MAX_FORCE_DIFFERENCE = 1e-3
 #: Largest error bound of a reference point that refutes a claim of infeasibility.

@@ -80,7 +80,7 @@ class Touched:
         return s**2 <= MAX_FILL * (s + float(inner[0]))
 
     def additive(self, t: Dense) -> DistributedVector:
-        """Convert a consistent vector (k,) to an additive one."""
+        """Convert a consistent vector (k,) to an additive vector."""
         return distributed(t / self.touching, self.ranks)
 
 

@@ -1,9 +1,9 @@
 """Reading of text files from untrusted sources, within limits.
 
-A file must be regular, since a device or a pipe may never end. It must also declare its
-size, which files in /proc do not. Its content must be UTF-8, must not exceed a limit
-that users can raise, and must not be nested too deeply. All functions raise an
-`InputError` that states where the error is and what was expected.
+A file must be regular, since a device or a pipe may never end. The file must also
+declare its size, which files in /proc do not. The content must be UTF-8, must not
+exceed a limit that users can raise, and must not be nested too deeply. All functions
+raise an `InputError` that states where the error is and what was expected.
 """
 
 from __future__ import annotations

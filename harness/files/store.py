@@ -98,7 +98,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 
 def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Yield the contact sides of a deformed state; old files contain none."""
+    """Yield the contact sides of a deformed state; old files contain no sides."""
     for i in range(len(arrays)):
         side = _with_prefix(_SIDE.format(i), arrays)
         if not set(side) >= {"name", *_ALONG}:

@@ -78,8 +78,8 @@ class CaseWorker:
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
-    _build_seconds: float = 0.0  # duration of the last build
-    _build_peak_mib: float | None = None  # peak memory during that build
+    _build_seconds: float = 0.0  # duration of the last build, s
+    _build_peak_mib: float | None = None  # peak memory during the last build, MiB
     _warm: bool = False  # True once a dual case has been built
     #: error bounds and note (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(

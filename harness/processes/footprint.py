@@ -32,8 +32,9 @@ class Footprint:
 
         Resident sizes are cheap to read, but their sum counts a shared page once per
         process. If this sum exceeds `limit`, in MiB, the proportional set sizes are
-        read instead. They divide the size of a shared page among the processes that map
-        it, but the kernel has to walk all page tables to compute them.
+        read instead. Proportional sizes divide the size of a shared page among the
+        processes that map it, but the kernel has to walk all page tables to compute
+        them.
         """
         tree = list(tree)
         self.notice(tree)

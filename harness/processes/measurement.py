@@ -49,13 +49,14 @@ HARNESS_SECONDS = 0.005
 #: Largest further CPU time of the harness per repeat of the solve. On a busy machine,
 #: 0.12 ms were measured; the margin prevents false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
-#: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor. The difference of the times must also exceed `MIN_GAIN_SECONDS` or
-#: `MIN_GAIN_BETWEEN_SECONDS`, because ratios of tiny times are unreliable.
+#: A repeat is suspected of reusing results if the first solve takes at least this
+#: factor times longer. The difference of the times must also exceed `MIN_GAIN_SECONDS`
+#: or `MIN_GAIN_BETWEEN_SECONDS`, because ratios of tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
-#: smallest suspicious difference between the times of solves in one measurement
+#: smallest suspicious difference between the times of solves in one measurement, s
 MIN_GAIN_SECONDS = 1e-3
-#: smallest suspicious difference between the first solves of two measurements
+#: smallest suspicious difference between the times of the first solves of two
+#: measurements, s
 MIN_GAIN_BETWEEN_SECONDS = 5e-3
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
@@ -66,7 +67,8 @@ class JudgedMeasurement(NamedTuple):
     """A measurement with its verdict."""
 
     record: Record
-    solution: Solution | None  #: None if the worker ended without an answer
+    #: answer of the solver; None if the worker ended without an answer
+    solution: Solution | None
     #: True if there is a point but its quantities or error bounds are missing. False if
     #: the ranks that solved the QP have evaluated their answer completely.
     needs_evaluation: bool = True
@@ -282,7 +284,7 @@ def _caching_notes(
 def _check_memory(limit: float, record: Record) -> Record:
     """Set the verdict MEMORY_LIMIT if the solver exceeded the limit or lacked memory.
 
-    limit : MiB
+    limit : memory limit, in MiB
     """
     if record.verdict is Verdict.DECLINED:
         return record

@@ -157,7 +157,7 @@ class _RankExits:
                     os.close(fd)
                 else:
                     self._take_records()
-                if fd == mpi:  # the end of mpiexec causes all later ends of ranks
+                if fd == mpi:  # ranks that end after mpiexec are ended by mpiexec
                     self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
@@ -189,7 +189,8 @@ class _RankExits:
             for number in (line["process"], line["above"]):
                 try:
                     process = os.pidfd_open(number)
-                except ProcessLookupError:  # ended before its record was read
+                # the process of the rank ended before its record was read
+                except ProcessLookupError:
                     self._record_first(line["rank"])
                 else:
                     self._rank_of[process] = line["rank"]
@@ -231,7 +232,7 @@ def follow(
     """Execute the orders of rank 0 on this rank, until rank 0 sends None.
 
     emit : assembles this rank's share of a case
-    limit : sets the memory limit of this process, in MiB, or lifts it if None
+    limit : sets the memory limit of this process, in MiB; None removes the limit
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None

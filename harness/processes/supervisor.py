@@ -70,7 +70,7 @@ LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log in which its last line is sought
-_MIN_FD = 3  #: smallest descriptor of a pipe; smaller ones are standard streams
+_MIN_FD = 3  #: smallest descriptor of a pipe; smaller numbers are standard streams
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
@@ -109,11 +109,13 @@ class Reply:
     """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None if there is an answer or `fault` is True
+    #: verdict on the end of the worker; None if there is an answer or a fault
+    verdict: Verdict | None = None
     fault: bool = False  #: True if the harness or the machine failed, not the solver
     message: str = ""  #: description of the failure, and notes
     peak_mib: float | None = None  #: largest memory that the parent observed
-    clock: Clock | None = None  #: None unless the request was a measurement
+    #: the parent's times of a measurement; None for other requests
+    clock: Clock | None = None
     threads: int | None = None  #: number of threads that the worker reported
     cpu: int | None = None  #: number of the CPU to which the worker is bound
     #: sizes, digest and build time of the QP that ranks emitted; None if they emitted
@@ -155,7 +157,8 @@ class WorkerProcess:
         self._is_stopped = self._was_busy = False
         # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
-        self._facts: dict[str, Any] = {}  # number of threads, CPU; see `_facts`
+        # number of threads and CPU of the worker; see `_facts`
+        self._facts: dict[str, Any] = {}
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
@@ -196,7 +199,8 @@ class WorkerProcess:
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
-        # Stop other workers before this one resumes: two must never run on one CPU.
+        # Stop other workers before this worker resumes, since two workers must never
+        # run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
@@ -253,7 +257,7 @@ class WorkerProcess:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Disown all workers; called in a fork, since workers belong to its parent."""
+        """Disown all workers; called in a fork, since workers belong to the parent."""
         for worker in tuple(cls._all):
             worker._disown()
         cls._all.clear()
@@ -422,8 +426,8 @@ class WorkerProcess:
     ) -> dict[str, Any]:
         """Wait for an event, and return its entries.
 
-        limit : s
-        memory_limit : MiB
+        limit : time limit, in s
+        memory_limit : memory limit, in MiB
         stage : stage of the measurement, as a prefix of the error message
 
         Raises

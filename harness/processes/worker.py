@@ -64,7 +64,7 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
 #: Largest number of doubles (2 MiB) in the array that shifts addresses between
-#: measurements. Its pages are never touched and take no memory.
+#: measurements. The pages of the array are never touched and take no memory.
 _MAX_BALLAST = 2**18
 
 
@@ -113,7 +113,7 @@ class _SolverHost:
         # content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        #: replaces the solver in measurements, on several ranks
+        #: on several ranks, replaces the solver in measurements
         self.parallel: ParallelSolver | None = None
 
     def warm_up(self) -> dict[str, Any]:

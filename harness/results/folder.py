@@ -259,7 +259,7 @@ def _open_lock(folder: Path) -> int:
     """
     # O_NOFOLLOW: if the lock were a link, another file would be overwritten
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:  # until the file at the path is the locked file
+    while True:  # repeat until the file at the path is the locked file
         fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

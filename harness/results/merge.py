@@ -138,7 +138,7 @@ def _journal(folder: Path) -> Path:
 
 
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
-    """Read the records of a folder, and add a session to old records without one.
+    """Read the records of a folder, and add a session to old records without a session.
 
     The session is a digest of the environment and of the earliest start of a record
     without a session in this environment.
@@ -163,7 +163,7 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
 
 
 def _refuse_nested(source: Path, out: Path) -> None:
-    """Raise `InputError` if `out` equals `source`, lies in it or contains it."""
+    """Raise `InputError` if `out` equals, contains or lies in `source`."""
     target, origin = out.resolve(), source.resolve()
     if target == origin:
         raise InputError(

@@ -60,11 +60,12 @@ class WorkUnit:
 class Result:
     """Outcome of a measurement that was completed."""
 
-    record: Record  #: complete except for the digests of `point` and `fields`
+    record: Record  #: record, complete except for the digests of `point` and `fields`
     #: number of the part of the block; a block has several parts if its measurements
     #: were interrupted, and only measurements in the same part ran consecutively
     part: int = 0
-    point: Arrays | None = None  #: None if the solver returned no point
+    #: arrays of the point; None if the solver returned no point
+    point: Arrays | None = None
     fields: Arrays | None = None  #: deformed state; None if it is not to be stored
 
 

@@ -350,14 +350,16 @@ def _connect(address: str, stack: ExitStack) -> Any:
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
                 memory_limit=0,  # the supervisor limits memory
-                dashboard_address="127.0.0.1:0",  # any free port; clusters may coexist
+                # use any free port, so that several clusters can coexist
+                dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
             return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except Exception as e:  # each address scheme has its own library and errors
+    # the library of each address scheme raises its own exceptions
+    except Exception as e:
         if isinstance(e, TypeError) and address.startswith("tls:"):
             raise InputError(
                 f"--dask {address}: Dask's configuration has no certificate for it; "

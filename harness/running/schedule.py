@@ -40,7 +40,8 @@ class Schedule:
     environment: str  #: digest of the environment
     session: str = ""  #: session of the run, see `harness.record.Record`
     progress: Progress
-    unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
+    #: names of the cases that could not be built
+    unbuilt: list[str] = field(default_factory=list)
     #: records by cell; empty unless the suite sets a precision
     _records: dict[Cell, list[Record]] = field(default_factory=dict)
     _declined: set[tuple[str, Cell]] = field(

@@ -88,7 +88,8 @@ class _Block:
     cases: list[CaseId]
     given: list[dict[str, object]]  #: keys that the suite sets, for each case
     kind: str  #: "sequence", "growing" or, for single cases, ""
-    along: tuple[str, ...]  #: keys that vary in the sequence or series, else ()
+    #: keys that vary in the sequence or series; () for single cases
+    along: tuple[str, ...]
 
 
 def _blocks(

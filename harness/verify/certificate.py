@@ -138,7 +138,7 @@ class Certificate:
 
     @property
     def equilibrium(self) -> Extended:
-        """u_λ (n,) of undivided bodies."""
+        """Displacement u_λ (n,); defined only for undivided bodies."""
         return np.asarray(self.u - self.off)
 
     @property

@@ -181,9 +181,8 @@ def _corrected(
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
         if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
-            order = np.lexsort(
-                [-np.abs(w), rows >= qp.b.size]
-            )  # the pivots: equations, then large multipliers
+            # order of the pivots: equations, then inequalities, each by decreasing |w|
+            order = np.lexsort([-np.abs(w), rows >= qp.b.size])
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
