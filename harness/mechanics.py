@@ -313,7 +313,7 @@ class AdmissibleForces:
 
         The norm of a projected multiplier equals g only up to rounding in extended
         precision, about 1e-19. If this error counted as work, it would dominate
-        certificates, which contain its square root.
+        certificates, which contain the square root of the work.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -402,7 +402,8 @@ class RigidMotions(NamedTuple):
     """
 
     constrained: Any  #: (n, p) sparse matrix of the motions that change gaps or slip
-    free: Any  #: (n, q) sparse; motions that change gaps and slip only by rounding
+    #: (n, q) sparse matrix of the motions that change gaps and slip only by rounding
+    free: Any
     G: Extended  #: (m, p) product B·constrained
     #: (n, p) `constrained` with each nonzero replaced by the largest absolute value of
     #: its column

@@ -207,8 +207,8 @@ def unbuilt(name: object, e: BaseException) -> str:
 def is_shared(name: CaseId) -> bool:
     """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
 
-    The result is False if the family raises an exception. `build` raises the same
-    exception, which is reported there.
+    The result is False if the family raises an exception. A later call of `build`
+    raises the same exception, which is then reported.
     """
     try:
         return name.family.emission(name.form, name.params) is not None

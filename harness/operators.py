@@ -160,7 +160,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
 
 def preconditioned(P: Any) -> Preconditioned | None:
-    """Return P or its map x ↦ Px if that object is `Preconditioned`, else None."""
+    """Return P or its map x ↦ Px if one is `Preconditioned`, else None."""
     product: Any = P.build() if isinstance(P, SerialisableOperator) else P
     return product if hasattr(product, "preconditioner") else None
 

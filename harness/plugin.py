@@ -30,13 +30,13 @@ class ReferenceOverRanks(Protocol):
     def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
         """Solve a QP to high accuracy.
 
-        start : a solution of a QP that differs from `qp` only in its bounds, from which
-            the iteration may start
+        start : initial guess, a solution of a QP that differs from `qp` only in the
+            bounds
         """
 
 
 class Solver(Protocol):
-    """A QP solver; in practice a frozen dataclass whose fields are its options.
+    """A QP solver, usually a frozen dataclass whose fields are the options.
 
     The class attribute ``accepts``, a tuple of classes of `harness.sets`, declares the
     convex sets that the solver supports. A solver without this attribute accepts only
@@ -163,7 +163,7 @@ class ContactSide:
     gap: Vector
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    #: (s,) tangential traction on the side, Pa; in 3D its magnitude
+    #: (s,) tangential traction on the side, Pa; in 3D the magnitude of the traction
     shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; "" at nodes without a contact row. Old
     #: files contain "open" in place of both `SLIDING` and ""
@@ -263,12 +263,13 @@ class SourceFile:
 
     path: str  #: path as given in the name of the case
     sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
-    #: suffix for the name of a copy; it depends on the file format, not on `path`
+    #: suffix for the name of a copy; the suffix depends on the file format, not on
+    #: `path`
     suffix: str
 
 
 class Family(ABC):
-    """A parametrised family of problems; in practice a frozen dataclass.
+    """A parametrised family of problems, usually a frozen dataclass.
 
     Methods raise `InputError` if the value of a key is not supported.
 

@@ -252,7 +252,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return the values of a solver's options by name; {} if it is not a dataclass."""
+    """Return the values of a solver's options by name; {} without a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
@@ -340,8 +340,8 @@ def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
     The function reads the folders of `sys.path`, which is faster than importing
-    importlib.metadata. It does not open archives; if an archive is on the path, the
-    result is True.
+    importlib.metadata. The function does not open archives; if an archive is on the
+    path, the result is True.
     """
     for place in sys.path:
         if os.path.isfile(place):
@@ -494,7 +494,7 @@ def _forget(package: str) -> None:
 
 
 class _PluginLoader(SourceFileLoader):
-    """Loader of the modules of a plug-in; redirects their imports to neighbours."""
+    """Loader of the modules of a plug-in, which redirects imports to neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
         # bypass __pycache__, since the rewritten imports depend on the files in the
@@ -580,7 +580,7 @@ def stand_for_harness() -> None:
     Only worker processes call this function directly. In the process of a user, a
     module of this name may belong to the user; see `_standing_for_harness`.
     """
-    exports = ModuleType("harness")  # without a path: it has no submodules
+    exports = ModuleType("harness")  # a module without a path has no submodules
     exports.__dict__["__getattr__"] = partial(getattr, import_module(__package__))
     exports.__dict__["__all__"] = import_module(__package__).__all__
     sys.modules["harness"] = exports

@@ -46,6 +46,7 @@ class Status(StrEnum):
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     #: the solver claims that the feasible set is empty or the objective is unbounded
+    #: below
     INFEASIBLE = "infeasible"
     FAILED = "failed"  #: the solver stopped without a solution, or raised an exception
     DECLINED = "declined"  #: the solver was not started; `message` states the reason
@@ -81,7 +82,8 @@ class Solution:
     z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
     #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
     z_box: Vector
-    iterations: int | None = None  #: None if the solver does not report the number
+    #: number of iterations; None if the solver does not report it
+    iterations: int | None = None
     counts: Mapping[str, int] = field(
         default_factory=dict
     )  #: numbers of operations by name, e.g. {"P_products": 61}

@@ -232,7 +232,7 @@ FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 
 
 def strings(form: str) -> QP:
-    """Return a small frictionless contact problem: a loaded string above a softer one.
+    """Return the QP of a loaded string in frictionless contact with a softer string.
 
     The upper string has 24 cells, and the lower string has 16 cells. The unknown is the
     deflection u at the 25 + 17 nodes; K is the stiffness and f the load. The primal

@@ -21,7 +21,7 @@ SCHEMA = 1  #: version of the format of the summary
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Summary of one solver at one tolerance; None for values that no answer has."""
+    """Summary of one solver at one tolerance; missing values are None."""
 
     solver: str
     tol: float
@@ -188,7 +188,8 @@ def _headline(
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
         parts.append(
-            f"{_many(counts['unresolved'], 'pair')} with too large a distance, neither refuted"
+            f"{_many(counts['unresolved'], 'pair')} too far apart, with neither answer "
+            "refuted"
         )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")

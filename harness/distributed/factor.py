@@ -48,8 +48,8 @@ PIVOT_SHIFT = 1e-15
 #: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
 #: Largest number of rows of a matrix that compiled code factorises as a dense array.
-#: For 500 rows, this already takes longer than the overhead of calling a sparse
-#: library.
+#: For 500 rows, the dense factorisation already takes longer than the overhead of
+#: calling a sparse library.
 MAX_ARRAY_ROWS = 256
 
 

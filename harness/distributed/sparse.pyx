@@ -431,7 +431,7 @@ cdef double *resized(double *held, Py_ssize_t size) except NULL:
 
 
 # Largest relative amount by which a squared pivot may be below its lower bound, since
-# both are rounded.
+# both values are rounded.
 cdef double PIVOT_TOLERANCE = 1e-3
 
 

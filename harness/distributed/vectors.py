@@ -362,7 +362,9 @@ class _DistributedRows:
 class Share(NamedTuple):
     """Part of a distributed QP that is stored on one rank."""
 
-    qp: QP  #: vectors and the columns of A are distributed; b is equal on all ranks
+    #: local part of the QP; vectors and the columns of A are distributed, and b is
+    #: equal on all ranks
+    qp: QP
     #: gathers a solution on rank 0; returns None on other ranks
     whole: Callable[[Solution], Solution | None]
 
@@ -393,7 +395,7 @@ class DistributedQP(NamedTuple):
     bounds: int  #: number of finite bounds on all ranks
     #: assembles the part of this rank; each call builds a new operator
     share: Callable[[], Share]
-    #: returns a digest of the coefficients. It differs from
+    #: returns a digest of the coefficients. The digest differs from
     #: `harness.files.qpfile.qp_digest`, which needs the whole QP, and therefore has the
     #: prefix `DISTRIBUTED_DIGEST`
     digest: Callable[[], str]

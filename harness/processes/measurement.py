@@ -49,9 +49,10 @@ HARNESS_SECONDS = 0.005
 #: Largest further CPU time of the harness per repeat of the solve. On a busy machine,
 #: 0.12 ms were measured; the margin prevents false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
-#: A repeat is suspected of reusing results if the first solve takes at least this
-#: factor times longer. The difference of the times must also exceed `MIN_GAIN_SECONDS`
-#: or `MIN_GAIN_BETWEEN_SECONDS`, because ratios of tiny times are unreliable.
+#: A repeat is suspected of reusing results if the time of the repeat, multiplied by
+#: this factor, is less than the time of the first solve. The difference of the times
+#: must also exceed `MIN_GAIN_SECONDS` or `MIN_GAIN_BETWEEN_SECONDS`, because ratios of
+#: tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
 #: smallest suspicious difference between the times of solves in one measurement, s
 MIN_GAIN_SECONDS = 1e-3

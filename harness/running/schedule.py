@@ -110,7 +110,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Mark the cases of a block as unbuilt; return False if none is new."""
+        """Mark the cases of a block as unbuilt; return False if all already were."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)

@@ -55,7 +55,7 @@ class ActiveSet(NamedTuple):
         return np.asarray(self.states == CLOSED)
 
     def at_bounds(self, multipliers: Extended) -> Extended:
-        """Replace the multipliers (m,) of rows that are not closed by their limits."""
+        """For rows that are not closed, replace the multipliers (m,) by the limits."""
         return np.where(self.closed, multipliers, self.limits)
 
 

@@ -40,8 +40,8 @@ MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
 #: Largest number of rows for which F_VV is assembled. Systems with more rows are solved
 #: by CG.
 MAX_DENSE_ROWS = 2000
-#: A combination of rigid motions counts as floating if its singular value in √W G is
-#: at most this fraction of the largest one (`supported_and_floating`).
+#: A combination of rigid motions counts as floating if its singular value in √W G is at
+#: most this fraction of the largest singular value (`supported_and_floating`).
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of the absolute terms of the load.
@@ -379,7 +379,7 @@ class Balance(NamedTuple):
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of the absolute terms of `load`
     bent: Extended  #: (p,) (KR)ᵀu, nonzero only because of rounding
-    forces: AdmissibleForces  #: Λ, set of admissible multipliers
+    forces: AdmissibleForces  #: set Λ of admissible multipliers
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.

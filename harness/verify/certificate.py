@@ -97,9 +97,9 @@ __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 #: Largest residual with which a combination of contact rows counts as equal to a rigid
 #: motion.
 COMBINATION_RESIDUAL = 1e-9
-#: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: its error grows like the
-#: logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002, Theorem
-#: 24.2, with errors of the weights of 2⁻⁵³).
+#: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: the error of the FFT grows
+#: like the logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002,
+#: Theorem 24.2, with errors of the weights of 2⁻⁵³).
 PRODUCT_ROUNDING = 2.0**-46
 #: Safety factor, since power iteration underestimates ‖P‖.
 POWER_ITERATION_FACTOR = 2.0
@@ -188,7 +188,7 @@ class EigenvalueCertificate(NamedTuple):
     """Bound (5) on the error of an answer, in the norm ‖·‖_P."""
 
     x: Vector  #: x̂ (n,), in the sets
-    z: Vector  #: (n,) normal to the sets at x̂
+    z: Vector  #: (n,) vector that is normal to the sets at x̂
     distance: float  #: ‖r‖/√μ, bound on ‖x̂ − x*‖_P, including the rounding of r
     moved: float  #: ‖x − x̂‖_P, distance of the answer from x̂
     norm: float  #: lower bound on ‖x̂‖_P, reduced by rounding errors

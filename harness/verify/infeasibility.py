@@ -45,9 +45,9 @@ from mortarbench.harness.verify.rational import (
 #: contradict one another by a smaller margin if their right-hand sides are rounded sums
 #: of thousands of terms.
 MIN_MARGIN = 1e-12
-#: Fractions of the largest multiplier of the scaled rows, tried in turn: smaller
-#: multipliers are set to zero. Iterative solvers return small multipliers for rows that
-#: do not contribute to the proof.
+#: Fractions of the largest multiplier of the scaled rows, which are tried in turn.
+#: Smaller multipliers are set to zero. Iterative solvers return small multipliers for
+#: rows that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 #: Largest |cⱼ| that counts as an approximation of 0, relative to the sum of its
 #: absolute terms.

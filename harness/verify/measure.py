@@ -33,7 +33,7 @@ SAMPLE_SECONDS = 0.005  #: approximate total time of all repetitions (s); see `m
 MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
-#: programs that store numbers as doubles do not represent all larger integers
+#: largest count that is stored, since doubles do not represent all larger integers
 MAX_COUNT = 2**53
 MAX_MESSAGE = 1900  #: largest length of a message of a solver, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters

@@ -274,8 +274,8 @@ def _least_squares(
             zeta, _ = nnls(stacked, rhs, maxiter=100 * slack.size + 100)
         except RuntimeError:
             raise InputError(
-                "multipliers: the least-squares iteration did not converge; expected y, z "
-                "and z_box in addition to x"
+                "multipliers: the least-squares iteration did not converge; expected "
+                "y, z and z_box in addition to x"
             ) from None
     y = np.zeros(free.shape[1])
     y[pivots[:rank]] = solve_triangular(R, Q.T @ (target - C @ zeta))

@@ -252,7 +252,7 @@ class ExactOptimum(NamedTuple):
     """Optimum computed in rational arithmetic."""
 
     value: Fraction  #: f*
-    solution: Solution  #: rounded to double precision
+    solution: Solution  #: solution, rounded to double precision
 
 
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:

@@ -179,7 +179,7 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of components `at` (w,), and a mask of local `at`."""
+        """Return local positions of `at` (w,), and a mask of the local components."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at

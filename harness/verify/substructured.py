@@ -58,10 +58,10 @@ from mortarbench.harness.verify.products import times_columns
 #: estimated at û. The relative difference is largest for displacements of low energy,
 #: such as û.
 SAFETY = 16
-#: Amplitude of the rounding errors of random sign that `sample` simulates in Ku, per
-#: row in units of eps times the root of the sum of its squared terms. The measured
-#: standard deviation is 0.4 to 0.5 for sums in extended precision, and 0.2 to 3.6 for
-#: the difference between the stored Ku and TᵀK_T Tu.
+#: Amplitude of the rounding errors of random sign that `sample` simulates in Ku, in
+#: each row, in units of eps times the root of the sum of the squared terms of the row.
+#: The measured standard deviation is 0.4 to 0.5 for sums in extended precision, and 0.2
+#: to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
 #: Amplitude of the simulated errors with the sign of u, in the same units. Random signs
 #: alone may fail to excite the few soft modes of a slender body. With 0.25, the error
