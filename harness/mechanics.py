@@ -667,7 +667,7 @@ class Mechanics:
         """Return the energy norm ‖v‖_K, which is a seminorm if bodies can move rigidly.
 
         The rigid part of v is subtracted first. KR = 0 holds only up to rounding
-        errors, which would dominate if the rigid part is much larger than the
+        errors, which would dominate if the rigid part were much larger than the
         deformation.
         """
         v = self.without_rigid_motion(v)

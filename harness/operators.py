@@ -142,7 +142,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return getattr(self.build(), "least_eigenvalue", None)
 
     def forget(self) -> None:
-        """Discard the product, so that the next solver has to build it while timed."""
+        """Discard the product; the next solver then builds it while the clock runs."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:

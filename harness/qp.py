@@ -247,7 +247,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return the diagonal of P (n,), or None if P is an operator without one."""
+        """Return the diagonal of P (n,); None if the operator P has no `diagonal`."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -281,8 +281,8 @@ class QP:
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
         """Return a copy of the QP with sparse matrices in another storage format.
 
-        convert : maps a sparse matrix to an equal one in that format; it is not applied
-            to dense matrices and operators
+        convert : maps a sparse matrix to an equal matrix in that format; not applied to
+            dense matrices and operators
         """
         matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
         sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
 _SIDE = 120  #: number of nodes per side of a square grid, whose matrix has 14 400 rows
-_PRODUCTS = 10  #: number of matrix-vector products in a timed call, about 1 ms
+#: number of matrix-vector products in a timed call, which takes about 1 ms
+_PRODUCTS = 10
 _BLOCKS = 20  #: number of blocks of consecutive pairs in the bootstrap
 _DRAWS = 1000  #: number of bootstrap samples
 

@@ -23,7 +23,7 @@ _UNFINISHED = ".mortarbench-*.tmp"
 #: patterns of the names of incomplete files of older versions, and of incomplete files
 #: in case folders
 _OTHERS = ("*.tmp", "*.new", ".*.new")
-#: incomplete files in result folders of older versions
+#: names of incomplete files in result folders of older versions
 _OLD = ("suite.tmp", "environment.tmp")
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit

@@ -126,7 +126,8 @@ class Lines:
         self._fd = os.open(self._path, flags, 0o666)
         self._end = _end_of_lines(self._fd)
         os.ftruncate(self._fd, self._end)
-        # before the content is read, to detect edits while the digest is computed
+        # Read the time stamps before the content, to detect edits while the digest is
+        # computed.
         self._times = _times(os.fstat(self._fd))
         self._digest: Digest = running_digest(self._chunks())
         sync_folder(self._path.parent)

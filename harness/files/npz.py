@@ -27,7 +27,8 @@ from mortarbench.harness.files.durable import replacing
 EXPECTED = "an npz file"
 #: size of a cache line in bytes; misaligned arrays would affect measured times
 ALIGNMENT = 64
-_LOCAL_HEADER = 30  #: bytes before the name and the extra field of a zip member
+#: number of bytes before the name and the extra field of a zip member
+_LOCAL_HEADER = 30
 _PADDING = b"\xfe\xca"  #: ID of an extra field, which readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)

@@ -34,7 +34,8 @@ import pyarrow.parquet as pq
 CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
 #: elapsed time after which the kernel kills this process, since reading may block
 SECONDS = 600
-ROOM = 2**29  #: bytes of address space in addition to four times the declared size
+#: number of bytes of address space in addition to four times the declared size
+ROOM = 2**29
 
 
 def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:

@@ -130,7 +130,7 @@ class Certificate:
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: second term of `work`, which is due to friction
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
-    stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
+    stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the energy norm in K_T
     claimed: float  #: bound (3) on the error of the answer
     least: float  #: lower bound on ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û

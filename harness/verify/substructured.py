@@ -151,7 +151,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm in K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
@@ -298,7 +298,7 @@ class Undivided(_Stored):
     """Undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ."""
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f; θ = 0, since K_T has the norm of K."""
+        """Return Ku − f; θ = 0, since K_T and K define the same norm."""
         Ku, _, deformed = self.stored(u)
         rho = self.free(Ku + self.mechanics.primal.q)
         return Residual(rho, deformed, self.product(deformed), 0.0)

@@ -261,7 +261,8 @@ def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | 
     return {"objective": float(objective), **residuals._asdict()}
 
 
-LATE_IMPORT = "scipy.optimize"  #: slow import, needed by `certify` for some bodies
+#: module that loads slowly, needed by `certify` for some bodies
+LATE_IMPORT = "scipy.optimize"
 
 
 def _certified(
