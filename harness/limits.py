@@ -14,7 +14,8 @@ ONE_THREAD = {
 }
 #: Environment variable with the memory limit for building a case, in MiB.
 CASE_VARIABLE = "MORTARBENCH_CASE_MIB"
-#: Environment variable with the memory limit of a suite, in MiB, set for its workers.
+#: Environment variable with the memory limit of a suite, in MiB, which is set for the
+#: workers of the suite.
 VARIABLE = "MORTARBENCH_MEMORY_MIB"
 
 

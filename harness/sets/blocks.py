@@ -51,7 +51,8 @@ class Blocks(ABC):
                 f"{kind}: {size} has shape {sizes.shape}; expected {index.shape[:1]}, "
                 "one number per row of index"
             )
-        with np.errstate(invalid="ignore"):  # NaN, or out of the range of int64
+        # a cast of NaN, or of numbers beyond the range of int64, is invalid
+        with np.errstate(invalid="ignore"):
             whole = index.astype(np.int64)
         if not np.array_equal(whole, index):
             raise InputError(f"{kind}: index contains a number that is not an integer")
