@@ -155,8 +155,8 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
         raise
     except MemoryError:
         raise InputError(
-            f"{path}: would take more than {room // MIB} MiB of memory, although its size "
-            "and its header declare less; expected an undamaged file"
+            f"{path}: would take more than {room // MIB} MiB of memory, although its "
+            "size and its header declare less; expected an undamaged file"
         ) from None
     except Exception:  # damaged files cause many types of exceptions
         raise InputError(f"{path}: {wrong}") from None
