@@ -15,7 +15,7 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown, unknown
 
-MAX_COUNT = 1_000_000  #: default upper limit of an integer
+MAX_COUNT = 1_000_000  #: default upper limit in `at_least_one`
 
 
 @contextmanager
@@ -113,7 +113,7 @@ def path(where: str, value: object) -> Path:
         os.stat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
-    # a ValueError is caused by NUL or lone surrogates
+    # NUL characters and lone surrogates cause a ValueError
     except (OSError, ValueError) as e:
         why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None

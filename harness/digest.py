@@ -9,9 +9,9 @@ from typing import IO, TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from hashlib import _Hash
 
-Digest: TypeAlias = "_Hash"  #: an unfinished SHA-256; ``update`` appends bytes
+Digest: TypeAlias = "_Hash"  #: SHA-256 hash object, to which ``update`` appends bytes
 
-_PIECE_BYTES = 2**20  #: number of bytes that are read at a time
+_PIECE_BYTES = 2**20  #: number of bytes that are read in one call
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
@@ -27,7 +27,7 @@ def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
 
 
 def running_digest(parts: Iterable[bytes]) -> Digest:
-    """Return the unfinished SHA-256 of the concatenated `parts`."""
+    """Return a SHA-256 hash object that already contains the concatenated `parts`."""
     content = sha256()
     for part in parts:
         content.update(part)

@@ -9,7 +9,9 @@ from collections.abc import Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 
-MAX_SHOWN = 200  #: number of characters of the user's input that a message repeats
+MAX_SHOWN = (
+    200  #: largest number of characters of the user's input that a message repeats
+)
 _MAX_MESSAGE = 600  #: largest number of characters of a message, excluding paths
 #: A quotation or a word. Possessive quantifiers avoid backtracking, whose time could
 #: grow without bound for malicious input.
@@ -50,7 +52,7 @@ def shown(value: object) -> str:
     except (
         RecursionError,
         ValueError,
-    ):  # nested too deeply, or an integer with too many digits
+    ):  # the value is nested too deeply, or is an integer with too many digits
         return f"a {type(value).__name__} too long to show"
 
 
@@ -129,5 +131,5 @@ def some(names: Iterable[str], most: int = 3) -> str:
 
 def say(text: str) -> None:
     """Print a remark on stderr, since stdout is reserved for results."""
-    with suppress(BrokenPipeError):  # a closed stderr must not end the program
+    with suppress(BrokenPipeError):  # a closed stderr must not stop the program
         print(f"mortarbench: {text}", file=sys.stderr)

@@ -14,7 +14,8 @@ ONE_THREAD = {
 }
 #: Environment variable with the memory limit for building a case, in MiB.
 CASE_VARIABLE = "MORTARBENCH_CASE_MIB"
-#: Environment variable with the memory limit of a suite, in MiB, set for its workers.
+#: Environment variable with the memory limit of a suite, in MiB, which is set for the
+#: workers of the suite.
 VARIABLE = "MORTARBENCH_MEMORY_MIB"
 
 
@@ -55,7 +56,7 @@ def too_large(n: int, copies: float = 1.0) -> str | None:
     """Return the reason to decline if dense matrices exceed the memory limit, or None.
 
     n : number of rows and columns of each matrix
-    copies : number of such matrices that the solver stores at the same time
+    copies : number of these matrices that the solver stores at the same time
     """
     needed, limit = copies * 8 * n**2 / 2**20, memory_limit_mib()
     if needed <= limit:

@@ -107,15 +107,15 @@ class Friction:
     T u is the tangential displacement of the slave side relative to the master side.
     The slip is measured from s. For a single static load, s = 0; for slip increments, s
     is T u of the previous load step. A contact row i with friction has d consecutive
-    rows Tᵢ of equal bound, one for each tangential direction, where d = 1 in the plane
-    and d = 2 in space. A problem without friction has zero rows.
+    rows Tᵢ of equal bound, one for each tangential direction, where d = 1 in 2D
+    and d = 2 in 3D. A problem without friction has zero rows.
 
     The law of friction requires g = cohesion + mu·λ_n, where λ_n is the multiplier of
     the contact row. Tresca's law has mu = 0, and Coulomb's law has cohesion = 0.
     """
 
     T: csr_array  #: (k, n) tangential rows, d consecutive rows per contact row
-    bound: Vector  #: (k,) g ≥ 0, a force
+    bound: Vector  #: (k,) bound g ≥ 0 on the tangential force
     start: Vector  #: (k,) s, the value of T u from which slip is measured, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
@@ -208,7 +208,7 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 def with_friction(primal: QP, friction: Friction) -> QP:
     """Return the problem with friction as a QP with auxiliary variables.
 
-    Friction rows with g = 0 are omitted. In the plane, a variable t ≥ |Tu − s| is added
+    Friction rows with g = 0 are omitted. In 2D, a variable t ≥ |Tu − s| is added
     for each row:
 
     ::
@@ -216,7 +216,7 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    In space, the two components of the slip w = Tu − s and a variable t ≥ ‖w‖ are added
+    In 3D, the two components of the slip w = Tu − s and a variable t ≥ ‖w‖ are added
     for each tangential vector, where (t, w) lies in a second-order cone:
 
     ::
@@ -224,7 +224,7 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
 
-    The unknown is (u, t) in the plane and (u, t, w) in space. If no row has g > 0,
+    The unknown is (u, t) in 2D and (u, t, w) in 3D. If no row has g > 0,
     `primal` is returned unchanged. `friction_multipliers` returns the multipliers of
     the friction rows.
     """
@@ -271,9 +271,9 @@ def friction_multipliers(
 
     s : solution of the QP returned by `with_friction`
 
-    The multipliers λ_t (k,) of friction rows are zero where g = 0. In the plane, the
+    The multipliers λ_t (k,) of friction rows are zero where g = 0. In 2D, the
     nonzero entries are differences of the multipliers of Tu − t ≤ s and −Tu − t ≤ −s.
-    In space, they are the multipliers of Tu − w = s.
+    In 3D, they are the multipliers of Tu − w = s.
     """
     e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
     tangential = np.zeros(acts.size)
@@ -313,7 +313,7 @@ class AdmissibleForces:
 
         The norm of a projected multiplier equals g only up to rounding in extended
         precision, about 1e-19. If this error counted as work, it would dominate
-        certificates, which contain its square root.
+        certificates, which contain the square root of the work.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -330,7 +330,7 @@ class AdmissibleForces:
         return distance
 
     def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
-        """Return lower and upper bounds (m,) of each λᵢ for fixed other multipliers."""
+        """Return lower and upper bounds (m,) on each λᵢ, with all others fixed."""
         lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
         squares = multipliers[self.discs.index] ** 2
         others = squares.sum(axis=1, keepdims=True) - squares
@@ -349,7 +349,7 @@ class Exact(NamedTuple):
     over friction vectors; otherwise, σ(v) is infinite.
     """
 
-    f: Extended  #: (n,) load
+    f: Extended  #: (n,) load vector
     B: Any  #: (m, n) sparse rows of contact and friction
     c: Extended  #: (m,) right-hand side: initial gaps, then the `start` of friction
     forces: AdmissibleForces  #: set Λ of admissible multipliers
@@ -401,13 +401,14 @@ class RigidMotions(NamedTuple):
     which are relevant if bodies move far; see `harness.verify.certificate`.
     """
 
-    constrained: Any  #: (n, p) sparse; motions that change gaps or slip
-    free: Any  #: (n, q) sparse; motions that change gaps and slip only by rounding
-    G: Extended  #: (m, p)  B·constrained
+    constrained: Any  #: (n, p) sparse matrix of the motions that change gaps or slip
+    #: (n, q) sparse matrix of the motions that change gaps and slip only by rounding
+    free: Any
+    G: Extended  #: (m, p) product B·constrained
     #: (n, p) `constrained` with each nonzero replaced by the largest absolute value of
     #: its column
     largest: Any
-    KR: Extended  #: (n, p)  K·constrained, zero on prescribed components
+    KR: Extended  #: (n, p) product K·constrained, zero on prescribed components
 
 
 #: Names of first-order cells in meshio, by dimension and number of corners.
@@ -422,8 +423,8 @@ KINDS = {
 }
 
 
-#: Corners of each facet, for each type of cell. In the plane, the cell is on the left
-#: of the edge. In space, the corners are in anticlockwise order when seen from outside,
+#: Corners of each facet, for each type of cell. In 2D, the cell is on the left
+#: of the edge. In 3D, the corners are in anticlockwise order when seen from outside,
 #: and a triangle repeats its last corner.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
@@ -478,7 +479,7 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
     """Return the node numbers (k, m) of the facets that belong to a single cell.
 
-    Facets are oriented as in `FACETS`. In the plane, facets are edges, which are sorted
+    Facets are oriented as in `FACETS`. In 2D, facets are edges, which are sorted
     by the lower, then by the higher node number.
     """
     facets, names, _ = cell_facets(cells, dim)
@@ -494,7 +495,7 @@ def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], 
 
     The key of a facet consists of its `dim` lowest node numbers, so that two adjacent
     cells have the same key for their common facet. Degenerate facets between repeated
-    corners are omitted. In space, a triangle repeats its last corner.
+    corners are omitted. In 3D, a triangle repeats its last corner.
     """
     facet = np.array(FACETS[KINDS[dim, cells.shape[1]]])
     facets = cells[:, facet].reshape(-1, facet.shape[1])
@@ -541,7 +542,9 @@ class Mechanics:
     #: maps a solution of the emitted QP to x = u, the multipliers y of the supports,
     #: and the multipliers z of the contact and friction rows
     to_primal: Callable[[Solution], Solution]
-    factorise: Callable[[], Inverse]  #: factorises K, returns K⁺; called at most once
+    factorise: Callable[
+        [], Inverse
+    ]  #: factorises K and returns K⁺; called at most once
     #: cell size of the contact side, in the unit of length of `primal`
     mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
@@ -664,7 +667,7 @@ class Mechanics:
         """Return the energy norm ‖v‖_K, which is a seminorm if bodies can move rigidly.
 
         The rigid part of v is subtracted first. KR = 0 holds only up to rounding
-        errors, which would dominate if the rigid part is much larger than the
+        errors, which would dominate if the rigid part were much larger than the
         deformation.
         """
         v = self.without_rigid_motion(v)

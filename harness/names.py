@@ -6,7 +6,7 @@ cells.
 
 A family that reads problems from files has the key ``path``, and its attribute
 ``path_suffix`` is the suffix of these files. The name of such a case is
-``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes; it ends at the first
+``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes, and ends at the first
 component with the suffix. If ``path_suffix`` is empty, PATH is the rest of the name,
 ``FAMILY:PATH``, and the family has a single form.
 """
@@ -28,7 +28,9 @@ from mortarbench.harness.plugin import Case, Family, Reference, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_FILE = re.compile(r"[^=:]*\.[A-Za-z]\w*(/|$)")  #: a path that ends in a suffix
+_FILE = re.compile(
+    r"[^=:]*\.[A-Za-z]\w*(/|$)"
+)  #: pattern of a path that ends in a suffix
 _INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bits
 _TYPE_NAMES = {
     int: "an integer, such as 4",
@@ -117,7 +119,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
         key, equals, value = part.partition("=")
         if not equals:
             raise InputError(
-                f"{head}: malformed part {shown(part)}; expected key=value"
+                f"{head}: malformed component {shown(part)}; expected key=value"
             )
         if key in given:
             raise InputError(f"{head}: key {shown(key)} is set twice; set it once")
@@ -205,8 +207,8 @@ def unbuilt(name: object, e: BaseException) -> str:
 def is_shared(name: CaseId) -> bool:
     """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
 
-    The result is False if the family raises an exception. `build` raises the same
-    exception, which is reported there.
+    The result is False if the family raises an exception. A later call of `build`
+    raises the same exception, which is then reported.
     """
     try:
         return name.family.emission(name.form, name.params) is not None
@@ -231,7 +233,7 @@ def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _path_key(family: Family) -> str:
-    """Return "path", a key of families that read files, or "" for other families."""
+    """Return "path" for a family that reads files, or "" for other families."""
     return "" if family.path_suffix is None else "path"
 
 
@@ -243,14 +245,17 @@ def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]
     head = family.name
     path = text[len(head) + 1 :]
     if text[len(head) : len(head) + 1] != ":" or not path:
-        raise InputError(f"{shortened(text)}: no file; expected {head}:PATH{suffix}")
+        raise InputError(
+            f"{shortened(text)}: the path is missing; expected {head}:PATH{suffix}"
+        )
     if not suffix:
         return path, []
     parts = path.split("/")
     ends = [i for i, part in enumerate(parts, 1) if part.endswith(suffix)]
     if not ends:
         raise InputError(
-            f"{shortened(text)}: no file; expected {head}:PATH{suffix}/…/FORM"
+            f"{shortened(text)}: the path is missing; expected "
+            f"{head}:PATH{suffix}/…/FORM"
         )
     path, parts = "/".join(parts[: ends[0]]), parts[ends[0] :]
     if len(family.forms) == 1 and (not parts or "=" in parts[-1]):

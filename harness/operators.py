@@ -1,9 +1,9 @@
 """Serialisable operators: plain arrays and the name of a function that builds P.
 
 P is the matrix of a QP. A matrix-free P cannot be written to a file, but the arrays
-from which it is built can. Workers receive these arrays and build the operator while
-the clock runs. Work before the first product, such as a factorisation, therefore counts
-as preparation of the solver.
+from which P is built can be written. Workers receive these arrays and build the
+operator while the clock runs. Work before the first product, such as a factorisation,
+therefore counts as preparation of the solver.
 
 The function that builds P, called its *maker*, is looked up by name in a table, the
 ``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
@@ -122,13 +122,13 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         self._product: Product | None = None
 
     def build(self) -> Product:
-        """Return the product x ↦ Px; the first call builds it."""
+        """Return the product x ↦ Px, which the first call builds."""
         if self._product is None:
             self._product = self._make(self.arrays)
         return self._product
 
     def diagonal(self) -> NDArray[np.float64] | None:
-        """Return the diagonal of P (n,), or None if x ↦ Px does not provide it."""
+        """Return the diagonal of P (n,), or None if x ↦ Px has no method `diagonal`."""
         product = self.build()
         return product.diagonal() if hasattr(product, "diagonal") else None
 
@@ -142,7 +142,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return getattr(self.build(), "least_eigenvalue", None)
 
     def forget(self) -> None:
-        """Discard the product: the next solver builds it while the clock runs."""
+        """Discard the product; the next solver then builds it while the clock runs."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -160,7 +160,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
 
 def preconditioned(P: Any) -> Preconditioned | None:
-    """Return P or its map x ↦ Px if that object is `Preconditioned`, else None."""
+    """Return P or its map x ↦ Px if one is `Preconditioned`, else None."""
     product: Any = P.build() if isinstance(P, SerialisableOperator) else P
     return product if hasattr(product, "preconditioner") else None
 

@@ -30,13 +30,13 @@ class ReferenceOverRanks(Protocol):
     def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
         """Solve a QP to high accuracy.
 
-        start : a solution of a QP that differs from `qp` only in its bounds, from which
-            the iteration may start
+        start : initial guess, a solution of a QP that differs from `qp` only in the
+            bounds
         """
 
 
 class Solver(Protocol):
-    """A QP solver; in practice a frozen dataclass whose fields are its options.
+    """A QP solver, usually a frozen dataclass whose fields are the options.
 
     The class attribute ``accepts``, a tuple of classes of `harness.sets`, declares the
     convex sets that the solver supports. A solver without this attribute accepts only
@@ -125,13 +125,14 @@ class About:
     title: str
     method: str  #: class of methods, e.g. "interior point"
     licence: str
-    linear_solver: str  #: solver used for its linear systems
+    linear_solver: str  #: solver used for the linear systems of the method
     #: work that is timed as preparation, and work that is timed as solution
     phases: str
     #: package to install; its module has the same name unless `module` is set
     package: str = ""
-    module: str = ""  #: name of the module, if it differs from that of the package
-    sequence: str = ""  #: work reused from one QP to the next; empty if none is reused
+    module: str = ""  #: name of the module, if it differs from the name of the package
+    #: work that is reused from one QP to the next, or "" if no work is reused
+    sequence: str = ""
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
     @property
@@ -155,13 +156,14 @@ class ContactSide:
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
     length: Vector  #: (s,) length of the undeformed side attributed to each node, m
-    #: (s, dim) force of this contact on each slave node: N/m in the plane, N in space
+    #: (s, dim) force of this contact on each slave node: N/m in 2D, N in 3D
     force: NDArray[Any]
-    pressure: Vector  #: (s,) contact pressure, Pa, positive in compression
-    gap: Vector  #: (s,) m, positive if open; NaN at nodes without an opposite side
+    pressure: Vector  #: (s,) contact pressure in Pa, positive in compression
+    #: (s,) gap in m, positive if open; NaN at nodes without an opposite side
+    gap: Vector
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    #: (s,) tangential traction on the side, Pa; in space its magnitude
+    #: (s,) tangential traction on the side, Pa; in 3D the magnitude of the traction
     shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; "" at nodes without a contact row. Old
     #: files contain "open" in place of both `SLIDING` and ""
@@ -174,12 +176,12 @@ class ContactSide:
     def pressed(self, least: float) -> NDArray[Any]:
         """Return the mask (s,) of the nodes in contact.
 
-        With friction, a node is in contact if it sticks or slips. A force is not a
-        sufficient criterion, since under Tresca's law forces also act without contact.
-        Without friction, a node is in contact if its `push`, or the norm of its force
-        if `push` is None, exceeds `least` (N/m). The norm of the force is a less
-        accurate criterion, because on a curved side a mortar row also causes tangential
-        forces at adjacent nodes.
+        With friction, a node is in contact if the node sticks or slips. A force is not
+        a sufficient criterion, since under Tresca's law forces also act without
+        contact. Without friction, a node is in contact if its `push`, or the norm of
+        its force if `push` is None, exceeds `least` (N/m). The norm of the force is a
+        less accurate criterion, because on a curved side a mortar row also causes
+        tangential forces at adjacent nodes.
         """
         mask: NDArray[Any]
         if self.friction is not None:
@@ -195,14 +197,16 @@ class ContactSide:
 class Fields:
     """A deformed state of all bodies, for plots and VTK files, in SI units."""
 
-    points: NDArray[Any]  #: (N, dim) reference positions, m
+    points: NDArray[Any]  #: (N, dim) reference positions of the nodes, m
     #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, dim) displacement of each node, m
-    nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
+    nodal: Mapping[str, Vector] = field(
+        default_factory=dict
+    )  #: nodal results by name, e.g. von_mises (N,), Pa
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
-    #: (c, dim) force on each slave node: N/m in the plane, N in space
+    #: (c, dim) force on each slave node: N/m in 2D, N in 3D
     contact_forces: NDArray[Any] | None = None
     #: contact sides, one for each pair of bodies
     contacts: tuple[ContactSide, ...] = ()
@@ -217,7 +221,8 @@ class Fields:
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
         """Cells grouped by type, with the type names of meshio."""
-        from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
+        # imported here, since this import loads NumPy
+        from mortarbench.harness.mechanics import cell_blocks
 
         return cell_blocks(self.cells, self.dim)
 
@@ -239,11 +244,13 @@ class Case:
     fields: Callable[[Solution], Fields] | None = None
     scale: float = 1.0
     constant: float = 0.0
-    matrices: Mapping[str, Any] = field(default_factory=dict)  #: exported with the QP
+    matrices: Mapping[str, Any] = field(
+        default_factory=dict
+    )  #: matrices by name that are exported with the QP
     #: time to form the dual, including the factorisation; None for other forms
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: elastic problem, needed to certify errors
-    remarks: tuple[str, ...] = ()  #: warnings about the input, one line each
+    remarks: tuple[str, ...] = ()  #: warnings about the input; each is a single line
     #: relative residual of the fixed-point iteration to which the QP belongs, such as
     #: the iteration for Coulomb's law. An accurate solution of this QP does not reduce
     #: the residual. 0 if there is no iteration
@@ -256,14 +263,15 @@ class SourceFile:
 
     path: str  #: path as given in the name of the case
     sha256: str  #: first 12 hexadecimal digits of the SHA-256 of the content
-    #: suffix for the name of a copy; it depends on the file format, not on `path`
+    #: suffix for the name of a copy; the suffix depends on the file format, not on
+    #: `path`
     suffix: str
 
 
 class Family(ABC):
-    """A parametrised family of problems; in practice a frozen dataclass.
+    """A parametrised family of problems, usually a frozen dataclass.
 
-    A method raises `InputError` if a value is outside the range of the family.
+    Methods raise `InputError` if the value of a key is not supported.
 
     Examples
     --------
@@ -285,13 +293,12 @@ class Family(ABC):
     ...         )
     >>> Spring().complete({})
     {'k': 2.0}
-
     """
 
-    name: str  #: first component of the names of its cases
+    name: str  #: name of the family, the first component of the names of its cases
     #: default values of all keys, in the order of keys in canonical names
     defaults: Mapping[str, Value]
-    forms: tuple[str, ...]  #: forms of the QPs
+    forms: tuple[str, ...]  #: names of the forms of the QP, such as "primal" and "dual"
     path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
     #: reason why the energy diverges under refinement; empty if it converges
     singular: str = ""
@@ -313,7 +320,7 @@ class Family(ABC):
         """Raise `InputError` if a value in `params` is invalid; called before a run."""
 
     def instead_of(self, key: str) -> str:
-        """Return the key to use instead of a key of other families, "" if unknown.
+        """Return the key to use instead of a key of other families, or "" if unknown.
 
         The text is the end of the message about an unknown key.
         """
@@ -328,7 +335,7 @@ class Family(ABC):
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the geometry that `refined` does not refine; "" if all is refined.
+        """Describe the geometry that `refined` does not refine; "" if there is none.
 
         The text is appended to an estimate of the discretisation error, for instance
         "of the bodies as they are meshed".

@@ -32,7 +32,8 @@ _MIN_CURVATURE = -1e-6
 #: Smallest diagonal entry used for scaling, relative to the largest entry of P. Smaller
 #: entries may consist mostly of rounding errors.
 _MIN_DIAGONAL = 1e-4
-_STRIP_ROWS = 256  #: rows of P that are compared with Pᵀ at a time, to save memory
+#: number of rows of P that are compared with Pᵀ at a time, to save memory
+_STRIP_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,12 +93,12 @@ class QP:
 
     """
 
-    P: Matrix  #: (n, n) symmetric positive semidefinite
-    q: Vector  #: (n,)
-    A: Matrix  #: (m, n)
-    b: Vector  #: (m,)
-    G: Matrix  #: (p, n)
-    h: Vector  #: (p,)
+    P: Matrix  #: (n, n) matrix of the quadratic term, symmetric positive semidefinite
+    q: Vector  #: (n,) coefficients of the linear term
+    A: Matrix  #: (m, n) matrix of the equality constraints
+    b: Vector  #: (m,) right-hand sides of the equality constraints
+    G: Matrix  #: (p, n) matrix of the inequality constraints
+    h: Vector  #: (p,) right-hand sides of the inequality constraints
     sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, followed by the other sets
     #: data that a solver may use but must not require
     structure: Structure | None = None
@@ -175,8 +176,8 @@ class QP:
 
         Matrices may be dense or sparse; sparse matrices are stored by columns. A vector
         may also be a matrix with one row or column. A single row of G or A may be a
-        vector, with a scalar right-hand side. Equal bounds may be a scalar. Absent
-        constraints and bounds are None.
+        vector, with a scalar right-hand side. If all lower or all upper bounds are
+        equal, a scalar suffices. Absent constraints and bounds are None.
 
         Parameters
         ----------
@@ -246,7 +247,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return the diagonal of P (n,), or None if P is an operator without it."""
+        """Return the diagonal of P (n,); None if the operator P has no `diagonal`."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -274,14 +275,14 @@ class QP:
         return sizes
 
     def with_bounds(self, lb: Vector, ub: Vector) -> QP:
-        """Return the same QP with other bounds (n,)."""
+        """Return a copy of the QP with the given bounds (n,)."""
         return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
 
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
-        """Return the same QP with its sparse matrices in another storage format.
+        """Return a copy of the QP with sparse matrices in another storage format.
 
-        convert : maps a sparse matrix to an equal one in that format; it is not applied
-            to dense matrices and operators
+        convert : maps a sparse matrix to an equal matrix in that format; not applied to
+            dense matrices and operators
         """
         matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
         sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}
@@ -562,7 +563,7 @@ def _rows(
 
 
 def _freeze(M: Matrix) -> None:
-    """Set the buffers of a dense or sparse matrix read-only."""
+    """Mark the buffers of a dense or sparse matrix as read-only."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]
     for buffer in buffers:
         if isinstance(buffer, np.ndarray):

@@ -26,7 +26,8 @@ VERIFIED_FACTOR = 10.0
 READABLE = (1, 2)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
-SECONDS = (1e-12, 1e10)  #: smallest and largest valid measured time in s, except 0
+#: smallest and largest valid measured time in s; 0 is also valid
+SECONDS = (1e-12, 1e10)
 MAX_LEVELS = 20  #: largest depth of nested lists and tables in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
@@ -41,15 +42,18 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Verdict on a measurement: the claim of the solver, and whether it is true."""
+    """Verdict on a measurement: states whether the claim of the solver is true."""
 
     VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
-    #: claimed infeasible, and proven infeasible; see `harness.verify.infeasibility`
+    #: the solver claimed infeasibility, which is proven; see
+    #: `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    #: claimed solved; not verified, but with at least half of the requested digits
+    #: the solver claimed a solution, which is not verified but has at least half of the
+    #: requested digits
     INACCURATE = "inaccurate"
-    WRONG = "wrong"  #: claimed solved, but refuted
-    INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, but not proven
+    WRONG = "wrong"  #: the solver claimed a solution, but the claim is refuted
+    #: the solver claimed infeasibility, but no proof was found
+    INFEASIBLE_CLAIM = "infeasible_claim"
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     MEMORY_LIMIT = "memory_limit"
@@ -177,7 +181,8 @@ class Record(Measurement):
     energy_bound: float | None = None
     #: relative components of `energy_bound`; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
-    objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
+    #: objective ½xᵀPx + qᵀx of the emitted QP at the answer
+    objective: float | None = None
     #: physical results by name, in SI units
     quantities: Mapping[str, Any] = field(default_factory=dict)
     qp: str | None = None  #: digest of the emitted QP; None in old journals
@@ -260,14 +265,15 @@ class Record(Measurement):
             if a field has a wrong type or an invalid value.
 
         """
-        import msgspec  # measuring processes do not need it
+        import msgspec  # imported here, since measuring processes do not need msgspec
 
         try:
             try:
                 parsed = _decoder().decode(line)
             except msgspec.ValidationError as e:
                 raise ValueError(_explained(e, _parsed(line))) from None
-            except msgspec.DecodeError:  # malformed, or a lone surrogate
+            # the line is malformed or contains a lone surrogate
+            except msgspec.DecodeError:
                 row = _escaped(_parsed(line))
                 try:
                     parsed = msgspec.convert(row, _line())
@@ -287,7 +293,7 @@ _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 def in_space(quantities: Mapping[str, Any]) -> bool:
     """Return True if the quantities belong to three-dimensional bodies.
 
-    Forces are then in N and energies in J, instead of N/m and J/m in the plane.
+    Forces are then in N and energies in J, instead of N/m and J/m in 2D.
     """
     nodes, dofs = quantities.get("nodes"), quantities.get("dofs")
     return isinstance(nodes, int) and nodes > 0 and dofs == 3 * nodes

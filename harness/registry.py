@@ -3,8 +3,8 @@
 A registry maps names to solvers or families. In a registry of solvers, the entry
 ``"PREFIX:*"`` represents all backends of a generic adapter. In the name
 ``PREFIX:BACKEND``, the text after the last colon is the value of the adapter's field
-``backend``. A method ``backends()`` of the adapter, if it exists, returns the installed
-backends.
+``backend``. If the adapter has a method ``backends()``, the method returns the
+installed backends.
 
 A plug-in file is loaded as a separate Python package, whose path is the folder of the
 file. The plug-in can import the modules and packages in this folder, which are called
@@ -63,7 +63,8 @@ COPIES = "copies"  #: role of a spec that `SolverSpec.copies` returns
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
-#: Modules that a plug-in does not import from its folder, even if they exist there.
+#: Names of modules that a plug-in does not import from its folder, even if they exist
+#: there.
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
 #: Subpackages that old plug-ins import without the prefix ``mortarbench.``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
@@ -162,7 +163,7 @@ class Plugin:
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    #: functions that build operators, see `harness.operators`
+    #: functions that build operators, by name; see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=dict)
     origin: str = ""  #: path of the plug-in file, or "entry points"
 
@@ -198,7 +199,7 @@ class Registry(Mapping[str, T]):
     """Mapping of names to objects, each imported at its first access."""
 
     def __init__(self, entries: Mapping[str, Entry | T]) -> None:
-        self.entries = dict(entries)  #: objects, or references to them
+        self.entries = dict(entries)  #: objects, or references to objects, by name
         self._loaded: dict[str, T] = {}
 
     def __getitem__(self, name: str) -> T:
@@ -251,7 +252,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return the values of a solver's options by name; {} if it is not a dataclass."""
+    """Return the values of a solver's options by name; {} without a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
@@ -322,7 +323,8 @@ def entry_point_plugins() -> Plugin:
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
     if not _some_package_offers():
         return Plugin(origin="entry points")
-    from importlib.metadata import entry_points  # loads slowly and is seldom needed
+    # imported here, since this module loads slowly and is seldom needed
+    from importlib.metadata import entry_points
 
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
@@ -338,8 +340,8 @@ def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
     The function reads the folders of `sys.path`, which is faster than importing
-    importlib.metadata. It does not open archives; if an archive is on the path, the
-    result is True.
+    importlib.metadata. The function does not open archives; if an archive is on the
+    path, the result is True.
     """
     for place in sys.path:
         if os.path.isfile(place):
@@ -370,7 +372,7 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
             if what == "solver"
             else "rename the new one, or load one of the two"
         )
-        raise InputError(f"{what} {both[0]!r} of the plug-in exists; {remedy}")
+        raise InputError(f"{what} {both[0]!r} of the plug-in already exists; {remedy}")
     if isinstance(known, Registry):
         return Registry({**known.entries, **new}) if new else known
     return {**known, **new}
@@ -474,7 +476,7 @@ def _imported(path: Path) -> ModuleType:
         raise InputError(f"{path}: not a Python file; its name must end in .py")
     _forget(name)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look up their module there
+    sys.modules[name] = module  # dataclasses look up their module in sys.modules
     try:
         with redirect_stdout(sys.stderr):
             spec.loader.exec_module(module)
@@ -492,7 +494,7 @@ def _forget(package: str) -> None:
 
 
 class _PluginLoader(SourceFileLoader):
-    """Loader of the modules of a plug-in; redirects their imports to neighbours."""
+    """Loader of the modules of a plug-in, which redirects imports to neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
         # bypass __pycache__, since the rewritten imports depend on the files in the
@@ -506,7 +508,7 @@ class _PluginLoader(SourceFileLoader):
 
 
 class _Imports(ast.NodeTransformer):
-    """Replacement of module names in import statements of a plug-in by full names."""
+    """Transformer that replaces module names in imports of a plug-in by full names."""
 
     def __init__(self, package: str, folder: str) -> None:
         self._package = package
@@ -525,7 +527,9 @@ class _Imports(ast.NodeTransformer):
             if full != alias.name:
                 first = alias.name.partition(".")[0]
                 names = [ast.alias(full, bound or first)]
-                if bound is None and first != alias.name:  # `import a.b` binds a
+                if (
+                    bound is None and first != alias.name
+                ):  # `import a.b` binds the name a
                     names += [ast.alias(self._full(first), first)]
             statements += [ast.Import([name]) for name in names]
         return [
@@ -576,7 +580,7 @@ def stand_for_harness() -> None:
     Only worker processes call this function directly. In the process of a user, a
     module of this name may belong to the user; see `_standing_for_harness`.
     """
-    exports = ModuleType("harness")  # without a path: it has no submodules
+    exports = ModuleType("harness")  # a module without a path has no submodules
     exports.__dict__["__getattr__"] = partial(getattr, import_module(__package__))
     exports.__dict__["__all__"] = import_module(__package__).__all__
     sys.modules["harness"] = exports
@@ -666,14 +670,14 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
                 raise InputError(f"{at} is a class; expected an instance")
             if not isinstance(key, str) or not _has(parts, thing):
                 raise InputError(
-                    f"{at} is of type {_type(thing)}; "
-                    f"expected a {kind}, under a name, with {', '.join(parts)}"
+                    f"{at} is of type {_type(thing)}; expected a {kind} with "
+                    f"{', '.join(parts)}, keyed by a string"
                 )
     for key, family in problems.items():
         if family.name != key:
             raise InputError(
-                f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; "
-                "expected the same name twice"
+                f"{where}: PROBLEMS[{key!r}] is named {family.name!r}; expected equal "
+                "names"
             )
         _check_names(f"{where}: PROBLEMS[{key!r}]", family)
     families = {name: as_family(offered) for name, offered in problems.items()}

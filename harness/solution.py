@@ -42,10 +42,11 @@ _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 class Status(StrEnum):
     """Outcome of a solve as claimed by the solver."""
 
-    SOLVED = "solved"  #: the solver claims that the point meets its tolerance
+    SOLVED = "solved"  #: the solver claims that its point satisfies the tolerance
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     #: the solver claims that the feasible set is empty or the objective is unbounded
+    #: below
     INFEASIBLE = "infeasible"
     FAILED = "failed"  #: the solver stopped without a solution, or raised an exception
     DECLINED = "declined"  #: the solver was not started; `message` states the reason
@@ -76,15 +77,19 @@ class Solution:
     """
 
     status: Status
-    x: Vector  #: (n,)
+    x: Vector  #: (n,) primal variables
     y: Vector  #: (m,) multipliers of A x = b
     z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
     #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
     z_box: Vector
-    iterations: int | None = None  #: None if the solver does not report the number
-    counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
+    #: number of iterations; None if the solver does not report it
+    iterations: int | None = None
+    counts: Mapping[str, int] = field(
+        default_factory=dict
+    )  #: numbers of operations by name, e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record
-    #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
+    #: other data from the solver by name, e.g. {"linear_solver": "qdldl",
+    #: "setup_seconds": 0.01}
     reported: Mapping[str, float | str] = field(default_factory=dict)
     #: columns of equal length, a row per iteration; see `harness.solution`
     history: History = field(default_factory=dict)
@@ -142,7 +147,7 @@ def usable_history(history: object) -> tuple[History, str]:
     """
     try:
         return checked_history(history), ""
-    except Exception as e:  # reading an object of a solver may raise any exception
+    except Exception as e:  # raised while an object of the solver is read
         return {}, f"history dropped: {e}"
 
 

@@ -68,8 +68,8 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-#: Largest gradient that counts as rounding, relative to its largest term. Dual
-#: residuals use the same value.
+#: Largest gradient that counts as rounding, relative to the largest term of the
+#: gradient. The dual residual uses the same value.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
@@ -86,7 +86,7 @@ class Grade(StrEnum):
 
 
 class Result(NamedTuple):
-    """Result of a check: its grade, and the reason for it or a remark."""
+    """Result of a check: the grade, and a reason or a remark."""
 
     grade: Grade
     message: str = ""
@@ -382,16 +382,19 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
         yield f"{SETS_PREFIX} {shape}", partial(_solves_over_sets, shape)
     yield DEGENERATE, _solves_the_degenerate_cone
     yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
-    yield "gives multipliers our signs", _multipliers_have_our_signs
-    yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
-    yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike
+    yield "returns multipliers in the convention of QP", _multipliers_have_our_signs
+    yield (
+        "returns zero multipliers for absent bounds",
+        _absent_bounds_have_no_multipliers,
+    )
+    yield "starts every repeat cold and repeats its answer", _repeats_are_cold_and_alike
     for dense in (False, True):
-        name = f"leaves the problem alone: {'dense' if dense else 'sparse'}"
+        name = f"does not modify the QP: {'dense' if dense else 'sparse'}"
         yield name, partial(_the_problem_is_left_alone, dense)
     yield "refuses a misspelt option", _a_misspelt_option_is_refused
     yield "claims no success: infeasible", partial(_claims_no_success, infeasible)
     yield "claims no success: unbounded", partial(_claims_no_success, unbounded)
-    yield "takes or declines an operator", _an_operator_is_taken_or_declined
+    yield "accepts or declines an operator", _an_operator_is_taken_or_declined
     yield "computes in one thread", _runs_in_one_thread
     yield "solves a sequence", _a_sequence_is_solved
     for form in FORMS:

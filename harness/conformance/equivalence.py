@@ -64,7 +64,7 @@ def same_answer(
     """Solve the unchanged and the changed string problem, and compare the answers.
 
     change : a key of `CHANGES`
-    old : the answer to the unchanged QP; None to solve it
+    old : the answer to the unchanged QP; None to compute this answer
 
     Returns
     -------
@@ -132,7 +132,8 @@ def _compare(quantity: str, change: float) -> None:
 
 def _units(name: str, qp: QP, form: str) -> Equivalent:
     force, length = UNITS[name]
-    unit = length if form == "primal" else force  # x is a displacement or a force
+    # x is a displacement in the primal form and a force in dual forms
+    unit = length if form == "primal" else force
     return change_units(qp, unknown=1 / unit, objective=force * length)
 
 

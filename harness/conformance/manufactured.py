@@ -39,7 +39,7 @@ def manufactured(
 
     The point, its multipliers and the active set are drawn at random, and q follows
     from stationarity. The entries of the matrices are of order one. Some constraints of
-    every kind in the shape are active. The minimiser is unique except for the shape
+    every type in the shape are active. The minimiser is unique except for the shape
     "singular".
 
     shape : a key of `SHAPES`
@@ -47,7 +47,6 @@ def manufactured(
     >>> qp, point = manufactured("equalities")
     >>> bool(np.allclose(qp.P @ point.x + qp.q + qp.A.T @ point.y, 0))
     True
-
     """
     store: Callable[[Matrix], Matrix] = np.asarray if dense else csr_array
     return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])
@@ -68,9 +67,9 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
-    # multipliers of active rows are at least 0.5: complementarity is strict
+    # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of each four variables, one is at its lower bound, one is at its upper bound, and
+    # of every four variables, one is at its lower bound, one is at its upper bound, and
     # two are between their bounds
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
@@ -233,14 +232,14 @@ FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 
 
 def strings(form: str) -> QP:
-    """Return a small frictionless contact problem: a loaded string above a softer one.
+    """Return the QP of a loaded string in frictionless contact with a softer string.
 
-    The upper string has 24 cells, the lower one 16. The unknown is the deflection u at
-    their 25 + 17 nodes; K is the stiffness and f the load. The primal problem is
-    min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends. Each row of
-    G u ≤ h keeps an inner node of the upper string above the lower string. The entries
-    of the row are −1 at this node and interpolation weights at two nodes of the lower
-    string.
+    The upper string has 24 cells, and the lower string has 16 cells. The unknown is the
+    deflection u at the 25 + 17 nodes; K is the stiffness and f the load. The primal
+    problem is min ½uᵀKu − fᵀu  subject to  A u = 0,  G u ≤ h.  A u = 0 fixes the ends.
+    Each row of G u ≤ h keeps an inner node of the upper string above the lower string.
+    The entries of the row are −1 at this node and interpolation weights at two nodes of
+    the lower string.
 
     form : "primal" is the primal problem. "dual", with B = [A; G], c = [0; h] and an
         orthonormal basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  subject to RᵀBᵀλ

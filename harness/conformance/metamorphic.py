@@ -35,7 +35,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector
 from mortarbench.harness.solution import Solution
 
-Order = NDArray[Any]  #: array of indices, or a mask
+Order = NDArray[Any]  #: array of indices or mask that selects unknowns or rows
 
 
 class Equivalent(NamedTuple):
@@ -44,7 +44,8 @@ class Equivalent(NamedTuple):
     qp: QP
     #: maps a point of the transformed QP to a point of the original QP
     recover: Callable[[Solution], Solution]
-    scale: float = 1.0  #: original objective = scale·transformed objective + constant
+    #: factor s in: original objective = s·(transformed objective) + constant
+    scale: float = 1.0
     constant: float = 0.0
 
     def followed_by(self, change: Callable[[QP], Equivalent]) -> Equivalent:

@@ -46,8 +46,8 @@ class Assessment:
     without mechanics, fields that require the mechanics are None.
     """
 
-    error: float  #: ‖u − u*‖
-    equilibrium_error: float | None  #: ‖u_λ − u*‖
+    error: float  #: ‖u − u*‖, error of the displacement
+    equilibrium_error: float | None  #: ‖u_λ − u*‖, error of the contact forces
     energy: float  #: J(u) − J(u*), where J is the potential energy
     #: max (Bu − c)₊ of all contact rows, divided by the mesh size
     penetration: float | None
@@ -65,7 +65,8 @@ class Deviation(NamedTuple):
     """Difference of an answer from the reference, divided by ‖u*‖; see `distances`."""
 
     u: Vector  #: (n,) difference of u, or of x for a QP without mechanics
-    equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
+    #: (n,) difference of the displacements u_λ; None without mechanics
+    equilibrium: Vector | None
 
 
 def energy_allowed(tol: float) -> float:
@@ -164,7 +165,7 @@ def distances(
     V = np.stack(points, axis=1)
     V = V - kernel @ (kernel.T @ V)
     gram = V.T @ np.asarray(P @ V)
-    norms = np.diag(gram)  # squares of the norms
+    norms = np.diag(gram)  # squared norms of the points
     squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
     lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
     np.fill_diagonal(lengths, 0)  # inf − inf would be NaN
@@ -187,9 +188,9 @@ def _balance(mechanics: Mechanics, s: Solution) -> float | None:
     """Return the largest relative resultant force or moment on a body, or None.
 
     Resultants are Rᵀ(f − B_Eᵀy − Bᵀλ), where R contains the rigid motions of the
-    bodies, B_E the rows of the supports, and B the rows of contact and friction. They
-    are relative to the sum of the absolute forces on the body. The value is None if
-    there are no rigid motions.
+    bodies, B_E the rows of the supports, and B the rows of contact and friction.
+    Resultants are divided by the sum of the absolute forces on the body. The value is
+    None if there are no rigid motions.
     """
     R, primal = mechanics.rigid, mechanics.primal
     if not R.shape[1]:

@@ -59,7 +59,8 @@ class Answer:
     claimed: str
     stored: Verdict  #: verdict that the run stored
     verdict: Verdict  #: verdict on the stored point, evaluated again
-    residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
+    #: the four residuals of `harness.verify.kkt` by name
+    residuals: Mapping[str, float]
     #: error relative to a proven optimum, which decides instead of the residuals
     optimum_error: float | None
     allowed: float  #: largest residual of a verified answer
@@ -87,7 +88,7 @@ class Pair(NamedTuple):
 
     a: int  #: index of the first answer
     b: int  #: index of the second answer
-    distance: float  #: ‖u − u'‖ in the energy norm
+    distance: float  #: distance ‖u − u'‖ of the displacements in the energy norm
     #: ‖Bᵀ(λ − λ')‖, distance of the contact forces in the dual norm; None without
     #: mechanics
     equilibrium: float | None
@@ -103,7 +104,8 @@ class Problem:
     #: origin of the reference point: "reference", or the solver and form of the best
     #: answer; empty if there is no reference point
     truth: str
-    doubt: float | None  #: bound on the relative error of the reference, energy norm
+    #: bound on the relative error of the reference in the energy norm
+    doubt: float | None
     closed: int | None  #: number of closed rows at the reference point
     answers: tuple[Answer, ...]
     pairs: tuple[Pair, ...]  #: pairs of answers at equal tolerances
@@ -210,7 +212,8 @@ def _contradiction(a: Answer) -> str:
     """Describe an error that exceeds the bound certified in the run, or return "".
 
     The result is "" for a point with remarks, and for a point whose new verdict differs
-    from the stored one. In both cases, the point may differ from the certified point.
+    from the stored verdict. In both cases, the point may differ from the certified
+    point.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
@@ -228,7 +231,7 @@ def _refutations(a: Answer) -> Iterable[str]:
         return
     if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
         most = brief(a.allowed)
-        yield f"off the proven optimum by {brief(a.optimum_error)} > {most}"
+        yield f"error relative to the proven optimum {brief(a.optimum_error)} > {most}"
     elif a.verdict is not Verdict.VERIFIED:
         name = max(a.residuals, key=lambda n: nan_last(a.residuals[n]))
         yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
@@ -236,7 +239,7 @@ def _refutations(a: Answer) -> Iterable[str]:
         return
     plain = a.assessment.equilibrium_error is None  # a QP without mechanics
     off = [
-        f"{what} off by {brief(error)}"
+        f"error of {what} {brief(error)}"
         for what, error in (
             ("x" if plain else "displacement", a.assessment.error),
             ("contact forces", a.assessment.equilibrium_error),

@@ -48,7 +48,8 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Family, Reference
 from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
-FILE = "discretisation.json"  #: name of the file in the result folder
+#: name of the file with the estimates in the result folder
+FILE = "discretisation.json"
 SCHEMA = 1  #: version of the format of the file
 MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 #: Assumed ratio of the numbers of unknowns after and before the first halving of the
@@ -56,7 +57,7 @@ MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is used
 GROWTH = 4.0
 #: Exponent p in the assumption that the time of a reference solve grows as unknowns^p.
 TIME_EXPONENT = 1.5
-MAX_LEVELS = 3  #: number of meshes, the smallest from which a rate can be determined
+MAX_LEVELS = 3  #: number of meshes, the smallest number that determines a rate
 #: smallest q for extrapolation; for a smaller q, 1/(1 − 2^−q) exceeds 3.4
 MIN_RATE = 0.5
 #: Smallest assumed relative error of u_h, even if its certificate proves a smaller
@@ -67,13 +68,13 @@ ROUNDING = 1e-8
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """Sizes of the solution on one mesh."""
+    """Norm, energy and error bound of the solution on one mesh."""
 
-    case: str  #: canonical name
-    unknowns: int  #: number of unknowns
-    energy: float  #: potential energy J_h, J/m in the plane, J in space
+    case: str  #: canonical name of the case
+    unknowns: int  #: number of unknowns on the mesh
+    energy: float  #: potential energy J_h, J/m in 2D, J in 3D
     norm: float  #: energy norm of u_h, in the square root of the unit of energy
-    #: certified relative error of the reference solve on this mesh
+    #: certified bound on the relative error of the reference solve on this mesh
     bound: float
     #: energy norm of the difference from the previous level; None on the first level
     distance: float | None = None
@@ -83,23 +84,24 @@ class Level:
 class Discretisation:
     """Discretisation error of one physical case.
 
-    kind : meaning of `error`. For "limit", it is the extrapolated distance to the limit
-        of fine meshes; for "change", the distance to the solution on the next mesh; for
-        "rounding", an upper bound at the level of rounding errors. For "unknown", there
-        is no estimate, and `note` states the reason
+    kind : meaning of `error`. For "limit", `error` is the extrapolated distance to the
+        limit of fine meshes; for "change", the distance to the solution on the next
+        mesh; for "rounding", an upper bound at the level of rounding errors. For
+        "unknown", there is no estimate, and `note` states the reason
     """
 
     case: str  #: canonical name without the form
     kind: str
-    error: float | None = None  #: relative to ‖û‖, in the energy norm
-    change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
+    error: float | None = None  #: error relative to ‖û‖, in the energy norm
+    change: float | None = None  #: relative change ‖u_h − u_{h/2}‖/‖û‖ on the next mesh
     rate: float | None = None  #: observed rate q of the squared error
     #: for the kind "limit", the geometry to which the meshes converge; for other kinds,
     #: the reason why there is no limit
     note: str = ""
     #: levels; the first is the coarsest mesh, which is the mesh of the case
     levels: tuple[Level, ...] = ()
-    params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
+    #: values of all keys of the case
+    params: Mapping[str, object] = field(default_factory=dict)
 
     def __str__(self) -> str:
         """Describe the error, or the reason why it is unknown."""
@@ -160,7 +162,7 @@ def discretisation_errors(
     If the time does not suffice for all meshes of a case, an earlier estimate from more
     meshes is kept.
 
-    cases : cases; the error of cases that differ only in form is estimated once
+    cases : cases to estimate; cases that differ only in form are estimated once
     folder : result folder, with the cache of reference points in ``references``
     budget : time for all cases, s; a mesh is skipped if its expected time exceeds the
         remaining time
@@ -238,7 +240,7 @@ class _Halving:
     family: Family
     reference: Reference
     references: Path
-    end: float  #: deadline, in seconds of `perf_counter`
+    end: float  #: deadline on the clock `perf_counter`, in s
     why: str = ""  #: reason why there is no finer mesh
     late: bool = False  #: True if the reason is the deadline
     _coarse: tuple[Grid, Extended] | None = None

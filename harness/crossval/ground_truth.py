@@ -45,7 +45,7 @@ class StoredAnswer:
     """A stored answer, with the case that was rebuilt for it."""
 
     record: Record
-    label: str  #: label of the solver; for a sequence, it contains the mode
+    label: str  #: label of the solver; for a sequence, the label contains the mode
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
@@ -55,7 +55,7 @@ class StoredAnswer:
 
 
 class GroundTruth(NamedTuple):
-    """A reference point, and the norm in which distances to it are measured."""
+    """A reference point, and the norm in which distances to this point are measured."""
 
     #: origin of the point: "reference", or the solver and form of an answer
     name: str
@@ -63,7 +63,7 @@ class GroundTruth(NamedTuple):
     closed: int | None  #: number of closed contact rows; None without mechanics
     #: computes the errors of an answer relative to this point
     assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
-    P: Matrix  #: (n, n) matrix of the norm: the stiffness, or P of the QP
+    P: Matrix  #: (n, n) matrix that defines the norm: the stiffness K, or P of the QP
     kernel: NDArray[np.float64]  #: (n, r) rigid motions, whose norm is zero
     note: str = ""  #: reason why an answer replaces the reference solution
 
@@ -109,7 +109,7 @@ def _elastic_truth(
     solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:
-    """Return the reference point, its origin, and a note if it is an answer.
+    """Return the reference point, its origin, and a note if the point is an answer.
 
     Without a reference point, return a message with the reason instead.
     """
@@ -155,7 +155,7 @@ def _best_certified(
 def _plain_truth(
     answers: Sequence[StoredAnswer], solve: Reference
 ) -> GroundTruth | str:
-    """Return the reference point of a QP without mechanics, or the reason why not.
+    """Return the reference point of a QP without mechanics, or why it is missing.
 
     The error of the point is bounded by √(2r), where r is its largest KKT residual. The
     errors of verified answers have the same bound.

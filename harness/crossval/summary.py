@@ -21,15 +21,16 @@ SCHEMA = 1  #: version of the format of the summary
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Summary of one solver at one tolerance; None for values that no answer has."""
+    """Summary of one solver at one tolerance; missing values are None."""
 
     solver: str
     tol: float
     answers: int  #: number of answers with a stored point
     refuted: int  #: number of refuted claims
     unanswered: int  #: number of measurements without a claim of success
-    error_median: float | None  #: median bound on the relative error, energy norm
-    error_worst: float | None  #: largest bound on the relative error, energy norm
+    #: median of the bounds on the relative error in the energy norm
+    error_median: float | None
+    error_worst: float | None  #: largest bound on the relative error in the energy norm
     worst_case: str  #: case with the error `error_worst`
     penetration: float | None  #: largest penetration relative to the mesh size
     balance: float | None  #: largest relative resultant force or moment on a body
@@ -187,7 +188,8 @@ def _headline(
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
         parts.append(
-            f"{_many(counts['unresolved'], 'pair')} too far apart, neither refuted"
+            f"{_many(counts['unresolved'], 'pair')} too far apart, with neither answer "
+            "refuted"
         )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")

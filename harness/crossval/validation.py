@@ -40,7 +40,7 @@ from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
-_CHANGED = "the stored point is not the one that was measured: its file was changed"
+_CHANGED = "the file of the stored point was changed after the measurement"
 #: Largest relative difference (Euclidean norm) of contact forces that count as equal.
 MAX_FORCE_DIFFERENCE = 1e-3
 #: Largest error bound of a reference point that refutes a claim of infeasibility.
@@ -334,7 +334,8 @@ def _true_forces(
     mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
-    point = reference_point(mechanics, solve, references)  # from the cache
+    # the reference point is in the cache
+    point = reference_point(mechanics, solve, references)
     return np.asarray(point.multipliers, dtype=float)
 
 
@@ -369,7 +370,7 @@ def _with_mix_ups(
         )
         if not name:
             return a
-        text = f"its contact forces are those of {name}"
+        text = f"its contact forces equal those of {name}"
         return replace(a, remarks=(*a.remarks, text))
 
     return [

@@ -19,8 +19,8 @@ class DistributedDiscs(Discs):
     """Discs whose components are on this rank, with radii as a distributed vector.
 
     All components of a disc are on the same rank, so that only sums over discs need
-    communication. Every rank has an object of this class, even without discs, since all
-    ranks must take part in the sums.
+    communication. Every rank has an object of this class, even if the rank has no
+    discs, since all ranks must take part in the sums.
 
     Parameters
     ----------

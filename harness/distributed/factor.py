@@ -48,8 +48,8 @@ PIVOT_SHIFT = 1e-15
 #: Largest number of entries of the dense factor of the shared rows, per row of A.
 MAX_FILL = 8
 #: Largest number of rows of a matrix that compiled code factorises as a dense array.
-#: For 500 rows, this already takes longer than the overhead of calling a sparse
-#: library.
+#: For 500 rows, the dense factorisation already takes longer than the overhead of
+#: calling a sparse library.
 MAX_ARRAY_ROWS = 256
 
 
@@ -80,7 +80,7 @@ class Touched:
         return s**2 <= MAX_FILL * (s + float(inner[0]))
 
     def additive(self, t: Dense) -> DistributedVector:
-        """Convert a consistent vector (k,) to an additive one."""
+        """Convert a consistent vector (k,) to an additive vector."""
         return distributed(t / self.touching, self.ranks)
 
 

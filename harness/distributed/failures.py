@@ -30,7 +30,8 @@ PEER_TIMEOUT = 5.0  #: longest time for which a failed rank waits for the other 
 #: ranks report failures to `harness.processes.ranks`, separately from the output of
 #: solvers.
 RECORD = "MORTARBENCH_RANK_RECORD"
-_POLL_SECONDS = 1e-3  #: interval at which a failed rank tests for the other ranks, s
+#: interval at which a failed rank tests whether other ranks have arrived, s
+_POLL_SECONDS = 1e-3
 _MESSAGE_BYTES = 500  #: length to which descriptions of failures are truncated
 
 

@@ -19,7 +19,8 @@ MISSING = (
 def mpiexec() -> str | None:
     """Return the path of mpiexec, or None if mpiexec or mpi4py is not installed.
 
-    An mpiexec in the folder of the Python interpreter is preferred to one on PATH.
+    An mpiexec in the folder of the Python interpreter is preferred to an mpiexec on
+    PATH.
     """
     if find_spec("mpi4py") is None:
         return None

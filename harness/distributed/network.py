@@ -12,8 +12,10 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE_BYTES = 2**20  #: size of a message whose time depends only on the bandwidth
-_BATCHES = 5  #: number of batches of timed calls; the first is discarded as warm-up
+#: size in bytes of a message, so large that its time depends only on bandwidth
+LARGE_BYTES = 2**20
+#: number of batches of timed calls; the first batch is discarded as warm-up
+_BATCHES = 5
 
 
 def network(comm: Comm) -> dict[str, float]:

@@ -4,8 +4,8 @@
 A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, or a composition
 of other maps. Operators of decomposed bodies, and the rows of their coarse problem, are
 implemented as linear maps. For short vectors, a product takes less time than the
-overhead of a library call, and less than another pass over the vectors for a linear
-combination. The module is compiled when the package is installed. `sparse.pyi` declares
+overhead of a library call. Products that are combined with a linear combination save
+another pass over the vectors. The module is compiled when the package is installed. `sparse.pyi` declares
 its types for Python, `sparse.pxd` for compiled callers.
 """
 
@@ -224,7 +224,7 @@ cdef class CompressedRows(LinearMap):
     cdef void combine(
         self, double s, const double *v, double t, const double *x, double *y
     ) noexcept:
-        """y ← sv + tMx; y may be v."""
+        """y ← sv + tMx; y and v may be the same array."""
         cdef Py_ssize_t i, j
         cdef double y_i
         cdef const double *data = self.data
@@ -431,7 +431,7 @@ cdef double *resized(double *held, Py_ssize_t size) except NULL:
 
 
 # Largest relative amount by which a squared pivot may be below its lower bound, since
-# both are rounded.
+# both values are rounded.
 cdef double PIVOT_TOLERANCE = 1e-3
 
 
@@ -440,17 +440,18 @@ def factor_above(M, double share, L_0):
 
     M is a difference of matrices of similar norm as L₀L₀ᵀ. If `share` is smaller than
     the relative rounding errors of these matrices, the computed M may have negative
-    eigenvalues. In exact arithmetic, the pivots of M are at least those of share·L₀L₀ᵀ.
-    If a computed pivot is smaller, the Cholesky factor is discarded, and the
-    eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed. Eigenvalues
-    below `share` are set to `share`, and L follows from
+    eigenvalues. In exact arithmetic, the pivots of M are at least the pivots of
+    share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is discarded, and
+    the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed.
+    Eigenvalues below `share` are set to `share`, and L follows from
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
 
     which contains no subtraction and therefore preserves the lower bound.
 
     M : (k, k) symmetric
-    share : small positive factor of the lower bound L_0 : (k, k) lower triangular L₀
+    share : small positive factor of the lower bound
+    L_0 : (k, k) lower triangular L₀
     """
     cdef Py_ssize_t k = len(M)
     L = np.array(M, dtype=np.float64, order="F")

@@ -252,7 +252,9 @@ class DistributedVector(np.ndarray):
         plain = [_slice(i) for i in inputs]
         if ufunc is np.matmul:
             return _contracted(self.ranks, *plain)
-        if method == "reduce" and how.get("axis") == 1:  # within rows (k, d)
+        if (
+            method == "reduce" and how.get("axis") == 1
+        ):  # each row of a matrix (k, d) is on one rank
             return _rewrap(self.ranks, ufunc.reduce(*plain, **how))
         if method == "__call__":
             if "out" in how:
@@ -360,7 +362,9 @@ class _DistributedRows:
 class Share(NamedTuple):
     """Part of a distributed QP that is stored on one rank."""
 
-    qp: QP  #: vectors and the columns of A are distributed; b is equal on all ranks
+    #: local part of the QP; vectors and the columns of A are distributed, and b is
+    #: equal on all ranks
+    qp: QP
     #: gathers a solution on rank 0; returns None on other ranks
     whole: Callable[[Solution], Solution | None]
 
@@ -391,7 +395,7 @@ class DistributedQP(NamedTuple):
     bounds: int  #: number of finite bounds on all ranks
     #: assembles the part of this rank; each call builds a new operator
     share: Callable[[], Share]
-    #: returns a digest of the coefficients. It differs from
+    #: returns a digest of the coefficients. The digest differs from
     #: `harness.files.qpfile.qp_digest`, which needs the whole QP, and therefore has the
     #: prefix `DISTRIBUTED_DIGEST`
     digest: Callable[[], str]
@@ -420,8 +424,8 @@ Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 class Distributable(Protocol):
     """A product x ↦ Px that can be distributed over ranks.
 
-    The function that builds an operator (`harness.operators`) may return an object of
-    this kind.
+    The function that builds an operator (`harness.operators`) may return such a
+    product.
     """
 
     @property

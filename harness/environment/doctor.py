@@ -1,4 +1,4 @@
-"""Checks of the fitness of a machine for measuring times, with advice on changes."""
+"""Checks whether a machine is fit for timing measurements, with advice on changes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Level(StrEnum):
 
     OK = "ok"
     WARN = "warn"
-    UNKNOWN = "unknown"  #: the system does not provide the value
+    UNKNOWN = "unknown"  #: the operating system does not report the value
 
 
 _SWITCH = {True: "on", False: "off", None: None}
@@ -106,7 +106,9 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
         "processor",
         f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
         f"{usable} usable{virtual})",
-        "" if usable > 1 else "Provide 2 cores: for measurements and for supervision",
+        ""
+        if usable > 1
+        else ("Provide 2 cores: one for measurements and one for supervision"),
     )
     limit = machine["cpu_limit"]
     throttled = limit is not None and limit < 2
@@ -133,9 +135,8 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "hyper-threads",
         _SWITCH[machine["smt"]],
-        "Two programs share a core: keep the machine free of others, or "
-        "echo off | sudo tee /sys/devices/system/cpu/smt/control"
-        * bool(machine["smt"]),
+        "Two programs may share a core: stop all other programs, or echo off | sudo "
+        "tee /sys/devices/system/cpu/smt/control" * bool(machine["smt"]),
     )
     load = now["load"]
     yield check("load", f"{load:.2f} cores busy", load_advice(load))
@@ -144,7 +145,7 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "memory",
         f"{available} of {total} MiB free" if is_known else None,
-        f"Make room for {MIN_MEMORY_MIB} MiB, or lower memory_limit in the suite"
+        f"Free {MIN_MEMORY_MIB} MiB of memory, or lower memory_limit in the suite"
         * (is_known and available < MIN_MEMORY_MIB),
     )
 
@@ -183,7 +184,9 @@ def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
     for pool in threads["pools"]:
         count = pool["threads"]
         advice = (
-            f"Several threads cause scatter of times: {ONE_THREAD}" if count > 1 else ""
+            f"Several threads increase the scatter of times: {ONE_THREAD}"
+            if count > 1
+            else ""
         )
         value = f"{count} thread{'s' if count > 1 else ''}"
         yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
@@ -193,11 +196,13 @@ def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
 
 def _clock(noise: NoiseFloor) -> Iterable[Check]:
     step = noise.clock_seconds
-    coarse = (
-        "" if step <= MAX_CLOCK_STEP_SECONDS else "Measure on a machine with a clock"
-    )
     yield _check(
-        "Clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
+        "Clock",
+        "smallest step",
+        f"{step * 1e9:.0f} ns",
+        "Measure on a machine whose clock has steps of at most 1 µs"
+        if step > MAX_CLOCK_STEP_SECONDS
+        else "",
     )
     biased = abs(noise.ratio - 1) > MAX_RATIO_BIAS and not noise.low <= 1 <= noise.high
     yield _check(
@@ -205,15 +210,17 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
         "A/A ratio",
         f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
         f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
-        "Equal measurements seem to differ: repeat when the machine is idle"
+        "Equal measurements differ significantly: repeat when the machine is idle"
         if biased
         else "",
     )
     yield _check(
         "Clock",
         "noise floor",
-        f"two equal measurements differ by up to {noise.one_pair:.1%} (19 of 20)",
-        f"Raise repeats: a single pair cannot resolve less than {noise.one_pair:.0%}"
+        f"two equal measurements differ by at most {noise.one_pair:.1%} (in 19 of 20 "
+        "pairs)",
+        "Raise repeats: a single pair cannot resolve differences below "
+        f"{noise.one_pair:.0%}"
         if noise.one_pair > MAX_PAIR_SCATTER
         else "",
     )
@@ -223,11 +230,11 @@ def _versions(environment: Mapping[str, Any]) -> Iterable[Check]:
     machine, source = environment["machine"], environment["source"]
     yield _check("Versions", "system", f"{machine['system']} {machine['kernel']}")
     for name, number in environment["versions"].items():
-        advice = "" if number else "It is missing: make setup"
+        advice = "" if number else "The package is missing: make setup"
         yield _check("Versions", name, number or "missing", advice)
     dirty = source is not None and source["dirty"]
     commit = (source["commit"][:12] if source else "not a checkout") + (
-        " with changes" if dirty else ""
+        " with uncommitted changes" if dirty else ""
     )
     advice = "Commit before you publish, so that others can measure the same code"
     yield _check("Versions", "commit", commit, advice if dirty else "")

@@ -94,7 +94,7 @@ def capture(
             "kernel": platform.release(),
             "libc": " ".join(platform.libc_ver()).strip() or None,
             "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-            "governor": ", ".join(sorted(governors)) or None,  # of all CPUs
+            "governor": ", ".join(sorted(governors)) or None,  # governors of all CPUs
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
         },
@@ -281,7 +281,7 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
 def _cpu_limit() -> float | None:
     """Return the container's CPU limit, in cores; None if unlimited or unknown."""
     quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
-    if not quota:  # version 1 of control groups
+    if not quota:  # control groups of version 1
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
         period = _read(_CGROUP / "cpu/cpu.cfs_period_us")
     return int(quota) / int(period) if quota.isdigit() and period.isdigit() else None

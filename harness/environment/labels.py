@@ -7,7 +7,8 @@ from typing import Any
 
 from mortarbench.harness.errors import shortened
 
-Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
+#: tuple of dotted key, value before the change, and value after the change
+Difference = tuple[str, Any, Any]
 
 _MAX_VALUE_CHARACTERS = 48
 _MAX_LISTED = 3  #: largest number of differences that are described in words

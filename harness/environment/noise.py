@@ -17,8 +17,9 @@ from math import exp
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-_SIDE = 120  #: nodes per side of a square grid, whose matrix has 14 400 rows
-_PRODUCTS = 10  #: number of matrix-vector products in a timed call, about 1 ms
+_SIDE = 120  #: number of nodes per side of a square grid, whose matrix has 14 400 rows
+#: number of matrix-vector products in a timed call, which takes about 1 ms
+_PRODUCTS = 10
 _BLOCKS = 20  #: number of blocks of consecutive pairs in the bootstrap
 _DRAWS = 1000  #: number of bootstrap samples
 
@@ -30,9 +31,9 @@ class NoiseFloor:
     clock_seconds: float  #: smallest observed step of the clock
     kernel_seconds: float  #: median time of the kernel
     pairs: int  #: number of pairs of times
-    ratio: float  #: median ratio of the times of arm A to those of arm B
+    ratio: float  #: median ratio of the time of arm A to the time of arm B
     low: float  #: lower end of the 95 % bootstrap interval of `ratio`
-    high: float  #: upper end of this interval
+    high: float  #: upper end of the 95 % bootstrap interval of `ratio`
     one_pair: float  #: relative difference that 95 % of single pairs do not exceed
 
 

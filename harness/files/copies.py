@@ -1,7 +1,7 @@
 """Copies of the input files of cases: ``FOLDER/files/DIGEST.SUFFIX``.
 
-To make a result folder self-contained, each file that defines a QP is copied into it,
-unless the file is too large. Files with equal content share one copy. The list
+To make a result folder self-contained, each file that defines a QP is copied into the
+folder, unless the file is too large. Files with equal content share one copy. The list
 ``files/copies.json`` contains the paths that occur in the names of cases, including the
 paths of files that were too large to copy. Readers compare these paths with the names
 of cases and never open them.
@@ -48,22 +48,22 @@ def content_digest(*paths: Path) -> str:
 
     def parts() -> Iterator[bytes]:
         for path in paths:
-            with opened(path, "a file that can be read") as file:
+            with opened(path, "a readable file") as file:
                 yield from pieces(file)
 
     return hex_digest(parts(), _DIGITS)
 
 
 def is_copy(name: str) -> bool:
-    """Return True if this module writes files of that name to ``files/``."""
+    """Return True if `name` has the form of the names of copies in ``files/``."""
     return name == LIST or _COPY.fullmatch(name) is not None
 
 
 class _Entry(NamedTuple):
     """Entry of ``copies.json``."""
 
-    path: str  #: path as in the names of cases
-    sha256: str  #: first digits of the SHA-256
+    path: str  #: path of the file as it occurs in the names of cases
+    sha256: str  #: first digits of the SHA-256 of the content
     size: int  #: size of the file in bytes
 
 
@@ -117,7 +117,9 @@ class Copies:
             return content_digest(Path(path))
         digests = {e.sha256 for e in _entries(self._folder) if e.path == path}
         if not digests:
-            return content_digest(Path(path))  # raises: no such file
+            return content_digest(
+                Path(path)
+            )  # raises InputError, since there is no such file
         if len(digests) > 1:
             raise InputError(
                 f"{path} does not exist, and {self._folder} has {len(digests)} "
@@ -136,7 +138,11 @@ class Copies:
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
             why = f"was too large to be copied with the results ({_mib(size)})"
-        other = f" (the file changed: it has {here})" if here is not None else ""
+        other = (
+            (f" (the file has changed; its digest is now {here})")
+            if here is not None
+            else ""
+        )
         return InputError(
             f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}; "
             f"put it at {path}"
@@ -157,8 +163,7 @@ def check_copy(copy: Path, digest: str, remedy: str) -> None:
         size = os.fstat(file.fileno()).st_size
         if size > MAX_FILE_MIB * MIB:
             raise InputError(
-                f"{copy}: {_mib(size)}, where copies have {MAX_FILE_MIB} MiB at most; "
-                f"{remedy}"
+                f"{copy}: {_mib(size)}; expected at most {MAX_FILE_MIB} MiB; {remedy}"
             )
         actual = hex_digest(pieces(file), _DIGITS)
     if actual != digest:
@@ -279,7 +284,7 @@ class _Writer:
             if name is not None:
                 self.add(_Entry(name, digest, copy.stat().st_size))
             return
-        with opened(original, "a file that can be read") as file:
+        with opened(original, "a readable file") as file:
             size = os.fstat(file.fileno()).st_size
             if name is not None:
                 self.add(_Entry(name, digest, size))
@@ -356,8 +361,8 @@ def _entries(folder: Path) -> list[_Entry]:
         entries = [_Entry("", "", -1)]
     if not all(map(_is_sound, entries)):
         raise InputError(
-            f"{path}: not a list of copied files as a run writes it; restore or delete "
-            "it; measured cases find their copies without the list"
+            f"{path}: malformed list of copied files; restore or delete it; the "
+            "copies of measured cases are found without this list"
         )
     return entries
 

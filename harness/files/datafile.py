@@ -2,9 +2,9 @@
 
 A small file can declare huge data, for instance an archive that expands a thousandfold,
 or a matrix with a billion columns and no entries. Readers therefore compute the
-required memory from the headers. If it exceeds the limit, they refuse the file before
-they read its data. The environment variable ``MORTARBENCH_MOST_MIB`` sets the limit in
-MiB; the default is 2048.
+required memory from the headers. If the required memory exceeds the limit, readers
+refuse the file before they read the data. The environment variable
+``MORTARBENCH_MOST_MIB`` sets the limit in MiB; the default is 2048.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
-MIB = 2**20  #: bytes in a mebibyte
+MIB = 2**20  #: number of bytes in a mebibyte
 
 _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 _PARSER_BYTES = 256 * MIB  #: memory that a parser may use in addition to the data
@@ -125,7 +125,8 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
             file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
                 return whole.read(size)
-        except (OSError, EOFError, zlib.error):  # not gzip, truncated, or damaged
+        # the content is not gzip data, is truncated, or is damaged
+        except (OSError, EOFError, zlib.error):
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None
@@ -154,8 +155,8 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
         raise
     except MemoryError:
         raise InputError(
-            f"{path}: would take more than {room // MIB} MiB of memory, while its size "
-            "and its head declare less; expected a file that is not damaged"
+            f"{path}: would take more than {room // MIB} MiB of memory, although its "
+            "size and its header declare less; expected an undamaged file"
         ) from None
     except Exception:  # damaged files cause many types of exceptions
         raise InputError(f"{path}: {wrong}") from None

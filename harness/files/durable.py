@@ -20,14 +20,15 @@ from mortarbench.harness.errors import InputError
 
 #: pattern of the names of files that are not yet complete
 _UNFINISHED = ".mortarbench-*.tmp"
-#: patterns of the names of incomplete files in older versions and in case folders
+#: patterns of the names of incomplete files of older versions, and of incomplete files
+#: in case folders
 _OTHERS = ("*.tmp", "*.new", ".*.new")
-#: incomplete files in result folders of older versions
+#: names of incomplete files in result folders of older versions
 _OLD = ("suite.tmp", "environment.tmp")
 
 #: error numbers of a full disk, an exhausted quota and an exceeded file size limit
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: number of bytes that are written to test if a disk is full
+_PROBE_BYTES = 2**16  #: number of bytes that are written to test whether a disk is full
 _MIB = 2**20
 
 
@@ -128,7 +129,8 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
     with report_full_disk(folder):
         path = folder / _UNFINISHED.replace("*", token_hex(8))
         try:
-            with suppress(FileNotFoundError), path.open("xb") as file:  # no such folder
+            # raised if the folder does not exist
+            with suppress(FileNotFoundError), path.open("xb") as file:
                 file.write(bytes(_PROBE_BYTES))
         finally:
             path.unlink(missing_ok=True)

@@ -30,7 +30,8 @@ Row = Mapping[str, Value]
 class Experiment:
     """Tables of measurements, deformed states, and the setting of an experiment."""
 
-    setting: Mapping[str, Any]  #: plain data that JSON can represent
+    #: setting of the experiment as plain data that JSON can represent
+    setting: Mapping[str, Any]
     #: rows of each table, by the name of the table; all rows of a table have the same
     #: keys
     tables: Mapping[str, Sequence[Row]]

@@ -1,6 +1,6 @@
 """Files that grow line by line, such as a journal.
 
-Such a file contains whole lines. If its writer was killed, it may also contain a
+Such a file contains whole lines. If the writer was killed, the file may also contain a
 partial last line. Readers skip the partial line, and the next writer removes it.
 Readers limit the size of the file and the length of its lines.
 """
@@ -46,7 +46,7 @@ def read_lines(path: Path, expected: str) -> Iterator[bytes]:
             else:
                 raise InputError(
                     f"{path}, line {number}: longer than {MAX_LINE_BYTES >> 20} MiB; "
-                    f"expected {expected}, as a run appends it"
+                    f"expected {expected} written by a run"
                 )
 
 
@@ -92,7 +92,7 @@ class Lines:
         self._times = _times(os.fstat(self._fd))
 
     def restore(self) -> None:
-        """Write the file again if it was deleted or replaced since it was opened.
+        """Restore the file if it was deleted or replaced after it was opened.
 
         Missing lines are restored from the old content, to which the open descriptor
         still refers. Lines that only the replacement file contains are kept.
@@ -126,7 +126,8 @@ class Lines:
         self._fd = os.open(self._path, flags, 0o666)
         self._end = _end_of_lines(self._fd)
         os.ftruncate(self._fd, self._end)
-        # before the content is read, to detect edits while the digest is computed
+        # Read the time stamps before the content, to detect edits while the digest is
+        # computed.
         self._times = _times(os.fstat(self._fd))
         self._digest: Digest = running_digest(self._chunks())
         sync_folder(self._path.parent)
@@ -140,8 +141,8 @@ class Lines:
             is_same = digest.digest() == self._digest.digest()
         if not is_same:
             raise InputError(
-                f"{self._path} was changed by another program while the run wrote it; "
-                "the same command continues with its present content"
+                f"{self._path} was changed by another program during the run; the "
+                "same command continues with the present content of the file"
             )
         # the content is unchanged; the file was only touched, linked or deleted
         self._times = _times(held)
@@ -158,7 +159,8 @@ class Lines:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            # An edit within the resolution of the time stamps does not change them.
+            # Compare the content again, since an edit within the resolution of the time
+            # stamps does not change the time stamps.
             if error is None:
                 self._refuse_changed()
         finally:

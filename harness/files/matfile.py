@@ -1,6 +1,6 @@
 """One QP in one .mat file, for MATLAB and Octave.
 
-The names of the variables are those of `harness.files.qpfile`. The vectors ``q, h, b,
+The variables have the same names as in `harness.files.qpfile`. The vectors ``q, h, b,
 lb, ub`` are columns, the matrices ``P, G, A`` are sparse, and ``meta`` is a JSON text.
 Indices of sets, such as ``disc_index``, start at 0. A case may add further arrays, for
 instance the arrays F, d, B, c and R of the paper's dual QP.
@@ -38,7 +38,7 @@ _WRONG = "not a .mat file; expected a file saved with -v7 or older"
 #: sizes in bytes of the header of a version 5 file, and of the tag before each element
 _HEADER, _TAG = 128, 8
 _COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: codes of data types
-_TYPES = {  #: NumPy types by code
+_TYPES = {  #: NumPy types of numbers by code of the data type
     1: "i1",
     2: "u1",
     3: "i2",
@@ -104,7 +104,7 @@ def read_mat(path: Path) -> dict[str, Any]:
     if b"MATLAB 7.3" in data[:_HEADER] or data.startswith(b"\x89HDF"):
         raise InputError(f"{path}: a .mat file of version 7.3; save it with -v7")
     with parsing(path, _WRONG, _COPIES * len(data)):
-        if 0 in data[:4]:  # version 4, which has no compression
+        if 0 in data[:4]:  # the file has version 4, which has no compression
             return dict(loadmat(BytesIO(data), spmatrix=False))
         elements = list(_elements(data))
         size = sum(map(_declared, elements))
@@ -114,7 +114,7 @@ def read_mat(path: Path) -> dict[str, Any]:
         for element in elements:
             name, value = _variable(element)
             if name in variables:
-                raise ValueError(f"{name} is there twice")
+                raise ValueError(f"{name} occurs twice")
             variables[name] = value
         return variables
 
@@ -124,7 +124,7 @@ class _Element(NamedTuple):
 
     order: str  #: byte order, in the notation of struct and NumPy
     kind: int  #: code of the data type
-    body: bytes  #: data without the tag
+    body: bytes  #: content of the element without the tag
 
 
 def _elements(data: bytes) -> Iterator[_Element]:
@@ -195,7 +195,7 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # the tag itself contains the data, of up to four bytes
+        if kind >> 16:  # a short element, whose data of up to four bytes are in the tag
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:

@@ -27,7 +27,8 @@ from mortarbench.harness.files.durable import replacing
 EXPECTED = "an npz file"
 #: size of a cache line in bytes; misaligned arrays would affect measured times
 ALIGNMENT = 64
-_LOCAL_HEADER = 30  #: bytes before the name and the extra field of a zip member
+#: number of bytes before the name and the extra field of a zip member
+_LOCAL_HEADER = 30
 _PADDING = b"\xfe\xca"  #: ID of an extra field, which readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -53,7 +54,8 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(stored))
             member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             start = file.tell() + _LOCAL_HEADER + len(member.filename.encode()) + 4
-            padding = -start % ALIGNMENT  # the npy header fills multiples of 64
+            # NumPy pads the npy header to a multiple of 64 bytes
+            padding = -start % ALIGNMENT
             member.extra = _PADDING + padding.to_bytes(2, "little") + bytes(padding)
             archive.writestr(member, header.getvalue() + stored.tobytes())
 
@@ -163,11 +165,11 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, order (True: Fortran) and dtype from the header of an npy file."""
+    """Return shape, order (True for Fortran order) and dtype of an npy file."""
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in readers:
-        raise ValueError(f"an npy header of version {version}; expected 1.0 or 2.0")
+        raise ValueError(f"the npy header has version {version}; expected 1.0 or 2.0")
     shape, fortran, dtype = readers[version](file)
     if dtype.hasobject:
         raise _PickledError
@@ -183,5 +185,7 @@ def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
     """
     count = prod(shape)  # Python integers, unlike NumPy integers, do not overflow
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
-        raise ValueError(f"{there} bytes; expected {count} values of {dtype}")
+        raise ValueError(
+            f"the file has {there} bytes left; expected {count} values of {dtype}"
+        )
     return count

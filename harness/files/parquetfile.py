@@ -4,9 +4,9 @@ Each row of the table is a problem. The columns are ``P, q, G, h, A, b, lb, ub``
 of doubles) and ``name``. All matrices are dense and stored row by row; their number of
 columns is the number of components of q. Absent constraints and bounds are null.
 qpbenchmark's ``ParquetTestSet`` reads exactly these columns [1]_. Sets other than
-bounds, such as discs, are stored in further columns, which qpbenchmark ignores. The
-names of these columns are those of `harness.sets.arrays`; index arrays are stored row
-by row.
+bounds, such as discs, are stored in further columns, which qpbenchmark ignores. These
+columns have the names of the arrays in `harness.sets.arrays`; index arrays are stored
+row by row.
 
 The meta data of `harness.files.qpfile` are stored in the metadata of the schema under
 the key ``mortarbench``, which other readers ignore.
@@ -69,9 +69,9 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     for name, count in rows.items():
         if count * n > _MAX_ENTRIES:
             raise InputError(
-                f"{path}: {name} has {count} × {n} entries, and Parquet stores them "
-                f"dense, at most {_MAX_ENTRIES}; expected .npz or .mat for a QP of "
-                "this size"
+                f"{path}: {name} has {count} × {n} entries; a Parquet file stores "
+                f"dense matrices of at most {_MAX_ENTRIES} entries; expected .npz or "
+                ".mat for a QP of this size"
             )
     matrices, dense = explicit_matrices(qp)
     flat = {"q": qp.q, "P": _flat(matrices["P"])}
@@ -136,7 +136,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     """Read the columns and the text of the meta data in a separate process.
 
-    A damaged file may crash Arrow; the separate process protects this one.
+    A damaged file may crash Arrow; the separate process protects this process.
 
     Raises
     ------
@@ -158,7 +158,9 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     if head["rows"] != 1:
         raise InputError(f"{path}: contains {head['rows']} problems; expected one row")
     if missing := head["missing"]:
-        raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
+        raise InputError(
+            f"{path}: no column {', '.join(missing)}; expected the columns of a QP"
+        )
     check_size(f"{path}: its content", head["bytes"])
     flat: dict[str, Vector | None] = {}
     begin = 0
@@ -174,7 +176,9 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
     """Check and return the matrix with n columns whose rows `flat` concatenates."""
     if n == 0 or flat.size % n:
-        raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
+        raise ValueError(
+            f"{name} has {flat.size} entries; expected rows of {n} entries"
+        )
     if not np.isfinite(flat).all():
         raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
     M = flat.reshape(-1, n)

@@ -34,7 +34,8 @@ import pyarrow.parquet as pq
 CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
 #: elapsed time after which the kernel kills this process, since reading may block
 SECONDS = 600
-ROOM = 2**29  #: bytes of address space in addition to four times the declared size
+#: number of bytes of address space in addition to four times the declared size
+ROOM = 2**29
 
 
 def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
@@ -43,8 +44,8 @@ def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     metadata = file.metadata
-    # Use also the number of values: a page can encode a billion equal values in a few
-    # bytes.
+    # The number of values is also used, since a page can encode a billion equal values
+    # in a few bytes.
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)

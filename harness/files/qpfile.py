@@ -71,7 +71,7 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
     P = qp.P
     if not qp.is_explicit:
         n = qp.q.size
-        check_size(f"P, an operator, as a dense matrix of {n} rows", 8 * n**2)
+        check_size(f"the operator P as a dense matrix of {n} rows", 8 * n**2)
         P = assembled(P)
     matrices = {"P": P, "G": qp.G, "A": qp.A}
     return matrices, [name for name, M in matrices.items() if isinstance(M, np.ndarray)]
@@ -241,7 +241,7 @@ def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
         there = [part for part in parts if part in arrays]
         if there and len(there) < len(parts):
             lacking = ", ".join(part for part in parts if part not in arrays)
-            raise ValueError(f"{lacking} missing beside {there[0]}")
+            raise ValueError(f"{lacking} missing, but {there[0]} is present")
         return _matrix(arrays, name) if there else None
     M = _vector(arrays, name)
     if M.ndim != 2:
@@ -358,7 +358,8 @@ def compressed(
         If the parts are inconsistent with each other or with `shape`.
 
     """
-    # SciPy (1.17.1) checks the differences of indptr, which may overflow.
+    # Compare neighbouring entries, since SciPy (1.17.1) computes the differences of
+    # indptr, which may overflow.
     if (indptr[1:] < indptr[:-1]).any():
         raise ValueError("indptr decreases")
     M = csc_array((data, indices, indptr), shape=shape)

@@ -1,9 +1,9 @@
 """Reading of text files from untrusted sources, within limits.
 
-A file must be regular, since a device or a pipe may never end. It must also declare its
-size, which files in /proc do not. Its content must be UTF-8, must not exceed a limit
-that users can raise, and must not be nested too deeply. All functions raise an
-`InputError` that states where the error is and what was expected.
+A file must be regular, since a device or a pipe may never end. The file must also
+declare its size, which files in /proc do not. The content must be UTF-8, must not
+exceed a limit that users can raise, and must not be nested too deeply. All functions
+raise an `InputError` that states where the error is and what was expected.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         # opening does not block if a pipe has replaced the file
         flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
         fd = os.open(path, flags) if regular else -1
-    except (OSError, ValueError) as e:  # ValueError: a NUL character in the name
+    except (OSError, ValueError) as e:  # a NUL character in the name raises ValueError
         why = e.strerror if isinstance(e, OSError) else "not a valid file name"
         raise InputError(f"{path}: {why}; expected {expected}") from None
     if not regular or not stat.S_ISREG(os.fstat(fd).st_mode):
@@ -111,7 +111,8 @@ def toml(text: str) -> dict[str, Any]:
             raise RecursionError
         table = tomllib.loads(text)
         _refuse_deep(table)
-    except tomllib.TOMLDecodeError as e:  # "Expected … (at line 3, column 5)"
+    # message such as "Expected … (at line 3, column 5)"
+    except tomllib.TOMLDecodeError as e:
         what, _, place = str(e).removesuffix(")").rpartition(" (at ")
         raise InputError(f"{place}: {what}") from None
     except RecursionError:

@@ -29,7 +29,8 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
-_SIDE = "side_{}_"  #: prefix of the arrays of a contact side, with its number
+#: prefix of the names of the arrays of a contact side, with the number of the side
+_SIDE = "side_{}_"
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
 #: optional arrays of a contact side
 _SOME = ("push", "shear", "friction", "friction_force", "exact")
@@ -97,7 +98,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 
 def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Yield the contact sides of a deformed state; old files contain none."""
+    """Yield the contact sides of a deformed state; old files contain no sides."""
     for i in range(len(arrays)):
         side = _with_prefix(_SIDE.format(i), arrays)
         if not set(side) >= {"name", *_ALONG}:
@@ -121,7 +122,7 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def read_point(path: Path, status: Status) -> Solution:
-    """Read a file that `write_point` wrote, as a `Solution` that claims `status`."""
+    """Read a file written by `write_point` as a `Solution` that claims `status`."""
     arrays = read_arrays(path, _POINT)
     x, y, z, z_box = (arrays[name] for name in _POINT)
     history = _history(path, arrays)
@@ -156,7 +157,9 @@ def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # written by a program that does not align arrays
+        except (
+            ValueError
+        ):  # the arrays are not aligned, since another program wrote the file
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -177,7 +180,8 @@ def _expected(
         Exception
     ):  # zipfile raises many types of exceptions for texts, pickles and damaged files
         raise InputError(
-            f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
+            f"{path}: not an npz file of plain arrays; expected a file written by "
+            "numpy.savez"
         ) from None
     if missing := [name for name in expected if name not in arrays]:
         raise InputError(f"{path}: {', '.join(missing)} missing")
@@ -223,7 +227,7 @@ def _as_stored(
     path = _path(folder, digest)
     arrays = read_arrays(path, expected)
     if digest_of(arrays) != digest:
-        raise InputError(f"{path}: its content is not what was stored")
+        raise InputError(f"{path}: its content does not match its digest")
     return path, arrays
 
 

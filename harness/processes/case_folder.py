@@ -43,7 +43,7 @@ def find_or_build(
 
     While one process looks up or builds a case, other processes that need it wait.
 
-    folder : created if it does not exist; its parent must exist
+    folder : folder of the cache; created if missing, but its parent must exist
     identity : plain data that identify the case and the environment of the build
     make : writes the QP to a file, flushes the file and returns the meta data. If
         `make` raises an exception, nothing is stored and the exception propagates

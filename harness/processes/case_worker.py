@@ -8,15 +8,15 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
   built and discarded beforehand
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
   point in the file ``point``. Reply: ``{"event": "done", "quantities": {…}, "bounds":
-  {…}, "notes": […]}``, with the physical quantities of the point and the bounds of its
+  {…}, "notes": […]}``, with the physical quantities of the point and the bounds on its
   error. If ``fields`` is a path and the case defines a deformed state, this state is
   written to ``fields``
 * ``{"shared": NAME}`` determines, without building the case, whether MPI ranks can emit
   the QP of the case. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
-  solver and writes the solution to the second file. It is sent if the residuals do not
-  decide a verdict. Reply: ``{"event": "done", "found": …}``, false if the reference
-  solver fails
+  solver and writes the solution to the second file. This request is sent if the
+  residuals do not decide a verdict. Reply: ``{"event": "done", "found": …}``, false if
+  the reference solver fails
 
 If a case cannot be built, the reply to the first two requests is ``{"event": "done",
 "unbuilt": REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true if the case
@@ -60,9 +60,9 @@ MAX_STORED_BOUNDS = 10_000  #: largest number of points whose error bounds are c
 #: The first dual case of a process is built again if its build took less than this
 #: time, in s. Effects of first calls (page faults, caches, late imports) took 12 of the
 #: 14 ms of dualising the smallest demo case, and imports alone may take a second.
-#: Without a second build, this time would be charged to the dual form. In a build of
-#: more than ten seconds, this time is negligible, whereas a second build would be
-#: expensive.
+#: Without a second build, the time of these effects would be charged to the dual form.
+#: In a build of more than ten seconds, the effects are negligible, whereas a second
+#: build would be expensive.
 MAX_WARM_UP_SECONDS = 10.0
 
 
@@ -78,8 +78,8 @@ class CaseWorker:
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
-    _build_seconds: float = 0.0  # duration of the last build
-    _build_peak_mib: float | None = None  # peak memory during that build
+    _build_seconds: float = 0.0  # duration of the last build, s
+    _build_peak_mib: float | None = None  # peak memory during the last build, MiB
     _warm: bool = False  # True once a dual case has been built
     #: error bounds and note (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(

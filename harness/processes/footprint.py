@@ -4,7 +4,8 @@ Resident memory (VmRSS) includes shared memory only if a process has mapped and 
 it. A file in /dev/shm, however, occupies memory even if no process has mapped it or the
 process that created it has ended. Each such file is therefore counted once, and it is
 removed when the tree has ended. Libraries that share arrays between processes (joblib,
-multiprocessing, MPI) would otherwise leave these files behind if they are killed.
+multiprocessing, MPI) would otherwise leave these files behind if their processes are
+killed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Meter of the memory of a process tree and of the shared files that it created."""
+    """Meter of the memory of a process tree, including the shared files of the tree."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
@@ -31,8 +32,9 @@ class Footprint:
 
         Resident sizes are cheap to read, but their sum counts a shared page once per
         process. If this sum exceeds `limit`, in MiB, the proportional set sizes are
-        read instead. They divide the size of a shared page among the processes that map
-        it, but the kernel has to walk all page tables to compute them.
+        read instead. Proportional sizes divide the size of a shared page among the
+        processes that map it, but the kernel has to walk all page tables to compute
+        them.
         """
         tree = list(tree)
         self.notice(tree)
@@ -117,7 +119,7 @@ def _listed() -> dict[str, int]:
 
 
 def _sum(tree: list[int], file: str, *groups: tuple[str, ...]) -> tuple[float, ...]:
-    """Return, for each group of keys, the sum of its values over all processes, in MiB.
+    """Return, for each group of keys, the sum of the values over all processes, in MiB.
 
     file : file in /proc/PID with lines like "RssAnon: 12 kB"
     """

@@ -49,13 +49,15 @@ HARNESS_SECONDS = 0.005
 #: Largest further CPU time of the harness per repeat of the solve. On a busy machine,
 #: 0.12 ms were measured; the margin prevents false suspicion of a solver.
 HARNESS_SECONDS_PER_REPEAT = 3e-4
-#: A repeat is suspected of reusing results if it is faster than the first solve by this
-#: factor. The difference of the times must also exceed `MIN_GAIN_SECONDS` or
-#: `MIN_GAIN_BETWEEN_SECONDS`, because ratios of tiny times are unreliable.
+#: A repeat is suspected of reusing results if the time of the repeat, multiplied by
+#: this factor, is less than the time of the first solve. The difference of the times
+#: must also exceed `MIN_GAIN_SECONDS` or `MIN_GAIN_BETWEEN_SECONDS`, because ratios of
+#: tiny times are unreliable.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
-#: smallest suspicious difference between the times of solves in one measurement
+#: smallest suspicious difference between the times of solves in one measurement, s
 MIN_GAIN_SECONDS = 1e-3
-#: smallest suspicious difference between the first solves of two measurements
+#: smallest suspicious difference between the times of the first solves of two
+#: measurements, s
 MIN_GAIN_BETWEEN_SECONDS = 5e-3
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
@@ -66,7 +68,8 @@ class JudgedMeasurement(NamedTuple):
     """A measurement with its verdict."""
 
     record: Record
-    solution: Solution | None  #: None if the worker ended without an answer
+    #: answer of the solver; None if the worker ended without an answer
+    solution: Solution | None
     #: True if there is a point but its quantities or error bounds are missing. False if
     #: the ranks that solved the QP have evaluated their answer completely.
     needs_evaluation: bool = True
@@ -181,7 +184,8 @@ def _with_cost(
     cost, *notes = _plausible_cost(reply)
     if (
         record.ranks > 1
-        # rank 0 measures its own memory, the parent the memory of all ranks
+        # rank 0 measures only its own memory, the parent measures the memory of all
+        # ranks
     ):
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
@@ -271,8 +275,8 @@ def _caching_notes(
         (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
     ]
     return [
-        f"took {slow:.3g} s the first time and {fast:.3g} s later: results are cached "
-        f"between {these}, or something was loaded the first time"
+        f"the first solve took {slow:.3g} s and a later one {fast:.3g} s: results are "
+        f"cached between {these}, or something was loaded in the first solve"
         for slow, fast, gain, these in compared
         if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
     ]
@@ -281,7 +285,7 @@ def _caching_notes(
 def _check_memory(limit: float, record: Record) -> Record:
     """Set the verdict MEMORY_LIMIT if the solver exceeded the limit or lacked memory.
 
-    limit : MiB
+    limit : memory limit, in MiB
     """
     if record.verdict is Verdict.DECLINED:
         return record
@@ -302,9 +306,9 @@ def single_worker(
     """Provide a worker for one measurement; the worker ends with the context.
 
     command : starts the worker; two file descriptors are appended
-    serve : main function of the worker as a fork of this process. If forking is safe,
-        the worker is forked at once, before this process loads data that the worker
-        does not need. Otherwise, `command` starts the worker
+    serve : main function of a forked worker. If forking is safe, the worker is forked
+        from this process at once, before this process loads data that the worker does
+        not need. Otherwise, `command` starts the worker
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")

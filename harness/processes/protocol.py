@@ -42,7 +42,7 @@ MAX_FAULT_CHARACTERS = 2000  #: longest message of the event "fault"
 class Events:
     """Callbacks with which the handler of a request sends events to the parent."""
 
-    start: Callable[[], None]  #: sends "start": the parent starts its clock
+    start: Callable[[], None]  #: sends "start", at which the parent starts its clock
     #: sends "timed": the worker's clock has stopped. Returns after the parent has read
     #: the CPU time
     timed: Callable[[], None]

@@ -9,7 +9,7 @@ are ended.
 
 A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
 every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
-each rank returns its slice of the same solution.
+the ranks return slices of one solution.
 
 As a baseline, the ranks can also solve copies: each rank solves the entire QP
 independently, at the same time as the other ranks. The slowest rank determines the
@@ -71,9 +71,10 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     """Run `command` on several MPI ranks, and report on stderr if a rank failed.
 
     A parent process of each rank records how the rank ended
-    (`harness.processes.reaper`). If one rank ends while others are running, the others
-    are ended, whatever the exit code. The message therefore names the rank that ended
-    first. The output of the ranks is not parsed, since its lines may be interleaved.
+    (`harness.processes.reaper`). If one rank ends while others are running, the other
+    ranks are ended, whatever the exit code. The message therefore names the rank that
+    ended first. The output of the ranks is not parsed, since its lines may be
+    interleaved.
 
     command : command line; its last two elements are file descriptors, which the ranks
         inherit
@@ -87,8 +88,8 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    # The supervisor bound this process to one CPU, and its parent, a sub-reaper, to the
-    # other CPUs.
+    # Use all CPUs of this worker again: the supervisor bound this process to one CPU,
+    # and its parent, a sub-reaper, to the other CPUs.
     with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
@@ -101,7 +102,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         env=os.environ | {RECORD: str(write)},
     )
     # Close this process's copies of the pipe ends. Otherwise, readers would not receive
-    # end of file after the ranks or the parent have closed theirs.
+    # end of file after the ranks or the parent have closed their copies.
     for fd in (*fds, write):
         os.close(fd)
     first = _RankExits(read, ranks).first(process.pid)
@@ -117,11 +118,11 @@ def launch(ranks: int, command: Sequence[str]) -> int:
 class _RankExits:
     """Exits of the ranks, in chronological order.
 
-    epoll(7) lists file descriptors in the order in which they became ready, even if it
-    is polled late. This order identifies the rank that ended first, whereas mpiexec
-    names the ended rank with the lowest number. The parent process of a rank writes the
-    exit status of the rank. The status is unknown if the parent process was killed
-    before it wrote the status.
+    epoll(7) lists file descriptors in the order in which they became ready, even if the
+    caller waits for them late. This order identifies the rank that ended first, whereas
+    mpiexec names the ended rank with the lowest number. The parent process of a rank
+    writes the exit status of the rank. The status is unknown if the parent process was
+    killed before it wrote the status.
     """
 
     def __init__(self, record: int, ranks: int) -> None:
@@ -132,7 +133,7 @@ class _RankExits:
         self._rank_of: dict[int, int] = {}  # rank by pidfd of its process
         # first rank that ended, or the message of its failure; None before any exit
         self._first: int | str | None = None
-        self._exit_description: dict[int, str] = {}  # by rank
+        self._exit_description: dict[int, str] = {}  # descriptions of exits by rank
         self._events = epoll()
         self._events.register(record, EPOLLIN)
 
@@ -156,7 +157,7 @@ class _RankExits:
                     os.close(fd)
                 else:
                     self._take_records()
-                if fd == mpi:  # the end of mpiexec causes all later ends of ranks
+                if fd == mpi:  # ranks that end after mpiexec are ended by mpiexec
                     self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
@@ -188,7 +189,8 @@ class _RankExits:
             for number in (line["process"], line["above"]):
                 try:
                     process = os.pidfd_open(number)
-                except ProcessLookupError:  # ended before its record was read
+                # the process of the rank ended before its record was read
+                except ProcessLookupError:
                     self._record_first(line["rank"])
                 else:
                     self._rank_of[process] = line["rank"]
@@ -230,7 +232,7 @@ def follow(
     """Execute the orders of rank 0 on this rank, until rank 0 sends None.
 
     emit : assembles this rank's share of a case
-    limit : sets the memory limit of this process, in MiB, or lifts it if None
+    limit : sets the memory limit of this process, in MiB; None removes the limit
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
@@ -296,9 +298,11 @@ class RankCosts(NamedTuple):
     The tables are empty for a solve in a single process.
     """
 
-    seconds: Mapping[str, tuple[float, float]] = {}  #: times by phase
+    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by phase
     counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
-    network: Mapping[str, tuple[float, float]] = {}  #: speed measured at the start
+    network: Mapping[
+        str, tuple[float, float]
+    ] = {}  #: speed of communication, measured at the start
 
     def fields(self) -> dict[str, Any]:
         """Return the tables as fields of a record."""
@@ -452,7 +456,7 @@ def _emit_on_ranks(
     Raises
     ------
     InputError
-        If the family raises it on every rank.
+        If the family raises an InputError on every rank.
     RankFailedError
         If some ranks fail with another error.
 

@@ -1,10 +1,10 @@
-"""Sub-reaper: parent of a worker that ends all processes the worker started.
+"""Sub-reaper: a parent of a worker, which ends all processes that the worker started.
 
 Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, the script starts COMMAND in a new
 session, bound to one CPU, and exits with the same code or signal. The script is run by
 an interpreter without site packages, which starts faster, since every worker has a
 sub-reaper. A *sub-reaper* adopts each descendant whose parent ends, see prctl(2), so
-that neither a double fork nor setsid(2) removes a process from its tree. The tree is
+that neither a double fork nor setsid(2) removes a process from the tree. The tree is
 killed
 
 * when COMMAND ends, and
@@ -20,9 +20,10 @@ descriptor RECORD, and exits with the same code or signal. Until its exit, the s
 keeps the inherited descriptors open, so that mpiexec does not end the other ranks
 before the record is written.
 
-The process of the run is not a sub-reaper itself, for three reasons. If it were killed,
-it could not clean up. The trees of two workers would be indistinguishable. In a Python
-session that imports this package, it would adopt unrelated processes.
+The process of the run is not a sub-reaper itself, for three reasons. If the process of
+the run were killed, it could not clean up. The trees of two workers would be
+indistinguishable. In a Python session that imports this package, a sub-reaper would
+adopt unrelated processes.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ if TYPE_CHECKING:
 SEGMENTS = "/proc/sysvipc/shm"
 END_SECONDS = 5.0  #: longest time to wait for the end of processes after SIGKILL, s
 
-_PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+_PR_SET_CHILD_SUBREAPER = 36  # constant of prctl(2)
 _PR_SET_PDEATHSIG = 1
-_IPC_RMID = 0  # shmctl(2)
+_IPC_RMID = 0  # constant of shmctl(2)
 #: environment variables that contain the rank: MPICH, Open MPI, PMIx
 _RANKS = ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "PMIX_RANK")
 _NOT_STARTED = 127  #: exit code of shells for a command that is not found
@@ -133,7 +134,7 @@ def kill_descendants(root: int) -> None:
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process below `root`, but not to another that reuses its ID.
+    """Send a signal to a process below `root`, not to another one that reuses the ID.
 
     A pidfd always refers to the same process. If the process with this ID still belongs
     to the tree after the pidfd was opened, the pidfd refers to a process of the tree.
@@ -152,7 +153,7 @@ def _send(process: int, number: int, root: int) -> None:
 
 
 def shared_segments() -> dict[int, int]:
-    """Return the creators' process IDs of this user's System V segments, by segment."""
+    """Map this user's System V segments to the process IDs of their creators."""
     creators = {}
     with suppress(OSError), open(SEGMENTS) as file:  # kernels may lack this file
         names = file.readline().split()
@@ -228,7 +229,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
     kill_descendants(reaper)
-    # If the init process of a container reaps nothing, zombies would accumulate.
+    # Zombies would otherwise accumulate in a container whose init process reaps none.
     _reap()
     # Remove only segments whose creator has ended. If a process with the ID of the
     # creator is alive, the ID was reused, and the segment may belong to this process.

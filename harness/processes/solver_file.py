@@ -1,10 +1,10 @@
 """Solver objects stored in files, from which worker processes load copies.
 
 Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
-notebook) with their code. It stores only the names of functions and classes of other
-modules. A worker would not find plug-ins or modules in the folder of the script, since
-workers do not search the working directory. Such modules are therefore also stored with
-their code.
+notebook) with their code. For functions and classes of other modules, cloudpickle
+stores only the names. A worker would not find plug-ins or modules in the folder of the
+script, since workers do not search the working directory. Such modules are therefore
+also stored with their code.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def write_solver(path: Path, solver: Solver) -> None:
 
 
 def read_solver(path: Path) -> Any:
-    """Load a solver that `write_solver` has stored.
+    """Load a solver from a file written by `write_solver`.
 
     The file is unpickled, so it must have been written by a process of the same user.
 
@@ -75,8 +75,8 @@ def read_solver(path: Path) -> Any:
 
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
-    """Yield loaded modules that a worker would not find, or find in another file."""
-    importable: dict[str, bool] = {}  # by top-level package
+    """Yield loaded modules that a worker would not find in the same file."""
+    importable: dict[str, bool] = {}  # result of the test by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if not isinstance(module, ModuleType) or not str(file).endswith(".py"):

@@ -56,20 +56,21 @@ POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 #: longest time between the closing of the pipe of requests and the exit of a worker,
 #: after which the worker is killed
 CLOSE_SECONDS = 1.0
-#: longest time between the end of its descendants and the exit of a sub-reaper
+#: longest time between the end of all descendants of a sub-reaper and its own exit
 END_SECONDS = 1.0
 #: longest time for which idle threads of pools may spin after an answer
 SETTLE_SECONDS = 0.5
 #: CPU time of a worker between an answer and the next request, relative to wall time,
 #: above which the worker counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-#: CPU time between an answer and the next request that is ignored
+#: largest CPU time, in s, between an answer and the next request that does not count as
+#: busy
 MIN_BUSY_CPU_SECONDS = 0.01
 LOG_BYTES = 2**20  #: size above which the log of a worker is truncated
 #: length to which the last line of the log is shortened in a message
 MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: bytes at the end of the log in which its last line is sought
-_MIN_FD = 3  #: smallest descriptor of a pipe; smaller ones are standard streams
+_MIN_FD = 3  #: smallest descriptor of a pipe; smaller numbers are standard streams
 #: fraction of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
@@ -77,7 +78,7 @@ _LOCK = ForkSafeLock()  #: held while a thread starts, stops, ends or queries a 
 
 REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: bits in the ID of a CPU clock; see clock_getcpuclockid(3)
+_CPUCLOCK_SCHED = 2  #: bits of the ID of a CPU clock; see clock_getcpuclockid(3)
 #: Signals that solvers do not send to themselves. If such a signal ends a worker before
 #: a solve, the worker was killed from outside.
 _EXTERNAL_SIGNALS = {
@@ -96,7 +97,7 @@ _MACHINE_FAILURE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """The parent's times of a measurement, which bound the times of the worker."""
+    """Times of a measurement on the parent's clock, which bound the worker's times."""
 
     min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
     elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
@@ -108,11 +109,13 @@ class Reply:
     """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None if there is an answer or `fault` is True
+    #: verdict on the end of the worker; None if there is an answer or a fault
+    verdict: Verdict | None = None
     fault: bool = False  #: True if the harness or the machine failed, not the solver
     message: str = ""  #: description of the failure, and notes
     peak_mib: float | None = None  #: largest memory that the parent observed
-    clock: Clock | None = None  #: None unless the request was a measurement
+    #: the parent's times of a measurement; None for other requests
+    clock: Clock | None = None
     threads: int | None = None  #: number of threads that the worker reported
     cpu: int | None = None  #: number of the CPU to which the worker is bound
     #: sizes, digest and build time of the QP that ranks emitted; None if they emitted
@@ -146,14 +149,16 @@ class WorkerProcess:
         self._worker = 0  # process ID of the worker, once it is ready
         self._reaper_fd = self._worker_fd = -1  # pidfds; -1 if there is no process
         self._cpu = -1
-        self._requests = self._replies = -1  # this process's ends of the two pipes
+        # file descriptors of the two pipes in this process
+        self._requests = self._replies = -1
         self._unread = bytearray()
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
-        # time on the parent's clock and CPU time of the worker at its last answer
+        # time on the parent's clock and CPU time of the worker at the last answer
         self._idle_since: tuple[float, float] | None = None
-        self._facts: dict[str, Any] = {}  # number of threads, CPU; see `_facts`
+        # number of threads and CPU of the worker; see `_facts`
+        self._facts: dict[str, Any] = {}
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
@@ -194,7 +199,8 @@ class WorkerProcess:
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
-        # Stop other workers before this one resumes: two must never run on one CPU.
+        # Stop other workers before this worker resumes, since two workers must never
+        # run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
@@ -251,7 +257,7 @@ class WorkerProcess:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Disown all workers; called in a fork, since workers belong to its parent."""
+        """Disown all workers; called in a fork, since workers belong to the parent."""
         for worker in tuple(cls._all):
             worker._disown()
         cls._all.clear()
@@ -354,7 +360,7 @@ class WorkerProcess:
                 self._spawn(memory_limit)
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
-        """Start a process: a fork that calls `serve` or, if it is None, the command."""
+        """Start a fork that calls `serve`, or the command if `serve` is None."""
         usable = os.sched_getaffinity(0)
         self._cpu = max(usable)
         self._footprint = Footprint()
@@ -366,7 +372,7 @@ class WorkerProcess:
         try:
             self._log.write_bytes(b"")
             # In append mode, the worker writes at the new end of the file after
-            # `_trim_log`. Without it, a write at the old offset would restore the old
+            # `_trim_log`. Otherwise, a write at the old offset would restore the old
             # length of the file.
             with self._log.open("ab") as log:
                 if serve is not None:
@@ -420,8 +426,8 @@ class WorkerProcess:
     ) -> dict[str, Any]:
         """Wait for an event, and return its entries.
 
-        limit : s
-        memory_limit : MiB
+        limit : time limit, in s
+        memory_limit : memory limit, in MiB
         stage : stage of the measurement, as a prefix of the error message
 
         Raises
@@ -507,7 +513,7 @@ class WorkerProcess:
         return [process for process in self._tree() if process != self._worker]
 
     def _cpu_seconds(self) -> float:
-        """Return the CPU time of all threads of the worker, as the kernel counts it."""
+        """Return the CPU time, counted by the kernel, of all threads of the worker."""
         with suppress(OSError):  # the worker may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
@@ -593,7 +599,13 @@ class WorkerProcess:
 
         The description includes the last line of the worker's output.
         """
-        how, number = "ended, and other code of this process took its exit code", 0
+        how, number = (
+            (
+                "ended, but other code of this process reaped it, so that its "
+                "exit code is unknown"
+            ),
+            0,
+        )
         with suppress(ChildProcessError):
             how, number = _describe_exit(self._reaper_fd)
         last = ""
@@ -640,7 +652,7 @@ class WorkerProcess:
             self._close(name)
 
     def _close(self, name: str) -> None:
-        """Close a file descriptor and forget it: its number may be used again."""
+        """Close a file descriptor and forget it, since its number may be used again."""
         fd: int = getattr(self, name)
         setattr(self, name, -1)
         if fd != -1:
@@ -702,7 +714,8 @@ class _WorkerEndError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # `START_SECONDS` expired, not the suite's limit
+            # the limit `START_SECONDS` has expired, not the limit of the suite
+            verdict = Verdict.FAILED
         self.verdict = verdict
         self.signal = number
         self.is_fault = False  #: True if the worker reported a fault of the harness

@@ -13,7 +13,7 @@ _ONCE_SECONDS = 5.0
 
 
 class TerminatedError(BaseException):
-    """Termination by a signal; a type that `except Exception` does not catch."""
+    """Exception for a termination signal, which `except Exception` does not catch."""
 
 
 @contextmanager
@@ -30,7 +30,7 @@ def ended_by_signals() -> Iterator[None]:
         if current_thread() is main_thread()
         and signal.getsignal(number) is signal.SIG_DFL
     ]
-    received: list[tuple[float, int]] = []  # time and number
+    received: list[tuple[float, int]] = []  # arrival time and number of each signal
 
     def end(number: int, _: object) -> None:
         now = time.monotonic()

@@ -1,8 +1,8 @@
 """Process that executes all measurements of one solver.
 
-The process follows `harness.processes.protocol`. Its warm-up solves tiny QPs, so that
-imports during the first solve of a solver are not timed. It answers three kinds of
-requests:
+The process follows `harness.processes.protocol`. In its warm-up, the process solves
+tiny QPs, so that imports during the first solve of a solver are not timed. The process
+answers three kinds of requests:
 
 * ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
   the point to ``out``. Optional entries are
@@ -64,7 +64,7 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
 #: Largest number of doubles (2 MiB) in the array that shifts addresses between
-#: measurements. Its pages are never touched and take no memory.
+#: measurements. The pages of the array are never touched and take no memory.
 _MAX_BALLAST = 2**18
 
 
@@ -102,18 +102,18 @@ def serve(
 
 
 class _SolverHost:
-    """Solver with the state that persists between requests, such as its sequence."""
+    """Solver with the state that persists between requests, such as a sequence."""
 
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
-        self._last_step = -1  # last step of the sequence
+        self._last_step = -1  # index of the last measured step of the sequence
         # inode, size and modification time of each verified file, by the digest of its
         # content
         self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        #: replaces the solver in measurements, on several ranks
+        #: on several ranks, replaces the solver in measurements
         self.parallel: ParallelSolver | None = None
 
     def warm_up(self) -> dict[str, Any]:
@@ -152,7 +152,7 @@ class _SolverHost:
         # often they are measured (Mytkowicz et al., ASPLOS 2009). A varying alignment
         # converts this bias into scatter, which confidence intervals include.
         self._ballast = np.empty(0)
-        with suppress(AttributeError):  # glibc only
+        with suppress(AttributeError):  # malloc_trim exists only in glibc
             # otherwise the allocator would reuse freed blocks at their old addresses
             ctypes.CDLL(None).malloc_trim(0)
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
@@ -258,7 +258,10 @@ def _begin_sequence(
     if hasattr(solver, "tightening"):
         varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
         return varying
-    why = "its chain() has one tolerance for all steps; tightening() would take several"
+    why = (
+        "chain() uses one tolerance for all steps; expected tightening() for several "
+        "tolerances"
+    )
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 

@@ -2,8 +2,8 @@
 
 A fault prevents a measurement, but implies nothing about the solver. Faults are
 therefore written to a separate file instead of the journal, with a JSON object on each
-line. The measurement counts as missing until it is in the journal. If the same run
-command is given again, it repeats missing measurements.
+line. The measurement counts as missing until its record is in the journal. If the same
+run command is given again, the new run repeats missing measurements.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Fault:
     run_id: str  #: run_id of the prevented measurement
     case: str  #: canonical name
     solver: str  #: label of the solver
-    what: str  #: reason, one line
+    what: str  #: reason of the fault in one line
     tried_again: bool  #: True if the same run repeated the measurement after the fault
 
     def to_json(self) -> str:
@@ -93,6 +93,6 @@ def _parsed(line: bytes, path: Path, number: int) -> Fault:
     if not fields or any(type(fields[k]) is not kind for k, kind in _TYPES.items()):
         raise InputError(
             f"{path}, line {number}: damaged; expected a JSON object with "
-            f"{', '.join(_TYPES)}, as a run appends it; the line may be deleted"
+            f"{', '.join(_TYPES)}, as written by a run; the line may be deleted"
         )
     return Fault(**fields)

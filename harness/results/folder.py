@@ -1,4 +1,4 @@
-"""Result folders; each has one suite and one environment, and a run locks it."""
+"""Result folders, each with one suite and one environment; a run locks its folder."""
 
 from __future__ import annotations
 
@@ -75,13 +75,13 @@ def refuse_links(folder: Path) -> None:
             for entry in entries:
                 if entry.name in (*_FOLDERS, _SCRATCH):
                     if not _is_plain(entry):
-                        raise _not_plain(entry.path, "a folder of its own")
+                        raise _not_plain(entry.path, "a folder")
                     if entry.is_dir(follow_symlinks=False):
                         _only_plain(entry.path)
                 elif entry.name == COPIES:
                     _only_plain_copies(entry)
                 elif entry.name.startswith(_FILE_PREFIXES) and not _is_plain(entry):
-                    raise _not_plain(entry.path, "a file of its own")
+                    raise _not_plain(entry.path, "a regular file")
     except OSError as e:
         raise InputError(
             f"{e.filename}: {e.strerror}; expected a folder that can be read"
@@ -97,14 +97,14 @@ def _only_plain(folder: str) -> None:
             with os.scandir(each) as entries:
                 for entry in entries:
                     if not _is_plain(entry):
-                        raise _not_plain(entry.path, "a file or folder of its own")
+                        raise _not_plain(entry.path, "a folder or a regular file")
                     if entry.is_dir(follow_symlinks=False):
                         inner.append(entry.path)
         level = inner
     if level:
         raise InputError(
-            f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; expected "
-            "those that a run writes; move the deep ones away"
+            f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; "
+            "expected at most this depth; move the deeper folders away"
         )
 
 
@@ -114,7 +114,7 @@ def _only_plain_copies(folder: os.DirEntry[str]) -> None:
     Other entries are ignored, since a user may have a folder of the same name.
     """
     if folder.is_symlink():
-        raise _not_plain(folder.path, "a folder of its own")
+        raise _not_plain(folder.path, "a folder")
     if not folder.is_dir():
         return
     with os.scandir(folder.path) as entries:
@@ -242,7 +242,8 @@ def lock_folder(folder: Path) -> Iterator[FolderLock]:
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        # not before locking, since another run may still have been writing these files
+        # Unfinished files are deleted after locking, since another run may still have
+        # been writing them.
         folders = [folder / name for name in _FOLDERS]
         remove_unfinished(folder, folders, shared=[folder / COPIES])
         yield lock
@@ -258,7 +259,7 @@ def _open_lock(folder: Path) -> int:
     """
     # O_NOFOLLOW: if the lock were a link, another file would be overwritten
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:  # until the file at the path is the locked file
+    while True:  # repeat until the file at the path is the locked file
         fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,7 +1,7 @@
 """Journal of a result folder: append-only, with one fsynced line per measurement.
 
 If a process is killed while it writes, the journal ends with a partial line. Readers
-ignore this line, and the next writer removes it.
+ignore the partial line, and the next writer removes it.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def read_journal(
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
     records: list[Record] = []
-    at: dict[str, int] = {}  # run_id → index
+    at: dict[str, int] = {}  # index in the result by run_id
     repeated = []
     for path in paths:
         for number, record in _records(path):
@@ -142,8 +142,8 @@ def _records(path: Path) -> Iterator[tuple[int, Record]]:
             yield number, Record.from_json(line, shared)
         except (JSONDecodeError, UnicodeDecodeError):
             raise InputError(
-                f"{path}, line {number}: damaged; expected a JSON object, as a run "
-                "appends it; restore the file, or delete the line and run again"
+                f"{path}, line {number}: damaged; expected a JSON object, as written "
+                "by a run; restore the file, or delete the line and run again"
             ) from None
         except ValueError as e:
             raise InputError(f"{path}, line {number}: {e}") from None

@@ -46,9 +46,15 @@ JOURNAL = "merged"  #: name of the only journal of a merged folder
 class _Union:
     """Union of the measurements of several folders."""
 
-    records: dict[str, Record] = field(default_factory=dict)  # by run_id, in order
-    _keys: set[tuple[str, str]] = field(default_factory=set)  # run_id, environment
-    _contents: set[str] = field(default_factory=set)  # digests without run_id
+    records: dict[str, Record] = field(
+        default_factory=dict
+    )  #: measurements by run_id, in order
+    _keys: set[tuple[str, str]] = field(
+        default_factory=set
+    )  # (run_id, environment) of each measurement
+    _contents: set[str] = field(
+        default_factory=set
+    )  # digests of the records without run_id
 
     def add(self, record: Record) -> bool:
         """Add a measurement; return True if it is a duplicate."""
@@ -132,7 +138,7 @@ def _journal(folder: Path) -> Path:
 
 
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
-    """Read the records of a folder, and add a session to old records without one.
+    """Read the records of a folder, and add a session to old records without a session.
 
     The session is a digest of the environment and of the earliest start of a record
     without a session in this environment.
@@ -157,7 +163,7 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
 
 
 def _refuse_nested(source: Path, out: Path) -> None:
-    """Raise `InputError` if `out` equals `source`, lies in it or contains it."""
+    """Raise `InputError` if `out` equals, contains or lies in `source`."""
     target, origin = out.resolve(), source.resolve()
     if target == origin:
         raise InputError(
@@ -166,8 +172,8 @@ def _refuse_nested(source: Path, out: Path) -> None:
     for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
             raise InputError(
-                f"--out {out}: {inner} lies inside of {outer}; expected a folder apart "
-                "from those to merge"
+                f"--out {out}: {inner} lies inside of {outer}; expected a folder "
+                "outside the folders to merge"
             )
 
 

@@ -1,4 +1,4 @@
-"""Access to stored measurements, for repeating them or rebuilding their cases."""
+"""Access to stored measurements, for repetition and for rebuilding the cases."""
 
 from __future__ import annotations
 

@@ -60,11 +60,12 @@ class WorkUnit:
 class Result:
     """Outcome of a measurement that was completed."""
 
-    record: Record  #: complete except for the digests of `point` and `fields`
+    record: Record  #: record, complete except for the digests of `point` and `fields`
     #: number of the part of the block; a block has several parts if its measurements
     #: were interrupted, and only measurements in the same part ran consecutively
     part: int = 0
-    point: Arrays | None = None  #: None if the solver returned no point
+    #: arrays of the point; None if the solver returned no point
+    point: Arrays | None = None
     fields: Arrays | None = None  #: deformed state; None if it is not to be stored
 
 
@@ -73,8 +74,8 @@ class BuildFailure:
     """Outcome of a block whose case, or one of whose cases, could not be built."""
 
     block: WorkUnit
-    reason: str  #: one line
-    trace: str = ""  #: traceback of the exception, if raised by the family's code
+    reason: str  #: reason in one line
+    trace: str = ""  #: traceback of the exception if the family's code raised it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +83,7 @@ class MeasurementFault:
     """Outcome of a measurement that the harness or the machine prevented."""
 
     record: Record  #: incomplete record of the missing measurement
-    reason: str  #: one line
+    reason: str  #: reason in one line
     tried_again: bool  #: True if the measurement is repeated and has another outcome
 
 
@@ -92,11 +93,11 @@ Outcome = Result | BuildFailure | MeasurementFault
 class Engine(Protocol):
     """Function that executes blocks, on this machine or on the nodes of a cluster.
 
-    An engine may take several blocks from the iterator before it yields outcomes. It
-    may yield outcomes of several blocks in any order, and it may yield the outcomes of
-    a lost block again. A block is created when the engine takes it, and the decision on
-    further repeats depends only on outcomes that were yielded before. An engine should
-    therefore take as few blocks as possible in advance.
+    An engine may take several blocks from the iterator before it yields outcomes. An
+    engine may yield outcomes of several blocks in any order, and may yield the outcomes
+    of a lost block again. A block is created when the engine takes it, and the decision
+    on further repeats depends only on outcomes that were yielded before. An engine
+    should therefore take as few blocks as possible in advance.
     """
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:

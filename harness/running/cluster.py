@@ -275,7 +275,8 @@ class _Cluster:
         """Yield the outcomes of a finished turn; submit the next turn of its block."""
         from distributed import CancelledError
 
-        if (active := self._active.get(future)) is None:  # its worker was lost
+        # the worker of this block was lost
+        if (active := self._active.get(future)) is None:
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
@@ -349,14 +350,16 @@ def _connect(address: str, stack: ExitStack) -> Any:
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
                 memory_limit=0,  # the supervisor limits memory
-                dashboard_address="127.0.0.1:0",  # any free port; clusters may coexist
+                # use any free port, so that several clusters can coexist
+                dashboard_address="127.0.0.1:0",
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
             return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except Exception as e:  # each address scheme has its own library and errors
+    # the library of each address scheme raises its own exceptions
+    except Exception as e:
         if isinstance(e, TypeError) and address.startswith("tls:"):
             raise InputError(
                 f"--dask {address}: Dask's configuration has no certificate for it; "
@@ -403,7 +406,7 @@ def _refuse_unguarded_script() -> None:
 
 @contextmanager
 def _delay_interrupt() -> Iterator[None]:
-    """Delay Ctrl-C to the end of the context, and shield processes started in it.
+    """Delay Ctrl-C to the end of the block, and shield processes started in the block.
 
     A terminal sends SIGINT to all processes of its group, and each Dask process would
     print a traceback. Dask processes inherit the signal mask of this thread, which

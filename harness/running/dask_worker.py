@@ -50,8 +50,8 @@ class ExecutorPlugin(WorkerPlugin):
         replaces the interpreter of the parent
     plugins : files that must exist under the same paths on the node
     operators : makers of operators P by name, except those of `plugins`
-    sharing : largest number of Dask workers on one machine; it is recorded in the
-        environment, since several workers disturb each other's measurements
+    sharing : largest number of Dask workers on one machine; the environment records
+        this number, since several workers disturb each other's measurements
     packages : names of the packages whose versions an environment contains
     """
 
@@ -213,7 +213,7 @@ def _cpu_of(worker: str) -> _Cpu:
     Raises
     ------
     InputError
-        If `claim_cpu` raises it.
+        If `claim_cpu` raises an InputError.
 
     """
     with _cpus_lock:

@@ -1,4 +1,4 @@
-"""Executor of blocks: the processes of a run on one machine."""
+"""Executor of blocks, which manages the processes of a run on one machine."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Executor:
         For a sequence, all steps are repeated, because the data that the solver carries
         from step to step are lost. No result is yielded twice.
         """
-        measured: set[str] = set()  # run IDs
+        measured: set[str] = set()  # run IDs of measurements with a result
         for tried_again in (True, False):
             try:
                 for result in self._results(block, turn):
@@ -175,7 +175,7 @@ class Executor:
                 prove=proven,
             )
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self.scratch, "")  # possibly the cause
+                refuse_full_disk(self.scratch, "")  # a full disk may be the cause
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or needs_evaluation:
                 yield self._describe(block, record, solution)

@@ -79,7 +79,8 @@ def unpaired_ratio(
     n, m = x.size, y.size
     if min(n, m) < 2:
         return None
-    # squared standard errors of the two means, and of their difference
+    # squared standard errors of the two means; the sum is the squared standard error of
+    # the difference of the means
     x_error, y_error = x.var(ddof=1) / n, y.var(ddof=1) / m
     freedom = n + m - 2.0
     if (error := x_error + y_error) > 0:  # Welch-Satterthwaite degrees of freedom

@@ -58,7 +58,8 @@ class Missing:
     """Measurements that are missing after a run; the same command repeats them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
-    faults: list[Fault]  #: measurements prevented by something other than the solver
+    #: faults of the harness or the machine that prevented measurements
+    faults: list[Fault]
 
 
 def run(
@@ -172,7 +173,7 @@ class _Recorder:
             If the folder has been moved, or another run has locked it.
         OSError
             If the result cannot be written, for instance because the disk is full; the
-            journal then has no line for it.
+            journal then has no line for this result
 
         """
         match outcome:
@@ -269,8 +270,8 @@ def _check_same(
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} contains {record.case}, which is no longer in the suite; cases "
-                f"may be added, and --case narrows a run; {REMEDY}"
+                f"{out} contains {record.case}, which is no longer in the suite; "
+                f"cases may only be added; --case selects cases of a run; {REMEDY}"
             )
         today = configured.get(record.solver, record.options)
         for key in today.keys() | record.options.keys():

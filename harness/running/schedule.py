@@ -7,8 +7,8 @@ precision, further blocks are measured after the prescribed repeats. The ratio o
 time of each verified solver to the time of the fastest solver has a confidence interval
 (`harness.running.pairs`). No further blocks are measured when all these intervals are
 narrow enough, or when a limit is reached. This stopping rule is fixed in the suite
-before the first measurement. It depends only on the journal, so that a resumed run
-stops at the same block as an uninterrupted run.
+before the first measurement. The rule depends only on the journal, so that a resumed
+run stops at the same block as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
 
-Cell = tuple[str, str, float]  #: mode, case and tolerance
+Cell = tuple[str, str, float]  #: mode, name of the case, and tolerance
 
 
 @dataclass(eq=False, kw_only=True)
@@ -40,20 +40,25 @@ class Schedule:
     environment: str  #: digest of the environment
     session: str = ""  #: session of the run, see `harness.record.Record`
     progress: Progress
-    unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
+    #: names of the cases that could not be built
+    unbuilt: list[str] = field(default_factory=list)
     #: records by cell; empty unless the suite sets a precision
     _records: dict[Cell, list[Record]] = field(default_factory=dict)
-    _declined: set[tuple[str, Cell]] = field(default_factory=set)  # solver and cell
+    _declined: set[tuple[str, Cell]] = field(
+        default_factory=set
+    )  # solver and cell of each declined case
     #: solver and cell of answers that were not verified, in series of growing sizes
     _ended: set[tuple[str, Cell]] = field(default_factory=set)
-    _done: set[str] = field(default_factory=set)  # run IDs in the journal
+    _done: set[str] = field(
+        default_factory=set
+    )  # run IDs of the measurements in the journal
     _next: int = 0  # number of the next new block
     # new block number by the original block number and the number of the part
     _parts: dict[tuple[int, int], int] = field(default_factory=dict)
 
     @property
     def cells(self) -> int:
-        """Largest number of measurements of the suite."""
+        """Largest possible number of measurements of the suite."""
         s = self.suite
         return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
 
@@ -97,7 +102,7 @@ class Schedule:
     def block_of_part(self, block: int, part: int) -> int:
         """Return the new block number of a part measured later or on another machine.
 
-        Times are paired within blocks, so such a part needs a separate block number.
+        Times are paired within blocks, so this part needs a separate block number.
         """
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next
@@ -105,7 +110,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Mark the cases of a block as unbuilt; return False if none is new."""
+        """Mark the cases of a block as unbuilt; return False if all already were."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)

@@ -22,7 +22,8 @@ class Blocks(ABC):
 
     prefix: ClassVar[str]  #: prefix of the names of arrays in files
     least: ClassVar[int]  #: smallest number d of variables in a block
-    columns: ClassVar[str]  #: meaning of the columns of `index`, for messages
+    #: text for messages that states the meaning of the columns of `index`
+    columns: ClassVar[str]
     #: True for sets distributed over ranks: a rank without blocks keeps an empty set
     may_be_empty: ClassVar[bool] = False
 
@@ -50,15 +51,16 @@ class Blocks(ABC):
                 f"{kind}: {size} has shape {sizes.shape}; expected {index.shape[:1]}, "
                 "one number per row of index"
             )
-        with np.errstate(invalid="ignore"):  # NaN, or out of the range of int64
+        # a cast of NaN, or of numbers beyond the range of int64, is invalid
+        with np.errstate(invalid="ignore"):
             whole = index.astype(np.int64)
         if not np.array_equal(whole, index):
             raise InputError(f"{kind}: index contains a number that is not an integer")
         bad = np.flatnonzero(~(np.isfinite(sizes) & (sizes >= 0)))
         if bad.size:
             raise InputError(
-                f"{kind}: {size}[{bad[0]}] = {sizes[bad[0]]}; expected finite numbers "
-                "that are not negative"
+                f"{kind}: {size}[{bad[0]}] = {sizes[bad[0]]}; expected finite "
+                "nonnegative numbers"
             )
         object.__setattr__(self, "index", whole)
         object.__setattr__(self, size, sizes.astype(float))

@@ -1,4 +1,4 @@
-"""Bounds of variables as a convex set."""
+"""Bounds on variables as a convex set."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Box:
     def block(self) -> NDArray[np.int64]:
         """Indices of the variables with a finite bound, in ascending order."""
         is_bounded = np.isfinite(self.lower) | np.isfinite(self.upper)
-        # the local slice of a distributed vector
+        # np.asarray returns the local slice of a distributed vector
         return np.flatnonzero(np.asarray(is_bounded))
 
     def check(self, n: int) -> None:

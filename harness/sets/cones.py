@@ -1,4 +1,4 @@
-"""Second-order cones ‖x_T‖ ≤ μ x_N of contact forces: Coulomb's law in space."""
+"""Second-order cones ‖x_T‖ ≤ μ x_N of contact forces: Coulomb's law in 3D."""
 
 from __future__ import annotations
 
@@ -98,9 +98,10 @@ class Cones(Blocks):
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the Euclidean distances (k,) of z from the normal cones of cones at x.
 
-        At the apex, the normal cone is the polar cone. Elsewhere, it is a ray on the
-        boundary of a cone of positive slope, and {0} inside. A block of x whose norm is
-        at most `tol` times the largest norm counts as the apex.
+        At the apex, the normal cone is the polar cone. At other points of a cone of
+        positive slope, the normal cone is a ray if x is on the boundary, and {0} if x
+        is inside. A block of x whose norm is at most `tol` times the largest norm
+        counts as the apex.
         """
         at, force = x[self.index], z[self.index]
         sizes, tangents = norms(at), norms(at[:, 1:])

@@ -3,7 +3,7 @@
 The feasible set of a QP without its rows is the product S₀ × S₁ × …, where S₀ is a
 `Box` of all variables. Each further set constrains a block of variables that are free
 in S₀ and in all other sets. KKT residuals, verdicts, transforms and files use only the
-operations of `ConvexSet`, so that they do not depend on the class of a set.
+operations of `ConvexSet` and are therefore independent of the class of a set.
 
 A vector z is normal to S at x ∈ S if zᵀ(y − x) ≤ 0 for all y ∈ S. With the support
 function σ(z) = sup zᵀy over y ∈ S, this is equivalent to  σ(z) − zᵀx = 0.  The
@@ -29,7 +29,8 @@ class Limits(NamedTuple):
 
     slack: Vector  #: distance to the limit, negative if violated
     size: Vector  #: absolute value of the limit
-    terms: Vector  #: sum of the absolute terms of the variables in the slack
+    #: sum of the absolute values of those terms of the slack that contain variables
+    terms: Vector
     sized: Callable[[Vector], Vector]  #: maps absolute values (n,) to `terms`
 
 

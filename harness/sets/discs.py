@@ -1,4 +1,4 @@
-"""Discs ‖x_I‖ ≤ r: bounds on friction forces in space."""
+"""Discs ‖x_I‖ ≤ r, which bound friction forces in 3D."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ class Growth:
     """Position of a case in a series of growing sizes."""
 
     smaller: str  #: name of the next smaller case of the series; empty for the smallest
-    warm_up: CaseId  #: the same case, but with the default size of its family
+    warm_up: CaseId  #: the same case with the default size of the family
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,7 +88,8 @@ class _Block:
     cases: list[CaseId]
     given: list[dict[str, object]]  #: keys that the suite sets, for each case
     kind: str  #: "sequence", "growing" or, for single cases, ""
-    along: tuple[str, ...]  #: keys that vary in the sequence or series, else ()
+    #: keys that vary in the sequence or series; () for single cases
+    along: tuple[str, ...]
 
 
 def _blocks(
@@ -171,8 +172,8 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
     if paths := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
         return paths
     raise InputError(
-        f"params.path = {shown(pattern)} matches no file; expected a pattern of files, "
-        "from here or from the folder of the suite"
+        f"params.path = {shown(pattern)} matches no file; expected a pattern relative "
+        "to the working directory or to the folder of the suite"
     )
 
 
@@ -188,9 +189,10 @@ def _located(
 ) -> dict[str, object]:
     """Return the keys of a case, with a path that leads to its file.
 
-    If the path does not exist relative to the working directory, it is interpreted
-    relative to the folder of the suite. If the file is also missing in this folder, and
-    exactly one copy in the result folder matches, the path of the copy is returned.
+    If the path does not exist relative to the working directory, the path is
+    interpreted relative to the folder of the suite. If the file is also missing in this
+    folder, and exactly one copy in the result folder matches, the path of the copy is
+    returned.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():
@@ -208,7 +210,7 @@ def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, st
     if not kinds:
         return "", ""
     if len(kinds) > 1:
-        raise InputError("sequence and growing: expected one of the two")
+        raise InputError("sequence and growing are both set; expected only one of them")
     (kind,) = kinds
     key = table[kind]
     values = params.get(checked.text(kind, key))
@@ -245,7 +247,7 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
             zipped[key] = group
         if len({len(columns[key]) for key in group}) > 1:
             lengths = ", ".join(f"{key} has {len(columns[key])}" for key in group)
-            raise InputError(f"zip: {lengths} values; expected equally many")
+            raise InputError(f"zip: {lengths} values; expected lists of equal length")
     axes = []
     for key in columns:
         together = zipped.get(key, [key])

@@ -112,7 +112,8 @@ def options_for(
         for key, values in options_of_texts.items():
             if len(values) > 1:
                 raise InputError(
-                    f"{key} has {len(values)} values; expected one, only `run` sweeps"
+                    f"{key} has {len(values)} values; expected one value, since only "
+                    "`run` sweeps options"
                 )
         spec = SolverSpec(name=name, label=name)
         single = {key: value for key, (value,) in options_of_texts.items()}

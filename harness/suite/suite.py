@@ -86,7 +86,7 @@ class Suite:
     memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
     cases: tuple[CaseId, ...]  #: distinct cases, solved without results of other cases
-    text: str  #: TOML of the suite, with the limits that apply
+    text: str  #: TOML text of the suite, including the limits that apply
     #: sequences, each a tuple of its steps in order
     sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: positions of cases in series of growing sizes, by name of the case
@@ -95,8 +95,8 @@ class Suite:
     #: for each value; 0 means constant tolerances
     tighten: tuple[float, ...] = (0.0,)
     #: requested relative half-width of confidence intervals; no further repeats are
-    #: measured when every ratio to the fastest solver attains it. If None, the number
-    #: of repeats is `repeats`
+    #: measured when the half-width of every ratio to the fastest solver is at most this
+    #: value. If None, the number of repeats is `repeats`
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
     #: largest time per case and tolerance in s, if a precision is set
@@ -371,8 +371,8 @@ def _on_ranks(
         raise InputError(f"copies = {shown(copies)}; expected true or false")
     if copies and counts == [1]:
         raise InputError(
-            "copies = true: copies are compared with ranks; expected several ranks, "
-            "such as ranks = [1, 2]"
+            "copies = true needs a number of ranks above 1; expected, for instance, "
+            "ranks = [1, 2]"
         )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
@@ -431,8 +431,8 @@ def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...
         set(thetas)
     ) < len(thetas):
         raise InputError(
-            f"tighten = {shown(thetas)}; expected distinct numbers from 0 (each step "
-            "to the tolerance) to below 1"
+            f"tighten = {shown(thetas)}; expected distinct numbers θ with 0 ≤ θ < 1, "
+            "where 0 means a constant tolerance"
         )
     if any(thetas) and not sequences:
         raise InputError(

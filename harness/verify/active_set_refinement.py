@@ -46,7 +46,7 @@ _EPS = Real(np.finfo(Real).eps)
 class ActiveSet(NamedTuple):
     """States of the rows, and the multipliers of rows that are not closed."""
 
-    states: States  #: (m,)
+    states: States  #: (m,) state of each row
     limits: Extended  #: (m,) multipliers on the boundary of Λ; unused for closed rows
 
     @property
@@ -55,7 +55,7 @@ class ActiveSet(NamedTuple):
         return np.asarray(self.states == CLOSED)
 
     def at_bounds(self, multipliers: Extended) -> Extended:
-        """Replace the multipliers (m,) of rows that are not closed by their limits."""
+        """For rows that are not closed, replace the multipliers (m,) by the limits."""
         return np.where(self.closed, multipliers, self.limits)
 
 
@@ -74,7 +74,7 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
         step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
-    return u - step, left  # the u for which the last residual was computed
+    return u - step, left  # the last residual was computed for this u
 
 
 def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
@@ -120,7 +120,7 @@ def predicted(
     push = multipliers[discs.index] * soft + v[discs.index]
     size = norms(push)[:, None]
     slips = size >= discs.radius[:, None] * soft
-    # if λ + v/D is zero, slip has the direction of λ
+    # if λ + v/D is zero, the direction of λ is used as the direction of slip
     limits[discs.index] = np.where(
         size > 0,
         push / np.where(size > 0, size, 1) * discs.radius[:, None],

@@ -40,8 +40,8 @@ MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
 #: Largest number of rows for which F_VV is assembled. Systems with more rows are solved
 #: by CG.
 MAX_DENSE_ROWS = 2000
-#: A combination of rigid motions counts as floating if its singular value in √W G is
-#: at most this fraction of the largest one (`supported_and_floating`).
+#: A combination of rigid motions counts as floating if its singular value in √W G is at
+#: most this fraction of the largest singular value (`supported_and_floating`).
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of the absolute terms of the load.
@@ -74,8 +74,8 @@ def admissible(
 class _Rows(NamedTuple):
     """Contact rows Bu ≤ c, and friction rows, which do not constrain u."""
 
-    B: Any  #: (m, n) in extended precision
-    c: Extended  #: (m,)
+    B: Any  #: (m, n) rows in extended precision
+    c: Extended  #: (m,) right-hand sides
     contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
 
 
@@ -169,7 +169,7 @@ def feasible_at_rows(
 ) -> FeasiblePoint | None:
     """Find a feasible point, moving only components on which the rows depend.
 
-    The algorithm is that of `_feasible_near`.
+    The algorithm is the same as in `_feasible_near`.
 
     Parameters
     ----------
@@ -347,7 +347,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
 
 def relative(multipliers: Extended) -> Extended:
-    """Divide multipliers by the largest one; return ones if none is positive."""
+    """Divide multipliers by the largest one; return ones if none is > 0."""
     largest = multipliers.max(initial=Real(0))
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
@@ -355,7 +355,7 @@ def relative(multipliers: Extended) -> Extended:
 def supported_and_floating(
     G: Extended, w: Extended
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split the space of rigid motions (p,) into supported and floating ones.
+    """Split the space of rigid motions (p,) into supported and floating motions.
 
     Rows resist a motion ν through the change Gν (m,) of their gaps, with weights w (m,)
     ≤ 1. A motion of unit norm is floating if ‖√w Gν‖ is at most SUPPORT_THRESHOLD times
@@ -379,7 +379,7 @@ class Balance(NamedTuple):
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of the absolute terms of `load`
     bent: Extended  #: (p,) (KR)ᵀu, nonzero only because of rounding
-    forces: AdmissibleForces  #: Λ, set of admissible multipliers
+    forces: AdmissibleForces  #: set Λ of admissible multipliers
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.

@@ -1,4 +1,4 @@
-"""Proven bound of the error of an answer, without trust in the solver.
+"""Proven bound on the error of an answer, without trust in the solver.
 
 Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the displacement
 in equilibrium with λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
@@ -16,19 +16,19 @@ solution, bounds both errors:
 Friction with bounds g_t adds the work Σ g_t‖v‖ of the slip v to the energy, and its
 multipliers satisfy ‖λ̂_t‖ ≤ g_t. The left-hand side of (1) then has the further terms
 Σ(g_t‖v*‖ − λ̂_tᵀv*) and Σ(g_t‖v̂‖ − λ_t*ᵀv̂), which are nonnegative. The right-hand
-side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of friction at its bound less
+side has the further term Σ(g_t‖v̂‖ − λ̂_tᵀv̂), the work of friction at its bound minus
 the work of λ̂_t. For Coulomb's law, g_t is fixed: the certificate holds for the last
 Tresca problem of the fixed-point iteration.
 
-The gap g is not evaluated as J − D: the difference would consist of rounding if the
-error is below 1e-8, since J and D then agree in all digits. The midpoint M of û and u_λ
+The gap g is not evaluated as J − D. If the error is below 1e-8, J and D agree in all
+digits, and their difference consists of rounding errors. The midpoint M of û and u_λ
 satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). Hence, for any other point u,
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
 where the right-hand side is at most √(2g) if u is û or u_λ.
 
-Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ less the root in (3).
+Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ minus the root in (3).
 This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
@@ -97,9 +97,9 @@ __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 #: Largest residual with which a combination of contact rows counts as equal to a rigid
 #: motion.
 COMBINATION_RESIDUAL = 1e-9
-#: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: its error grows like the
-#: logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002, Theorem
-#: 24.2, with errors of the weights of 2⁻⁵³).
+#: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: the error of the FFT grows
+#: like the logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002,
+#: Theorem 24.2, with errors of the weights of 2⁻⁵³).
 PRODUCT_ROUNDING = 2.0**-46
 #: Safety factor, since power iteration underestimates ‖P‖.
 POWER_ITERATION_FACTOR = 2.0
@@ -128,17 +128,17 @@ class Certificate:
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
-    sliding: float  #: the frictional part of `work`, its second term
+    sliding: float  #: second term of `work`, which is due to friction
     rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
-    stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, where ‖Tv‖ is the norm of K_T
-    claimed: float  #: bound (3) of the error of the answer
-    least: float  #: lower bound of ‖u*‖
+    stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the energy norm in K_T
+    claimed: float  #: bound (3) on the error of the answer
+    least: float  #: lower bound on ‖u*‖
     moved: float  #: ‖u − û‖, distance of the answer from û
     seminorm: bool  #: True if bodies can move rigidly; see module docstring
 
     @property
     def equilibrium(self) -> Extended:
-        """u_λ (n,) of undivided bodies."""
+        """Displacement u_λ (n,); defined only for undivided bodies."""
         return np.asarray(self.u - self.off)
 
     @property
@@ -148,12 +148,12 @@ class Certificate:
 
     @property
     def pair(self) -> float:
-        """√(2g), bound (2) of the errors of û and u_λ together."""
+        """√(2g), bound (2) on the errors of û and u_λ together."""
         return _root(2 * self.gap)
 
     @property
     def bound(self) -> float:
-        """Bound of the relative errors of û, u_λ and the answer, in the energy norm.
+        """Bound on the relative errors of û, u_λ and the answer, in the energy norm.
 
         The bound is infinite if the solution is not proven to be nonzero.
         """
@@ -161,7 +161,7 @@ class Certificate:
 
     @property
     def error(self) -> float:
-        """Bound of the energy norms of the errors of û, of u_λ and of the answer."""
+        """Bound on the energy norms of the errors of û, of u_λ and of the answer."""
         return max(self.pair * self.stretch, self.claimed)
 
     @property
@@ -185,17 +185,17 @@ class Certificate:
 
 
 class EigenvalueCertificate(NamedTuple):
-    """Bound (5) of the error of an answer, in the norm ‖·‖_P."""
+    """Bound (5) on the error of an answer, in the norm ‖·‖_P."""
 
     x: Vector  #: x̂ (n,), in the sets
-    z: Vector  #: (n,) normal to the sets at x̂
-    distance: float  #: ‖r‖/√μ, bound of ‖x̂ − x*‖_P, including the rounding of r
+    z: Vector  #: (n,) vector that is normal to the sets at x̂
+    distance: float  #: ‖r‖/√μ, bound on ‖x̂ − x*‖_P, including the rounding of r
     moved: float  #: ‖x − x̂‖_P, distance of the answer from x̂
-    norm: float  #: ‖x̂‖_P, less rounding
+    norm: float  #: lower bound on ‖x̂‖_P, reduced by rounding errors
 
     @property
     def error(self) -> float:
-        """Bound of the error ‖x − x*‖_P of the answer."""
+        """Bound on the error ‖x − x*‖_P of the answer."""
         return self.moved + self.distance
 
     @property
@@ -219,7 +219,9 @@ class EigenvalueCertificate(NamedTuple):
         return length / least if least > 0 else np.inf
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
+@np.errstate(
+    all="ignore"
+)  # a point may contain 1e300; an overflow raises UncertifiableError
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
@@ -229,7 +231,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     for the radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ.
     The rounding term of the residual covers this distance (docs/certificates.md).
 
-    least : μ > 0, a proven lower bound of the eigenvalues of P
+    least : μ > 0, a proven lower bound on the eigenvalues of P
 
     Raises
     ------
@@ -263,7 +265,9 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     return certificate
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300; infinite results raise
+@np.errstate(
+    all="ignore"
+)  # a point may contain 1e300; an overflow raises UncertifiableError
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
@@ -326,7 +330,7 @@ def sharpest(
 
 
 def _least_norm(split: Undivided) -> float:
-    """Return a lower bound of ‖u*‖ from a pair that does not depend on an answer."""
+    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer."""
     mechanics = split.mechanics
     u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
@@ -360,7 +364,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
-    """Return the certificate of the pair near zero, or the reason why it has none."""
+    """Return the certificate of the pair near zero, or the reason why it is missing."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
@@ -483,7 +487,8 @@ def proven(
     further = np.abs(supported.T @ split.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
-    if off is not None:  # K_T has no energy in bodies that move with their supports
+    # the energy in K_T of bodies that move together with their supports is zero
+    if off is not None:
         turned = np.abs(supported.T @ split.along(off[0])[:p]).astype(np.float64)
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
@@ -519,7 +524,7 @@ def _charge(
 ) -> float:
     """Bound the rounding terms (R3) of (4) by a fixed-point iteration.
 
-    The rounding terms depend on the bounds of the errors, which depend on the rounding
+    The rounding terms depend on the bounds on the errors, which depend on the rounding
     terms. Each iterate is increased by 1 %, so that the iteration ends above the fixed
     point.
 
@@ -541,7 +546,7 @@ def _charge(
 
 
 class _Reach(NamedTuple):
-    """Bounds of the rigid part of û − u*, as functions of the errors of û and u_λ."""
+    """Bounds on the rigid part of û − u*, as functions of the errors of û and u_λ."""
 
     gaps: Vector  #: (h,) constant terms, due to open gaps
     error: Vector  #: (h,) coefficients of ‖û − u*‖
@@ -607,7 +612,8 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Return y ≥ 0 with columns·y = target (p,); inf if no such y is found."""
-    from scipy.optimize import nnls  # loads slowly, and workers do not need it
+    # imported here, since scipy.optimize loads slowly and workers do not need it
+    from scipy.optimize import nnls
 
     try:
         y, left = nnls(columns, target)

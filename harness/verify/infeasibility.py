@@ -45,9 +45,9 @@ from mortarbench.harness.verify.rational import (
 #: contradict one another by a smaller margin if their right-hand sides are rounded sums
 #: of thousands of terms.
 MIN_MARGIN = 1e-12
-#: Fractions of the largest multiplier of the scaled rows, tried in turn: smaller
-#: multipliers are set to zero. Iterative solvers return small multipliers for rows that
-#: do not contribute to the proof.
+#: Fractions of the largest multiplier of the scaled rows, which are tried in turn.
+#: Smaller multipliers are set to zero. Iterative solvers return small multipliers for
+#: rows that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 #: Largest |cⱼ| that counts as an approximation of 0, relative to the sum of its
 #: absolute terms.
@@ -72,8 +72,8 @@ class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
     rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
-    centre: Any  #: (k,) fractions, approximate multipliers
-    radius: Any  #: (k,) fractions, bounds of |multipliers − centre|
+    centre: Any  #: (k,) approximate multipliers, as fractions
+    radius: Any  #: (k,) bounds on |multipliers − centre|, as fractions
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 
@@ -131,7 +131,9 @@ def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | Non
     w[qp.b.size :] = np.maximum(w[qp.b.size :], 0)
     sizes = abs(M) @ diags_array(column)
     largest = np.asarray(sizes.max(axis=1).toarray()).ravel()
-    size = np.abs(w) * np.where(largest > 0, largest, 1.0)  # rows 0·x ≤ −1 are empty
+    size = np.abs(w) * np.where(
+        largest > 0, largest, 1.0
+    )  # a row 0·x ≤ −1 has no entries
     if not 0 < size.max() < np.inf:
         return None
     w = w * 2.0 ** -np.floor(np.log2(size.max()))
@@ -179,11 +181,12 @@ def _corrected(
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
         if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
-            order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
+            # order of the pivots: equations, then inequalities, each by decreasing |w|
+            order = np.lexsort([-np.abs(w), rows >= qp.b.size])
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
-            assert solve is not None  # 0 is a solution
+            assert solve is not None  # w = 0 is a solution
             corrected = exact.copy()
             corrected[order] = solve(exact[order])
             yield Ray(rows, corrected, zero, vanish)
@@ -193,7 +196,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
     """Bound a change of w (k,) after which Mᵀw = 0 holds exactly; None if unproven.
 
     Columns are scaled by their terms and rows by w. Let X be an approximate right
-    inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
+    inverse of Mᵀ, and α < 1 a bound on ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
     regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δᵢ| ≤ Σⱼ|Xᵢⱼ|·‖c‖∞/(1 − α).
 
     M : (k, n) columns of the variables with cⱼ = 0
@@ -239,7 +242,7 @@ def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
             if np.isinf(bound):
                 return None
             products.append(-end * Fraction(bound))
-        value += max(products)  # convex in cⱼ: the maximum is at an end
+        value += max(products)  # the term is convex in cⱼ, so its maximum is at an end
         terms += max(map(abs, products))
     return float(-value / terms) if -value > Fraction(MIN_MARGIN) * terms else None
 
@@ -277,7 +280,8 @@ def _solved(
         rows are equations
     reach : bounds of larger absolute value are omitted
     """
-    from scipy.optimize import linprog  # imported here because it loads slowly
+    # imported here, since scipy.optimize loads slowly
+    from scipy.optimize import linprog
 
     n, k = M.shape[1], M.shape[0]
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))

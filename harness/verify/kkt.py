@@ -116,10 +116,10 @@ class _Constraints(NamedTuple):
 class _Terms:
     """Quantities in the KKT conditions at a point, and sums of their absolute terms."""
 
-    x: Vector  #: |x|
+    x: Vector  #: |xⱼ| (n,)
     constraints: _Constraints
     Px: Vector
-    Px_size: Vector  #: upper bound of Σ|Pᵢⱼ||xⱼ|
+    Px_size: Vector  #: upper bound on Σ|Pᵢⱼ||xⱼ|
     curvature: Vector  #: Pᵢᵢ; zero if an operator P has no `diagonal`
     has_diagonal: bool  #: False if an operator P has no `diagonal`
     forces: Vector  #: Aᵀy + Gᵀz + z_box
@@ -192,8 +192,8 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
 
     * `natural_map` is ‖x − Π(x − g/L)‖·L/‖q‖ with g = Px + q + Aᵀy + Gᵀz, the
       projection Π onto all sets and an estimate L of the largest eigenvalue of P. It
-      does not depend on z_box. If q = 0, it is relative to the larger of ‖Px‖ and
-      ‖Aᵀy + Gᵀz‖.
+      does not depend on z_box. If q = 0, the value is relative to the larger of ‖Px‖
+      and ‖Aᵀy + Gᵀz‖.
     * `normal_distance` is the largest Euclidean distance of z_box on a disc or cone
       from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
       ‖Aᵀy + Gᵀz + z_box‖∞.
@@ -356,7 +356,9 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
     lower, upper = hull(qp.sets, qp.q.size)
-    room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # along the descent
+    room = np.where(
+        t.residual > 0, s.x - lower, upper - s.x
+    )  # distance to the bound in the direction of descent
     signed = (s.z >= 0).all()  # False if z contains NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
@@ -664,7 +666,9 @@ def _largest(*values: float) -> float:
 
 
 def _ratio(error: Vector, scale: Vector | float) -> float:
-    if isinstance(scale, float) and 0 < scale < np.inf:  # rounded division is monotonic
+    if (
+        isinstance(scale, float) and 0 < scale < np.inf
+    ):  # the largest error has the largest ratio, since rounded division is monotonic
         return float(np.abs(error).max(initial=0.0) / scale)
     return float(scales.excesses(error, 0.0, scale, dtype=float).max(initial=0.0))
 
@@ -675,7 +679,7 @@ def _excess(
     scale: Vector | float,
     most_rounding: float = NEGLIGIBLE,
 ) -> float:
-    """Subtract rounding from errors; return the largest ratio to their scales.
+    """Subtract rounding from errors, and return the largest ratio of error to scale.
 
     size : sum of the absolute terms of the error
     most_rounding : largest fraction of the scale that is subtracted as rounding

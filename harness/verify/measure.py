@@ -33,7 +33,7 @@ SAMPLE_SECONDS = 0.005  #: approximate total time of all repetitions (s); see `m
 MAX_INNER_LOOPS = 100  #: largest number of repetitions of a short solve
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
-#: programs that store numbers as doubles do not represent all larger integers
+#: largest count that is stored, since doubles do not represent all larger integers
 MAX_COUNT = 2**53
 MAX_MESSAGE = 1900  #: largest length of a message of a solver, in characters
 _MAX_NAME = 60  #: largest length of a file name in a message, in characters
@@ -44,9 +44,10 @@ _VECTORS = ("x", "y", "z", "z_box")
 class Timed(NamedTuple):
     """A solution, and the cost of computing it."""
 
-    solution: Solution  #: its vectors are floats of the right shapes
+    solution: Solution  #: solution, whose vectors are float arrays of the right shapes
     cost: Measurement  #: times and memory
-    first_seconds: float | None = None  #: time of the first solve, if it was repeated
+    #: time of the first solve in s; None if the solve was not repeated
+    first_seconds: float | None = None
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
@@ -77,8 +78,8 @@ def measure(
         answer is the answer of the first solve. The times are means over the
         repetitions, because the first solve runs with cold caches. Every repetition
         receives a QP of new objects, so that the solver cannot recognise the QP by
-        identity starts, ends : called just before the clock starts and just after it
-        stops
+        identity
+    starts, ends : called just before the clock starts and just after the clock stops
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
@@ -233,7 +234,7 @@ def _fresh_copy(qp: QP) -> QP:
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
     """Copy a dataclass, and apply `other` to each attribute of the copy."""
-    new = copy(whole)  # skip __init__: its checks may take longer than a solve
+    new = copy(whole)  # skip __init__, whose checks may take longer than a solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
@@ -262,7 +263,9 @@ def memory_mib(key: str, process: int | str = "self") -> float | None:
 def reset_peak() -> bool:
     """Reset VmHWM to the resident memory; return False on failure."""
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # proc(5)
+        Path("/proc/self/clear_refs").write_text(
+            "5"
+        )  # the code 5 resets VmHWM, see proc(5)
     except OSError:
         return False
     return True
@@ -283,8 +286,8 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, are those of the
-    innermost call in the file that defines the class of the solver. They are omitted if
+    File name and line number, as in ``KeyError: 'rho' (mine.py:24)``, refer to the
+    innermost call in the file that defines the class of the solver. Both are omitted if
     the traceback does not contain this file.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")

@@ -71,7 +71,7 @@ class _Scales(NamedTuple):
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
 
-@np.errstate(all="ignore")  # a point may contain 1e300
+@np.errstate(all="ignore")  # entries of a point may be as large as 1e300
 def with_multipliers(
     qp: QP,
     x: Vector,
@@ -79,13 +79,12 @@ def with_multipliers(
     z: Vector | None = None,
     z_box: Vector | None = None,
 ) -> Solution:
-    """Return a solution in which multipliers that are None are replaced by the best.
+    """Return a solution; multipliers that are None are fitted to the KKT conditions.
 
     Raises
     ------
     InputError
         If the least-squares problem would have more than `MAX_ENTRIES` entries.
-
     """
     given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
     unknown = {name for name, (v, like) in given.items() if v is None and like.size}
@@ -140,9 +139,9 @@ class _Linearisation:
     sets: Sequence[ConvexSet]
     #: (n,) mask of the variables of the sets; all False if z_box is prescribed
     block: NDArray[np.bool_]
-    x: Vector  #: (n,)
+    x: Vector  #: (n,) point x
     tau: float  #: step τ of the natural map
-    force: Vector | None = None  #: (n,); None: sets balance any force
+    force: Vector | None = None  #: (n,) force f; None if the sets balance any force
     #: True for damped steps, which apply the derivative also to the residual. Damped
     #: steps converge more slowly than Newton's method, but from more distant points
     is_careful: bool = True
@@ -198,7 +197,7 @@ def _fitted(
     unknown: set[str],
     linearised: _Linearisation,
 ) -> Solution:
-    """Minimise both sums over the unknown multipliers; the others are those of `s`.
+    """Minimise both sums over the unknown multipliers, with all others as in `s`.
 
     g : (n,) Px + q + Aᵀy + Gᵀz + z_box with the multipliers of `s`
     """
@@ -235,7 +234,7 @@ def _fitted(
             z[rows] = pull[: rows.size]
     r = g + qp.A.T @ (y - s.y) + qp.G.T @ (z - s.z)
     z_box = s.z_box
-    if "z_box" in unknown:  # each component separately
+    if "z_box" in unknown:  # fit each component separately
         balanced = _share(np.maximum(r, 0), lower, scales)
         z_box = _share(np.maximum(-r, 0), upper, scales) - balanced
         z_box[is_fixed] = -r[is_fixed]
@@ -251,7 +250,8 @@ def _least_squares(
     y is eliminated with an orthonormal basis of the range of w·free. Linearly dependent
     columns of `free` receive the multiplier zero.
     """
-    from scipy.optimize import nnls  # loads slowly; workers do not need it
+    # imported here, since scipy.optimize loads slowly and workers do not need it
+    from scipy.optimize import nnls
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)
@@ -274,8 +274,8 @@ def _least_squares(
             zeta, _ = nnls(stacked, rhs, maxiter=100 * slack.size + 100)
         except RuntimeError:
             raise InputError(
-                "multipliers: the least-squares iteration did not end; expected y, z "
-                "and z_box beside x"
+                "multipliers: the least-squares iteration did not converge; expected "
+                "y, z and z_box in addition to x"
             ) from None
     y = np.zeros(free.shape[1])
     y[pivots[:rank]] = solve_triangular(R, Q.T @ (target - C @ zeta))

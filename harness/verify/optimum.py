@@ -79,11 +79,11 @@ MAX_RESIDUAL = 1e-14
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Optimum:
-    """Optimal value of a QP, and the scales of errors relative to it."""
+    """Optimal value of a QP, and the scales by which errors are divided."""
 
-    qp: QP  #: the QP that was solved, with P as a matrix
+    qp: QP  #: QP that was solved, in which P is a matrix
     value: float  #: f*
-    #: bound of the error of f*, plus the rounding of f at an exact solution
+    #: bound on the error of f*, plus the rounding of f at an exact solution
     doubt: float
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
@@ -143,7 +143,7 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Return a mask (n,) of variables that P, a row or a set couples to others."""
+    """Return a mask (n,) of variables that are coupled by P, rows or sets."""
     is_coupled = np.zeros(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         is_coupled[one.block] = True
@@ -213,12 +213,14 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
         # an error of 100·tol times this scale is half of the error that `kkt_residuals`
         # allows
         scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
-    elif work > NEGLIGIBLE * least:  # f* vanishes
+    elif work > NEGLIGIBLE * least:  # f* is zero up to rounding
         scale = magnitude = work
-    else:  # x* vanishes
+    else:  # x* is zero up to rounding
         scale = magnitude = generous
     rounding = min(ROUNDING * size, NEGLIGIBLE * magnitude)
-    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # 0 if all terms vanish
+    if not (
+        scale > 0 and doubt <= NEGLIGIBLE * scale
+    ):  # the scale is 0 if all terms vanish
         return None
     return Optimum(
         qp=qp,
@@ -247,10 +249,10 @@ def _reference_point(qp: QP, solve: Reference) -> Solution | None:
 
 
 class ExactOptimum(NamedTuple):
-    """An optimum without rounding."""
+    """Optimum computed in rational arithmetic."""
 
     value: Fraction  #: f*
-    solution: Solution  #: rounded to double precision
+    solution: Solution  #: solution, rounded to double precision
 
 
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
@@ -307,10 +309,10 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
 class _ExactPoint(NamedTuple):
     """A primal-dual point in fractions."""
 
-    x: Any  #: (n,)
-    y: Any  #: (m,)
-    z: Any  #: (p,)
-    z_box: Any  #: (n,)
+    x: Any  #: (n,) primal variables
+    y: Any  #: (m,) multipliers of equality rows
+    z: Any  #: (p,) multipliers of inequality rows
+    z_box: Any  #: (n,) multipliers of bounds
 
 
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
@@ -418,7 +420,8 @@ def proves(solve: Reference) -> Proves:
     optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
-        if id(qp) not in optima:  # storing the QP keeps its id unique
+        # the cache also stores the QP, so that its id is not reused
+        if id(qp) not in optima:
             optima[id(qp)] = qp, proven_optimum(qp, solve)
         return optima[id(qp)][1]
 
@@ -434,7 +437,7 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
     Equality rows, fixed variables, and rows and bounds with a nonzero multiplier in `s`
     receive multipliers λᵢ. These minimise Σ(λᵢtᵢ)², where tᵢ is the sum of the absolute
-    terms of row i. A row whose multiplier would change its sign is left out. `s` is
+    terms of row i. A row is omitted if its multiplier would change sign. `s` is
     returned unchanged if the remaining rows do not balance the gradient up to a
     negligible part, or if the QP has sets other than bounds.
     """

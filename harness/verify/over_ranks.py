@@ -2,9 +2,9 @@
 
 The method is described in `harness.verify.substructured`; MPI reductions complete the
 sums. Each rank stores the components of its subdomains. A component that several ranks
-store has the same value on all of them. The contact and friction rows and the coarse
-problem are replicated on all ranks. The number of these rows is similar to the number
-of nodes of the contact sides.
+store has the same value on all these ranks. The contact and friction rows and the
+coarse problem are replicated on all ranks. The number of these rows is similar to the
+number of nodes of the contact sides.
 
 If only contact supports a body, its rigid motions are the few columns of a distributed
 matrix R, and products with Rᵀ are reductions in extended precision. The equilibrium of
@@ -69,7 +69,7 @@ from mortarbench.harness.verify.substructured import (
 class Contact:
     """Contact rows, then friction rows with a positive bound; replicated on ranks."""
 
-    rows: csr_array  #: (m, n) rows, with global components as columns
+    rows: csr_array  #: (m, n) rows; the columns are the global components
     c: Vector  #: (m,) right-hand sides
     bound: Vector  #: (k,) friction bounds of the last k rows
     tangents: int = 1  #: number of friction rows of each tangential vector
@@ -94,7 +94,7 @@ class LocalBodies:
     """Subdomains of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    #: local subdomains; their T has a column for each local component
+    #: local subdomains; the matrix T has a column for each local component
     parts: Substructures
     components: NDArray[np.int64]  #: (n,) global numbers of components, ascending
     shared: NDArray[np.bool_]  #: (n,) mask of components that are also on other ranks
@@ -179,7 +179,7 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of components `at` (w,), and a mask of local ones."""
+        """Return local positions of `at` (w,), and a mask of the local components."""
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at
@@ -219,7 +219,7 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which obtain the same bound.
 
-    The pairs are those of `harness.verify.certificate.certify`, except the pair that
+    The pairs of `harness.verify.certificate.certify` are tried, except the pair that
     results from an exchange of closed rows.
 
     Parameters
@@ -235,7 +235,6 @@ def certify_over_ranks(
     ------
     UncertifiableError
         If the answer contains NaN or inf, or no admissible pair is found near it.
-
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:
@@ -350,7 +349,7 @@ class _RigidMotions:
     """
 
     #: (n, r) sparse, at local components. The first p motions change gaps
-    #: ("constrained"); the others ("free") change gaps by rounding only
+    #: ("constrained"); the other ("free") motions change gaps only by rounding
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in subdomain motions
@@ -377,7 +376,7 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions into those that change gaps, and free ones.
+    """Split the rigid motions into motions that change gaps and free motions.
 
     at : (w,) global components in the rows
     """

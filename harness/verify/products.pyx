@@ -17,7 +17,7 @@ ctypedef fused real:
     long double
 
 cdef enum:
-    MODES = 6  # rigid motions of a body in space
+    MODES = 6  # rigid motions of a body in 3D
 
 
 def times_columns(

@@ -47,7 +47,7 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 
 
 def nonnegative_solution(M: Any, b: Any) -> Any | None:
-    """Return w ≥ 0 with Mw = b from the simplex method, or None if none exists.
+    """Return w ≥ 0 with Mw = b by the simplex method, or None if no such w exists.
 
     Phase one of the method minimises the sum of one artificial variable per row.
     Bland's rule (1977) selects the first column with a negative cost and, among the

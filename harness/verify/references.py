@@ -1,12 +1,12 @@
 """Reference solutions of contact problems, with certified error bounds.
 
 An injected reference solver, which is not under test, solves the dual QP of the contact
-and friction rows. Its solution identifies the closed rows, which hold with equality:
-contacts that touch and friction that sticks. `harness.verify.active_set_refinement`
-then computes the solution in extended precision, and `harness.verify.certificate`
-bounds its error. The cache contains only the states of the rows and the multipliers,
-which determine the directions of slip. A later run uses the cached data as an initial
-guess.
+and friction rows. The solution of this QP identifies the closed rows, which hold with
+equality: contacts that touch and friction that sticks.
+`harness.verify.active_set_refinement` then computes the solution in extended precision,
+and `harness.verify.certificate` bounds the error of this solution. The cache contains
+only the states of the rows and the multipliers, which determine the directions of slip.
+A later run uses the cached data as an initial guess.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-MAX_CACHED_BOUND = 1e-7  #: cached states that yield a larger bound are discarded
+#: largest error bound of a cached result; a result with a larger bound is discarded
+MAX_CACHED_BOUND = 1e-7
 #: Names and types of the cached arrays.
 STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}
 
@@ -47,14 +48,14 @@ class UnsolvedError(Exception):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReferencePoint:
-    """A solution of the elastic problem, and a certified bound of its error."""
+    """A solution of the elastic problem, and a certified bound on its error."""
 
     u: Extended  #: (n,) admissible displacement
     multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
     equilibrium: Extended  #: u_λ (n,), in equilibrium with the multipliers
     states: States  #: (m,) states of the rows: closed, or multiplier at a bound
     norm: float  #: ‖u‖_K
-    bound: float  #: certified bound of the relative error; see `Certificate.bound`
+    bound: float  #: certified bound on the relative error; see `Certificate.bound`
 
     @property
     def active(self) -> NDArray[np.bool_]:

@@ -7,11 +7,12 @@
 
 enum {
     /* Largest ratio of the scale of energy to the objective: at tol 1e-8, 10·tol times the
-       scale is then at most 1e-3 of the objective, which is three digits. Without it,
-       `test_a_cancelling_objective_is_accurate_relative_to_its_terms` fails. */
+       scale is then at most 1e-3 of the objective, which is three digits. Without this
+       limit, `test_a_cancelling_objective_is_accurate_relative_to_its_terms` fails. */
     MAX_CANCELLATION = 10000,
-    /* Violations and errors of the objective are divided by this factor times their terms:
-       since residuals of up to 10·tol are accepted, so are errors of 100·tol of the terms.
+    /* Violations and errors of the objective are divided by this factor times their terms.
+       As residuals of up to 10·tol are accepted, errors of up to 100·tol times the terms
+       are accepted as well.
        With 100, `test_a_narrow_box_does_not_increase_the_scale_of_a_row` fails. */
     TERMS_FACTOR = 10,
     /* Largest size of a variable, in units of the length over which the energy changes

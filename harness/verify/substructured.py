@@ -25,7 +25,7 @@ the diagonal matrix W of the stiffnesses of all copies,
 where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all other
 components. The range of Z contains the gluing and support forces. Then K_T d = b is a
 small Neumann problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three
-rows per plane subdomain. The matrix is singular along motions of whole bodies that only
+rows per subdomain in 2D. The matrix is singular along motions of whole bodies that only
 contact resists; λ̂ balances the load along these motions
 (`harness.verify.admissible.balanced`). The multipliers of gluing and supports in an
 answer are not used.
@@ -58,10 +58,10 @@ from mortarbench.harness.verify.products import times_columns
 #: estimated at û. The relative difference is largest for displacements of low energy,
 #: such as û.
 SAFETY = 16
-#: Amplitude of the rounding errors of random sign that `sample` simulates in Ku, per
-#: row in units of eps times the root of the sum of its squared terms. The measured
-#: standard deviation is 0.4 to 0.5 for sums in extended precision, and 0.2 to 3.6 for
-#: the difference between the stored Ku and TᵀK_T Tu.
+#: Amplitude of the rounding errors of random sign that `sample` simulates in Ku, in
+#: each row, in units of eps times the root of the sum of the squared terms of the row.
+#: The measured standard deviation is 0.4 to 0.5 for sums in extended precision, and 0.2
+#: to 3.6 for the difference between the stored Ku and TᵀK_T Tu.
 RANDOM_ULPS = 4.0
 #: Amplitude of the simulated errors with the sign of u, in the same units. Random signs
 #: alone may fail to excite the few soft modes of a slender body. With 0.25, the error
@@ -100,7 +100,7 @@ class Split(Protocol):
         """Return the sums Tᵀb (n,) over the copies of each component."""
 
     def averaged(self, v: Extended) -> Extended:
-        """Average the copies v (N,) of components (n,), after `Sharing.matched`."""
+        """Return the averages (n,) of the copies v (N,), after `Sharing.matched`."""
 
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
@@ -143,7 +143,7 @@ class Rounding(NamedTuple):
     """Effect of E along h rigid motions R."""
 
     strain: Vector  #: (h,) dual norms of the columns of ER
-    curvature: NDArray[np.float64]  #: (h, h) upper bounds of |RᵀER|
+    curvature: NDArray[np.float64]  #: (h, h) upper bounds on |RᵀER|
 
     def work(self, size: float, gamma: Vector, theta: float) -> float:
         """Bound |eᵀEe| for e = e' + Rγ by ‖e'‖, |γ| (h,) and |e'ᵀEe'| ≤ θ‖e'‖²."""
@@ -151,7 +151,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) from the arguments of `work`; ‖e'‖ is the norm in K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
@@ -160,7 +160,7 @@ class Neighbour(NamedTuple):
 
     d: Extended  #: (N,) computed approximation
     Kd: Extended  #: (N,) K_T d
-    left: float  #: bound of the energy norm of the error of d
+    left: float  #: bound on the energy norm of the error of d
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
@@ -173,9 +173,10 @@ def without_rigid_motion(split: Split, v: Extended) -> Extended:
 def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
-    The last correction is not added; it bounds the error instead. If the norm of each
-    correction is at most q times that of the previous one, the norms of the omitted
-    corrections sum to at most size/(1 − q), where `size` is the norm of the last one.
+    The last correction is not added to d, but is used to bound the error. If the norm
+    of each correction is at most q times the norm of the previous correction, the norms
+    of the omitted corrections sum to at most size/(1 − q), where `size` is the norm of
+    the last correction.
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
@@ -297,7 +298,7 @@ class Undivided(_Stored):
     """Undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ."""
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f; θ = 0, since K_T has the norm of K."""
+        """Return Ku − f; θ = 0, since K_T and K define the same norm."""
         Ku, _, deformed = self.stored(u)
         rho = self.free(Ku + self.mechanics.primal.q)
         return Residual(rho, deformed, self.product(deformed), 0.0)
@@ -333,7 +334,7 @@ class Undivided(_Stored):
         return self.free(sample(variances, deformed, np.arange(u.size), Real))
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Return bounds of ER, which is KR up to the projection P."""
+        """Return bounds on ER, which is KR up to the projection P."""
         motions = self.mechanics.motions
         along = np.abs(
             supported.T @ np.asarray(motions.constrained.T @ motions.KR) @ supported

@@ -101,8 +101,9 @@ def judged(
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
     prove : returns the proven optimum of `qp`; called if residuals do not decide the
-        verdict values : residuals and objective as evaluated by ranks; None to evaluate
-        them here
+        verdict
+    values : residuals and objective that ranks have evaluated; None to evaluate them in
+        this function
     """
     record = record.replace(
         sizes=qp.sizes,
@@ -168,7 +169,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
 
     ``energy_bound`` bounds the errors of the answer and of the displacements û and u_λ
     that prove the bound (`harness.verify.certificate`). ``certificate`` contains the
-    components of the bound, relative to a lower bound of ‖u*‖: `pair` = √(2(J − D)),
+    components of the bound, relative to a lower bound on ‖u*‖: `pair` = √(2(J − D)),
     `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer
     alone), `moved` = ‖u − û‖, and `friction`, the frictional part of `work`. `seminorm`
     is 1 if bodies can move rigidly; the errors of these motions are not bounded.
@@ -260,7 +261,8 @@ def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | 
     return {"objective": float(objective), **residuals._asdict()}
 
 
-LATE_IMPORT = "scipy.optimize"  #: slow import, needed by `certify` for some bodies
+#: module that loads slowly, needed by `certify` for some bodies
+LATE_IMPORT = "scipy.optimize"
 
 
 def _certified(

@@ -517,7 +517,7 @@ def _chain(where: str, edges: Nodes) -> Nodes:
     while chain and chain[-1] in following:
         chain.append(following.pop(chain[-1]))
     if len(chain) != len(edges) + 1:
-        fault = "is disconnected or has branches" if starts.size else "closes on itself"
+        fault = "is disconnected or has branches" if starts.size else "is closed"
         raise InputError(f"{where} {fault}; expected one open chain of edges")
     return np.array(chain, dtype=np.int64)
 

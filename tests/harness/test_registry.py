@@ -212,7 +212,7 @@ FAMILY = (
         (
             "from types import SimpleNamespace as S\n"
             "PROBLEMS = {'a': S(name='b', defaults={}, forms=(), build=None)}",
-            "PROBLEMS['a'] is named 'b'; expected the same name twice",
+            "PROBLEMS['a'] is named 'b'; expected equal names",
         ),
         (FAMILY.format("['n']", "('a',)"), "PROBLEMS['a']: defaults = ['n']; expected"),
         (
@@ -311,7 +311,7 @@ def test_entry_points_for_others_are_not_loaded(install):
 
 def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
     assert merged("solver", {"a": 1}, {"b": 2}) == {"a": 1, "b": 2}
-    with pytest.raises(InputError, match="solver 'a' of the plug-in exists"):
+    with pytest.raises(InputError, match="solver 'a' of the plug-in already exists"):
         merged("solver", {"a": 1}, {"a": 2})
 
 

@@ -455,7 +455,7 @@ WRONG = {
     ),
     "malformed case": (
         ("export", "well/n/primal", "a.npz"),
-        "well: malformed part 'n'; expected key=value",
+        "well: malformed component 'n'; expected key=value",
     ),
     "no form": (("export", "well/n=2", "a.npz"), "expected one of primal, dual"),
     "tolerance": ((*SOLVE, "--tol", "2"), "--tol = 2.0; expected a number between 0"),
@@ -524,7 +524,7 @@ WRONG = {
     ),
     "plug-in takes a name": (
         (*SOLVE, "--plugin", "taken.py"),
-        "taken.py: solver 'exact' of the plug-in exists; rename the new one",
+        "taken.py: solver 'exact' of the plug-in already exists; rename the new one",
     ),
     "missing suite": (
         ("run", "gone.toml"),

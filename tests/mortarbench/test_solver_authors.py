@@ -123,8 +123,8 @@ def test_the_error_for_versions_without_labels_mentions_labels(cli, versions):
 
     assert code == 2
     assert err == (
-        "mortarbench: new/mine.py: solver 'mine' of the plug-in exists; rename the new "
-        "one, or tell its plug-in apart by --plugin LABEL=FILE.py\n"
+        "mortarbench: new/mine.py: solver 'mine' of the plug-in already exists; rename "
+        "the new one, or tell its plug-in apart by --plugin LABEL=FILE.py\n"
     )
 
 

@@ -190,7 +190,7 @@ def test_the_answer_to_the_step_before_is_refuted_and_recognised(truths, tmp_pat
     assert (wrong["solver"], wrong["case"]) == ("stale", f"{BEAM}/dual-bounds")
     assert wrong["error"] > 0.1
     assert any("equals its answer to" in r for r in wrong["reasons"])
-    assert f"its contact forces are those of {BEAM}/step=1" in wrong["reasons"]
+    assert f"its contact forces equal those of {BEAM}/step=1" in wrong["reasons"]
 
 
 def test_correct_forces_are_not_attributed_to_another_problem(truths, tmp_path, cli):

@@ -125,5 +125,5 @@ def test_an_operator_too_large_as_a_matrix_is_written_as_one_only(
     qp = operator_of(np.ones(400))  # 1.2 MiB
 
     save_qp(tmp_path / "qp.npz", qp, serialised=True)
-    with pytest.raises(InputError, match="P, an operator, as a dense matrix of 400"):
+    with pytest.raises(InputError, match="the operator P as a dense matrix of 400"):
         save_qp(tmp_path / "qp.npz", qp)

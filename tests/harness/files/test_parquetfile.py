@@ -115,7 +115,10 @@ def columns(**changes):
     ("changes", "message"),
     [
         ({"P": [1.0, 2.0], "q": [1.0, 1.0]}, r"QP.P has shape \(1, 2\), expected \(2,"),
-        ({"P": [1.0] * 3, "q": [1.0, 1.0]}, "P has 3 entries; expected rows of 2"),
+        (
+            {"P": [1.0] * 3, "q": [1.0, 1.0]},
+            "P has 3 entries; expected rows of 2 entries",
+        ),
         ({"P": [np.nan]}, "P contains NaN or inf"),
         ({"P": ["one"]}, "P is not a list of numbers"),
         ({"q": None}, "P or q is null"),

@@ -173,7 +173,10 @@ def test_a_sparse_matrix_may_be_passed_as_its_arrays(tmp_path):
         ({"h": None}, "h is missing, but G is present"),
         ({"A": None}, "A is missing, but b is present"),
         ({"Aeq": np.eye(2)}, "unknown array 'Aeq'; known: A, G, P, b, h, lb, q, ub"),
-        ({"P": None, "P_data": np.ones(1)}, "P_indices, P_indptr, P_shape missing be"),
+        (
+            {"P": None, "P_data": np.ones(1)},
+            "P_indices, P_indptr, P_shape missing, but",
+        ),
         ({"P": np.eye(3)}, "P has shape (3, 3); expected (2, 2)"),
         ({"P": np.ones(4)}, "P has shape (4,); expected two dimensions"),
         ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),

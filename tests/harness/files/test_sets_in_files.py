@@ -111,8 +111,16 @@ def test_other_readers_of_parquet_find_the_sets_as_columns(tmp_path):
         ("disc4_index", [5], "disc4_index belongs to no set; expected disc_index"),
         ("disc1_index", [5], "disc1_index belongs to no set; expected disc_index"),
         ("disc_slope", [5], "disc_slope belongs to no set; expected disc_index"),
-        ("disc2_radius", [-1.0], r"Discs: radius\[0\] = -1.0; expected finite numbers"),
-        ("cone_slope", [np.nan], r"Cones: slope\[0\] = nan; expected finite numbers"),
+        (
+            "disc2_radius",
+            [-1.0],
+            r"Discs: radius\[0\] = -1.0; expected finite nonnegative",
+        ),
+        (
+            "cone_slope",
+            [np.nan],
+            r"Cones: slope\[0\] = nan; expected finite nonnegative",
+        ),
         ("disc_radius", [1.0, 2.0], r"Discs: radius has shape \(2,\); expected \(1,\)"),
         ("cone_index", [[0, 8]], "Cones: index 8 is out of range; expected 0 … 7"),
         (

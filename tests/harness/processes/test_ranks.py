@@ -373,7 +373,7 @@ def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
-        ("ranks = [1]\ncopies = true", "copies = true: copies are compared with ranks"),
+        ("ranks = [1]\ncopies = true", "copies = true needs a number of ranks above 1"),
         ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )

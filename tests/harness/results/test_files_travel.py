@@ -321,7 +321,7 @@ def test_a_list_that_no_run_wrote_is_refused_in_one_line(here, cli, text):
     code, _, said = cli("run", "run/suite.toml", "--out", "run")
 
     assert code == 2
-    assert "copies.json: not a list of copied files as a run writes it" in said
+    assert "copies.json: malformed list of copied files" in said
 
 
 def test_fresh_deletes_copies_and_nothing_else_in_their_folder(measured, here, copy):

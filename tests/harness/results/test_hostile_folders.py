@@ -144,7 +144,7 @@ def test_stored_fields_with_another_content_are_refused(tmp_path):
     changed = {**FIELDS, "displacement": np.ones((4, 2))}
     np.savez(tmp_path / "vectors" / f"{digest}.npz", **changed)
 
-    with pytest.raises(InputError, match="content is not what was stored"):
+    with pytest.raises(InputError, match="content does not match its digest"):
         load_fields(tmp_path, digest)
 
 

@@ -93,7 +93,7 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
         ("max_iter=", "--option 'max_iter='; expected KEY=VALUE"),
         ("max_iter=5,", "--option 'max_iter=5,'; expected KEY=VALUE"),
         ("=5", "--option '=5'; expected KEY=VALUE"),
-        ("max_iter=5,6", "--option: max_iter has 2 values; expected one, only `run`"),
+        ("max_iter=5,6", "--option: max_iter has 2 values; expected one value"),
     ],
 )
 def test_unknown_options_and_values_are_refused(text, message):

@@ -221,7 +221,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ),
         (
             MINIMAL + "zip = [['n', 'm']]\nparams = { n = [2, 3], m = [2, 3, 4] }",
-            "problems[0]: zip: n has 2, m has 3 values; expected equally many",
+            "problems[0]: zip: n has 2, m has 3 values; expected lists of equal length",
         ),
         (
             HEAD + "[[problems]]\nfamily = 'wall'",
@@ -485,7 +485,8 @@ def test_a_pattern_without_files_is_refused(tmp_path, monkeypatch):
         patterned(tmp_path, '["set/a.qps", "set/*.npz"]')
     assert str(e.value) == (
         f"{tmp_path}/s.toml: problems[0]: params.path = 'set/*.npz' matches no file; "
-        "expected a pattern of files, from here or from the folder of the suite"
+        "expected a pattern relative to the working directory or to the folder of "
+        "the suite"
     )
 
 
@@ -622,7 +623,7 @@ def test_a_growing_series_provides_the_next_smaller_and_a_warm_up_case(load):
         ("growing = 'm'\nparams = { n = [1, 2] }", "growing = 'm' is not a list"),
         (
             "growing = 'n'\nsequence = 'n'\nparams = { n = [1, 2] }",
-            "sequence and growing: expected one of the two",
+            "sequence and growing are both set; expected only one of them",
         ),
     ],
 )

@@ -795,10 +795,10 @@ def test_other_files_are_refused(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("bodies", "bodies: no file; expected bodies:PATH.toml"),
+        ("bodies", "bodies: the path is missing; expected bodies:PATH.toml"),
         (
             "bodies:a.msh/dual",
-            "bodies:a.msh/dual: no file; expected bodies:PATH.toml/…/",
+            "bodies:a.msh/dual: the path is missing; expected bodies:PATH.toml/…/",
         ),
         (
             "bodies:no/a.toml/dual",

@@ -505,7 +505,7 @@ def test_the_content_is_part_of_the_case(written):
 
 @pytest.mark.parametrize("text", ["file", "file:", "file/a.npz"])
 def test_the_error_for_a_missing_path_states_the_syntax(text):
-    with pytest.raises(InputError, match="no file; expected file:PATH"):
+    with pytest.raises(InputError, match="the path is missing; expected file:PATH"):
         parse(text, PROBLEMS)
 
 
