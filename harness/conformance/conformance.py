@@ -382,19 +382,16 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
         yield f"{SETS_PREFIX} {shape}", partial(_solves_over_sets, shape)
     yield DEGENERATE, _solves_the_degenerate_cone
     yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
-    yield "returns multipliers in the convention of QP", _multipliers_have_our_signs
-    yield (
-        "returns zero multipliers for absent bounds",
-        _absent_bounds_have_no_multipliers,
-    )
-    yield "starts every repeat cold and repeats its answer", _repeats_are_cold_and_alike
+    yield "gives multipliers our signs", _multipliers_have_our_signs
+    yield "puts none on absent bounds", _absent_bounds_have_no_multipliers
+    yield "starts every repeat cold, same answer", _repeats_are_cold_and_alike
     for dense in (False, True):
-        name = f"does not modify the QP: {'dense' if dense else 'sparse'}"
+        name = f"leaves the problem alone: {'dense' if dense else 'sparse'}"
         yield name, partial(_the_problem_is_left_alone, dense)
     yield "refuses a misspelt option", _a_misspelt_option_is_refused
     yield "claims no success: infeasible", partial(_claims_no_success, infeasible)
     yield "claims no success: unbounded", partial(_claims_no_success, unbounded)
-    yield "accepts or declines an operator", _an_operator_is_taken_or_declined
+    yield "takes or declines an operator", _an_operator_is_taken_or_declined
     yield "computes in one thread", _runs_in_one_thread
     yield "solves a sequence", _a_sequence_is_solved
     for form in FORMS:

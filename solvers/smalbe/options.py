@@ -54,9 +54,9 @@ class Options:
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at the end of an inner run
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # if P is sparse, conjugation against stored directions costs more than a product
-    #: store the CG directions of a face and make new ones conjugate to them, unless P
-    #: is sparse
-    recycle: bool = True
+    recycle: bool = (
+        True  #: make the CG directions of a face conjugate unless P is sparse
+    )
     reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖

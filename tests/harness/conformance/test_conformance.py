@@ -377,17 +377,17 @@ def test_a_sound_solver_fails_no_check(check):
     [
         (StopsEarly, "finds the planted solution: everything, sparse"),
         (StopsEarly, "reaches the tolerance 1e-06: box"),
-        (FlipsSigns, "returns multipliers in the convention of QP"),
-        (HoldsAbsentBounds, "returns zero multipliers for absent bounds"),
-        (Remembers, "starts every repeat cold and repeats its answer"),
-        (Wanders, "starts every repeat cold and repeats its answer"),
-        (Scales, "does not modify the QP: sparse"),
-        (Scales, "does not modify the QP: dense"),
+        (FlipsSigns, "gives multipliers our signs"),
+        (HoldsAbsentBounds, "puts none on absent bounds"),
+        (Remembers, "starts every repeat cold, same answer"),
+        (Wanders, "starts every repeat cold, same answer"),
+        (Scales, "leaves the problem alone: sparse"),
+        (Scales, "leaves the problem alone: dense"),
         (TakesAnything, "refuses a misspelt option"),
         (AlwaysSolved, "claims no success: infeasible"),
         (AlwaysSolved, "claims no success: unbounded"),
         (Silent, "claims no success: unbounded"),
-        (TakesOperatorsForZero, "accepts or declines an operator"),
+        (TakesOperatorsForZero, "takes or declines an operator"),
         (StopsAtTheStart, "finds where a membrane of 400 nodes touches"),
         (RepeatsTheFirst, "solves a sequence"),
     ],
@@ -398,14 +398,10 @@ def test_a_check_catches_its_fault(kind, check):
 
 
 def test_rounding_on_absent_bounds_passes_with_a_remark():
-    grade, message, _ = run_check(
-        "returns zero multipliers for absent bounds", LeavesRoundOff()
-    )
+    grade, message, _ = run_check("puts none on absent bounds", LeavesRoundOff())
     assert grade is Grade.PASS
     assert "3.5e-18" in message
-    assert (
-        run_check("returns zero multipliers for absent bounds", Sound()).message == ""
-    )
+    assert run_check("puts none on absent bounds", Sound()).message == ""
 
 
 def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
@@ -417,7 +413,7 @@ def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
 
 def test_a_failure_on_an_operator_names_the_missing_line():
     """If the line quoted in the message is inserted, the check passes."""
-    check = "accepts or declines an operator"
+    check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
     ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)
     scope: dict = {}
@@ -461,7 +457,7 @@ def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
     assert Grade.PASS in grades  # the check of options
-    result = run_check("returns multipliers in the convention of QP", DeclinesAll())
+    result = run_check("gives multipliers our signs", DeclinesAll())
     assert result == (Grade.DECLINE, "never on a Monday", None)
 
 
@@ -545,7 +541,7 @@ def test_solvers_can_be_selected_by_patterns(plugin, capsys, monkeypatch):
 
 
 def test_a_crash_fails_only_the_current_check(plugin, capsys, monkeypatch):
-    few = ("returns multipliers in the convention of QP", "refuses a misspelt option")
+    few = ("gives multipliers our signs", "refuses a misspelt option")
     monkeypatch.setattr(conformance, "CHECKS", few)
     assert command("test-solver", "dies", "--plugin", plugin) == 1
     lines = capsys.readouterr().out.splitlines()
@@ -564,7 +560,7 @@ def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
 def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     few = [
         "finds the planted solution: bounds, sparse", "refuses a misspelt option",
-        "returns multipliers in the convention of QP",
+        "gives multipliers our signs",
     ]  # fmt: skip
     monkeypatch.setattr(conformance, "CHECKS", few)
     wrong = "declines returned False; expected None or a string"
