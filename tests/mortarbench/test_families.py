@@ -10,8 +10,8 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: default cases that take seconds, and whose duals are solved in every run
-LARGE = [("hertz-sphere", "primal")]
+#: default cases that take seconds; test_hertz_sphere.py solves the dual in every run
+LARGE = [("hertz-sphere", "primal"), ("hertz-sphere", "dual")]
 CASES = [
     pytest.param(name, form, marks=[pytest.mark.slow] * ((name, form) in LARGE))
     for name, family in PROBLEMS.items()

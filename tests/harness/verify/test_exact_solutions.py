@@ -187,6 +187,7 @@ def test_no_error_of_ten_thousand_exceeds_its_bound_and_bounds_are_sharp():
     ],
 )
 @pytest.mark.together
+@pytest.mark.slow
 def test_no_error_exceeds_the_bound_of_two_ranks(count, names):
     done = subprocess.run(
         [

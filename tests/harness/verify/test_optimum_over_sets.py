@@ -197,6 +197,7 @@ def test_the_reference_solves_qps_over_balls_to_their_rounding(seed):
     assert s.x == pytest.approx(planted.x, abs=1e-13)
 
 
+@pytest.mark.slow
 def test_a_reference_of_contradicting_rows_and_balls_is_refused():
     balls = Balls(np.array([[0, 1]]), np.ones(1))
     row = np.ones((1, 2))

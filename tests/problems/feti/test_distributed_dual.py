@@ -132,7 +132,8 @@ def test_a_class_on_several_ranks_is_factorised_by_one_rank(found, case):
     assert sorted(of["factorised"]) == sorted(set(of["formed"]))
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
 def test_problems_after_solutions_equal_those_of_one_process(ranks):
     for name, of in emitted(ranks, LATER).items():
         assert of["sizes"][0] == of["sizes"][1]
@@ -151,7 +152,8 @@ def test_every_disc_has_one_owner(found):
     assert of["radii"] < COUPLING_ROUNDING
 
 
-@pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
 def test_the_reference_over_ranks_does_not_cycle(ranks):
     (of,) = emitted(ranks, [CIRCLES]).values()
 

@@ -222,9 +222,7 @@ def test_highs_reads_an_exported_qps(tmp_path):
 def test_values_that_qps_treats_as_infinite_are_not_written(tmp_path):
     qp = replace(awkward(np.random.default_rng(33)), h=np.array([0.0, 1.0, 1e20]))
 
-    with pytest.raises(
-        InputError, match=r"h holds 1e\+20, but QPS treats 1e\+20 or more as infinite"
-    ):
+    with pytest.raises(InputError, match=r"h contains 1e\+20, but QPS treats 1e\+20"):
         save_qps(tmp_path / "a.qps", qp, {})
     assert [*tmp_path.iterdir()] == []
 
