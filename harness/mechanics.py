@@ -44,9 +44,10 @@ MOTION_ROUNDING = 1e-10
 class Inverse(Protocol):
     """A symmetric generalised inverse K⁺ of the stiffness K (n, n).
 
-    K⁺ is zero on prescribed components, and the inverse of K on all other components.
-    If the supports allow rigid motions, which form the columns of R, then K K⁺ b = b
-    for all b with Rᵀb = 0.
+    Rows and columns of K⁺ at prescribed components are zero. On the other components f,
+    K⁺ is the inverse of K_ff if the supports prevent all rigid motions. Otherwise,
+    K K⁺ b = b on f for all b with Rᵀb = 0, where the columns of R are the rigid motions
+    that the supports allow.
     """
 
     @property

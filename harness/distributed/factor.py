@@ -55,7 +55,7 @@ MAX_ARRAY_ROWS = 256
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """The rows of A that this rank touches, and the shared rows of all ranks."""
+    """Rows of A that this rank touches, and all rows that several ranks touch."""
 
     ranks: Ranks
     rows: Rows  #: (k,) numbers of the rows that this rank touches, ascending

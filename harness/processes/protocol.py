@@ -78,7 +78,7 @@ def answer_requests(
                     answer = handle(request, _events(requests, replies))
                     reply = {"event": "done", **answer}
                 sys.stdout.flush()  # the next request truncates the log
-            # raised by code of the harness; handlers catch errors of solvers
+            # fault of the harness: `handle` and `warm_up` catch errors of solvers
             except Exception as e:
                 traceback.print_exc()
                 what = " ".join(f"{type(e).__name__}: {e}".split())

@@ -406,7 +406,9 @@ def proof(
     mechanics = split.mechanics
     feasible = admissible(mechanics, u, closed)
     if feasible is None:
-        raise UncertifiableError("the penetration of the answer could not be removed")
+        raise UncertifiableError(
+            "no displacement without penetration was found near the answer"
+        )
     lam = balanced(mechanics, multipliers, feasible)
     return proven(
         split,

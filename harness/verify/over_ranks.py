@@ -305,7 +305,9 @@ def _admissible_pair(
     at, softness, start = trace
     found = feasible_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
-        raise UncertifiableError("the penetration of the answer could not be removed")
+        raise UncertifiableError(
+            "no displacement without penetration was found near the answer"
+        )
     if rigid.driven:
         raise UncertifiableError(rigid.driven)
     places, here = local.reduction.places(at)

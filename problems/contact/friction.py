@@ -166,8 +166,8 @@ def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
     """
     if iterate > len(problems):
         raise PastEndError(
-            f"iterate={iterate}: the fixed-point iteration of step {step} has "
-            f"{len(problems)} problems; expected at most {len(problems)}, or 0 for the "
+            f"iterate={iterate}: the fixed-point iteration of step {step} has only "
+            f"{len(problems)} iterates; expected at most {len(problems)}, or 0 for the "
             "last"
         )
     return problems[iterate - 1]

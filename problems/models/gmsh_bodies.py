@@ -181,7 +181,11 @@ def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:
-    """Return True if edges of a contact side meet at angles like those of an arc."""
+    """Return True if any two consecutive edges of a contact side form an arc.
+
+    Their directions differ by an angle between `MAX_STRAIGHT_ANGLE` and
+    `MAX_ARC_ANGLE`, as for chords of an arc.
+    """
     p: Any = params
     elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
     for side in (chain for pair in elastic.pairs for chain in pair.sides):

@@ -455,8 +455,9 @@ def shear_quantities(
     The nodal traction is the horizontal friction force divided by ∫N_j dx. Errors are
     relative; the error of the force is relative to the peak of the force.
     `shear_centre` is the traction at x = 0. `stick_half_width` is the half width of the
-    stick zone for which the exact tractions have the same ratio of ∫x²q to ∫x²p. In
-    this ratio, the effects of the finite bodies on the two moments cancel.
+    stick zone for which the ratio of ∫x²q to ∫x²p, with shear traction q and pressure
+    p, is the same for the exact and for the computed tractions. In this ratio, the
+    effects of the finite bodies on the two moments cancel.
     `stick_half_width` is absent for proportional quasi-static steps, where nothing
     slips.
     """

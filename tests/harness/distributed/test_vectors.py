@@ -181,8 +181,8 @@ def test_columns_over_ranks_multiply_as_the_whole_matrix():
     assert on_threads(3, work) == [DistributedVector] * 3
 
 
-def test_components_are_functions_of_slices_and_keep_their_ranks():
-    """The result may also be written to an existing array."""
+def test_elementwise_operations_act_on_local_slices_and_keep_the_ranks():
+    """The argument `out` may be a distributed vector."""
     x = np.arange(6.0)
 
     def work(ranks):

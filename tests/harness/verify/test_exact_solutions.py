@@ -81,8 +81,8 @@ ON_RANKS = (
 DISTURBED = 10_000
 #: factor for the rounding of bounds, which are evaluated in double precision
 ROUNDED = 1 + 1e-9
-#: range of errors for which effectivities are measured; bounds of smaller errors
-#: consist of rounding
+#: range of relative errors for which effectivities (bound / error) are collected;
+#: bounds on smaller errors are dominated by rounding
 SHARP = (1e-7, 0.1)
 
 
