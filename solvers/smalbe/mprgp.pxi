@@ -58,9 +58,9 @@ cdef enum:
     # Newton step on these patches. With 10, Mindlin's problem with 1468 discs takes up
     # to 40 % more products.
     # With n unknowns, the number is √n if this is larger than 100. Mindlin's problem,
-    # ν = 0.3, then takes 61, 154 and 246 products with 1468, 41 684 and 166 740 discs.
-    # With 100 steps in all three cases, it took 61, 217 and 444 products, and five
-    # times the memory.
+    # ν = 0.3, then takes 57, 148 and 344 products with 1468, 41 684 and 166 740 discs.
+    # With 100 steps in all three cases, an earlier version took 61, 217 and 444
+    # products, and five times the memory.
     FIRST_NEWTON = 100
     # Number of bits of the length of a spectral step. A small change of a length leads
     # to another sequence of spectral steps. If lengths are rounded, sums in another

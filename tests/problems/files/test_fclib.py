@@ -149,7 +149,7 @@ def test_iterates_are_counted_from_one(tmp_path):
     again = case_of(tmp_path / "boxes.hdf5", f"iterate={count}", "dual")
     assert again.qp.q == pytest.approx(last.qp.q, abs=1e-12)
     with pytest.raises(
-        InputError, match=f"has {count} problems; expected at most {count}, or 0"
+        InputError, match=f"has only {count} iterates; expected at most {count}, or 0"
     ):
         case_of(tmp_path / "boxes.hdf5", f"iterate={count + 1}", "dual")
 
