@@ -29,8 +29,8 @@ libraries](solvers-libraries.md) from the docstrings in `solvers/`.
 
 Every solver is called with the same `tol`, the relative KKT accuracy of the
 non-dimensional QP. The notes explain how each adapter translates `tol` to the stopping
-test of its solver. Claims of solvers are recorded, but verdicts do not rely on claims
-([comparison policy](fair-play.md)).
+test of its solver. Whether a solver claims success is recorded, but verdicts do not
+depend on this claim ([comparison policy](fair-play.md)).
 
 | your QP | try first |
 | --- | --- |

@@ -79,8 +79,8 @@ class Fclib(FromFile):
             steps = coulomb_steps(contact, p["loop"], reference, p["iterate"])
         if p["iterate"] > len(steps):
             raise PastEndError(
-                f"iterate={p['iterate']}: loop={p['loop']} has {len(steps)} problems; "
-                f"expected at most {len(steps)}, or 0 for the last"
+                f"iterate={p['iterate']}: loop={p['loop']} has only {len(steps)} "
+                f"iterates; expected at most {len(steps)}, or 0 for the last"
             )
         remarks = []
         if (rank := contact.rank) is not None and rank < contact.q.size:
