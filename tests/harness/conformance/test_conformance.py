@@ -547,7 +547,7 @@ def test_a_crash_fails_only_the_current_check(plugin, capsys, monkeypatch):
     lines = capsys.readouterr().out.splitlines()
     (options,) = (line for line in lines if "misspelt option" in line)
     assert options.startswith("pass")
-    (signs,) = (line for line in lines if "the convention of QP" in line)
+    (signs,) = (line for line in lines if "our signs" in line)
     assert signs.startswith("fail")
     assert "SIGSEGV" in signs
 

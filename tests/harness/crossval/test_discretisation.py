@@ -404,7 +404,7 @@ def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path)
     whole = np.hypot(coarse.change, fine.error * fine.levels[0].norm
                      / coarse.levels[0].norm)  # fmt: skip
     assert coarse.error == pytest.approx(whole, rel=0.1)
-    assert "on curved sides" in curved.note
+    assert "refinement of curved sides" in curved.note
     assert "compare answers with lower=" in coulomb.note
     assert curved.kind == coulomb.kind == "unknown"
 

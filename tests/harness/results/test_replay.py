@@ -297,7 +297,7 @@ def test_a_case_with_a_changed_file_uses_the_copy_or_is_refused(
     code, _, err = cli("replay", "done", record.run_id, registries=ours)
     assert (code, err.count("\n")) == (2, 1)
     assert record.run_id in err
-    assert "the file changed" in err
+    assert "the file has changed" in err
 
 
 @pytest.mark.parametrize("shape", ["box", "everything"])

@@ -124,9 +124,9 @@ OUTCOMES = {
     "raises": (
         Verdict.FAILED,
         "failed",
-        "ValueError: first line second line (adversaries.py:127)",
+        "ValueError: first line second line (adversaries.py:133)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:132)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:138)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -151,7 +151,7 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:382)",
+        "ValueError: assignment destination is read-only (adversaries.py:388)",
     ),
     "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),

@@ -115,7 +115,7 @@ def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
         "third", "first", "second", "third",
     ]  # fmt: skip
     with pytest.raises(
-        PastEndError, match="iterate=4: the fixed-point iteration of step 5 has 3"
+        PastEndError, match="iterate=4: the fixed-point iteration of step 5 has only 3"
     ):
         select_iterate(problems, 4, 5)
 
