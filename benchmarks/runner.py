@@ -36,7 +36,8 @@ class Watch:
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
         # estimated time of all solves of each record, in s: mean time × number of
-        # solves. Several inner loops are preceded by one more solve.
+        # solves. Before repeated solves (`inner_loops` > 1), there is one more solve,
+        # which is not part of the mean.
         self.solving = []
         self._fsync, self._fsync_seconds = os.fsync, 0.0
         os.fsync = self._timed_fsync

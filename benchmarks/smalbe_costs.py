@@ -18,8 +18,9 @@
 
 Runs that are compared with each other alternate in one process. Times are processor
 times of this process; set OMP_NUM_THREADS=1, because the times of threads are added.
-The script prints the median of the runs and the median of the fastest tenth, on which
-other programs have less influence.
+The script prints the median of the runs. Except in `incomplete` and `subdomains`, it
+also prints the median of the fastest tenth, on which other programs have less
+influence.
 """
 
 from __future__ import annotations

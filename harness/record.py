@@ -410,7 +410,7 @@ def _check(r: Record) -> None:
     theta = r.mode.removeprefix(TIGHTENING)
     if theta != r.mode and not re.fullmatch(r"0\.[0-9]+|[0-9.]+e-[0-9]+", theta):
         raise ValueError(
-            f"mode = {shown(r.mode)}; expected {TIGHTENING}θ, θ between 0 and 1"
+            f"mode = {shown(r.mode)}; expected '{TIGHTENING}θ' with θ between 0 and 1"
         )
     numbers = [n for n in _not_negative(r) if n]
     if numbers and not 0 < min(numbers) <= max(numbers) <= LARGEST_INTEGER:

@@ -67,7 +67,7 @@ def ranks(registries: Registries, arguments: Sequence[str]) -> int:
 
 
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Run the case worker; called by the command that `Registries.commands` returns.
+    """Run the case worker; called by `case_worker` of `Registries.commands`.
 
     arguments : a JSON object, and the file descriptors for requests and replies
     """

@@ -18,9 +18,10 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-#: folder of scales.h and scales.pxd, which compiled modules of solvers include
+#: folder of scales.h, which compiled modules of solvers include, and of scales.pxd,
+#: which they cimport
 SCALES = ROOT / "harness" / "verify"
-#: folder of sparse.pxd, which compiled modules of problems and solvers include
+#: folder of sparse.pxd, which compiled modules of problems and solvers cimport
 MAPS = ROOT / "harness" / "distributed"
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: for all modules
 #: Further flags by module. Without contraction to fused multiply-adds, results have the

@@ -13,10 +13,10 @@ so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at 
 error ‖u_λ − u*‖ equals the error ‖Bᵀ(λ − λ*)‖ of the contact forces in the dual norm.
 The multipliers need not be unique.
 
-A contact row i with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors within this
-bound change λᵢDᵢ or gapᵢ by at most sᵢ = √(20t Dᵢ)‖u*‖. A reference and an answer with
-different states of row i therefore contradict each other only if max(λᵢDᵢ, gapᵢ) > sᵢ
-for the reference and for the answer.
+A contact row i with the estimated compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors
+within this bound change λᵢDᵢ or gapᵢ by about sᵢ = √(20t Dᵢ)‖u*‖. A reference and an
+answer with different states of row i therefore contradict each other only if
+max(λᵢDᵢ, gapᵢ) > sᵢ for the reference and for the answer.
 """
 
 from __future__ import annotations

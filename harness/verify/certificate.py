@@ -608,7 +608,8 @@ def _reach(
                 (pressed * y).max(initial=0.0),
             )
             bounds[:, k] = np.maximum(bounds[:, k], bound)
-    # combinations equal ±γₖ up to COMBINATION_RESIDUAL times the largest motion
+    # each combination equals ±γₖ up to COMBINATION_RESIDUAL·‖γ‖, and ‖γ‖ is at most the
+    # sum of the bounds on |γₖ|
     return _Reach(*(v + 2 * COMBINATION_RESIDUAL * v.sum() for v in bounds))
 
 

@@ -197,7 +197,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
 
     Columns are scaled by their terms and rows by w. Let X be an approximate right
     inverse of Mᵀ, and α < 1 a bound on ‖I − MᵀX‖∞ that includes rounding. Then MᵀX is
-    regular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δᵢ| ≤ Σⱼ|Xᵢⱼ|·‖c‖∞/(1 − α).
+    nonsingular, δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, and |δᵢ| ≤ Σⱼ|Xᵢⱼ|·‖c‖∞/(1 − α).
 
     M : (k, n) columns of the variables with cⱼ = 0
     c : (n,) Mᵀw

@@ -250,7 +250,8 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
 
     """
     prescribed = bodies.B_D.indices
-    # a factorisation can fail to detect a singular K, which rounding may make regular
+    # a factorisation can fail to detect a singular K, since rounding may make it
+    # nonsingular
     if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
             "the supports allow a rigid motion of some body, so dual-bounds does not "

@@ -82,7 +82,7 @@ def dualise(
     Parameters
     ----------
     primal : QP with P = K and no finite bounds
-    inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
+    inverse : K⁺ with an orthonormal basis R of ker K (no columns if K is nonsingular)
     free : K⁺f (n,); None if not computed yet
     friction : law with a prescribed bound; its rows follow the contact rows
 

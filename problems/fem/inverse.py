@@ -59,7 +59,7 @@ class GeneralisedInverse(Protocol):
 
     @property
     def kernel(self) -> NDArray[np.float64]:
-        """Orthonormal basis R (n, r) of ker K; no columns for a regular K."""
+        """Orthonormal basis R (n, r) of ker K; no columns if K is nonsingular."""
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ to one vector (n,) or to several (n, k)."""

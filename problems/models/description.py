@@ -479,7 +479,8 @@ def _check_faces(
     if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
         raise InputError(
             f"no part of slave {name!r} faces the rigid body; expected a plane whose "
-            "normal points towards the slave, or a centre beyond the facing side"
+            "normal points towards the slave, or a sphere or cylinder whose centre is "
+            "in front of the slave"
         )
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     if gap.min() > extent:

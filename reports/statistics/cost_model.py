@@ -11,8 +11,8 @@ leaves C ≥ 0, but is at least 1. The other terms are communication [2]_: R red
 over all ranks, and M messages with b bytes in total to neighbouring ranks. A reduction
 has the latency α_R, a message has the latency α, and a byte takes β seconds.
 
-W and C are fitted to measured times, s and the latencies are measured, and R, M and b
-are counted, all on the ranks of the run. Superlinear speed-up cannot be fitted even
+W and C are fitted to measured times; s, α_R, α and β are measured; R, M and b are
+counted. All of this is done on the ranks of the run. Superlinear speed-up cannot be fitted even
 with s = 1; it increases the misfit. Beyond the measured ranks, the model is extended as
 follows:
 

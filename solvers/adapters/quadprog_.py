@@ -22,7 +22,8 @@ from mortarbench.solvers.common.conversion import (
     to_cone,
 )
 
-#: smallest ratio of Cholesky pivots (smallest to largest) of a nonsingular Hessian
+#: a Hessian counts as singular if the ratio of its smallest to its largest Cholesky
+#: pivot is below this value
 MIN_PIVOT = 1e-12
 
 

@@ -31,9 +31,9 @@ CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: A claimed solution counts as diverged if ‖x‖∞ exceeds this value: the terms of its
 #: residuals are then so large that every relative residual is small.
 DIVERGED = 1e12
-#: ‖q‖∞ after scaling, for solvers that divide residuals by max(1, size). If the size is
-#: about 1e4, the 1 has no effect. The tests of these solvers are then relative, like
-#: the tests of the harness.
+#: ‖q‖∞ after scaling, for solvers that divide residuals by max(1, size). With sizes of
+#: about 1e4, the 1 has no effect, and the stopping criteria of these solvers are
+#: relative, like the residuals of the harness.
 OBJECTIVE_SIZE = 1e4
 
 

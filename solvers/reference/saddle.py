@@ -1,6 +1,6 @@
 """Saddle-point systems [P + D Bᵀ; B −W] with diagonal D, W > 0, solved by LU factors.
 
-If P is positive semidefinite, the matrix is quasidefinite: it is regular and has
+If P is positive semidefinite, the matrix is quasidefinite: it is nonsingular and has
 triangular factors for every symmetric permutation (Vanderbei 1995, SIAM J. Optim. 5).
 A sparse matrix is therefore ordered to reduce fill and factorised without pivoting. If
 D and W are so small that these factors are inaccurate because of rounding, partial

@@ -89,8 +89,9 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     """Eliminate the variables without bounds; return None if this is not possible.
 
     Elimination requires an explicit P with positive definite P_EE, variables with and
-    without bounds, and consistent equality rows whose restrictions to E are either zero
-    or well conditioned. A QP with inequality rows is not reduced.
+    without bounds, and consistent equality rows. After orthonormalisation, each
+    singular value of these rows restricted to E must be either zero up to rounding or
+    far above rounding. A QP with inequality rows is not reduced.
 
     previous : block of an earlier problem, used if P_EE has not changed
     """

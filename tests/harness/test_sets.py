@@ -39,7 +39,8 @@ FLAT = Cones([[3, 7], [5, 0], [2, 6]], [0.0, 1.0, 1e-8])
 SETS = [BOX, BALLS, Discs(BALLS.index, BALLS.radius), CONES, FLAT]
 NAMES = ["box", "balls", "discs", "cones", "flat cones"]
 names = pytest.mark.parametrize("one", SETS, ids=NAMES)
-#: rounding of a projection on an unbounded set, of points of size up to 16
+#: rounding errors of projections onto an unbounded set, for points with components up
+#: to 16
 ROUNDING = {Cones: 16 * 2.0**-52}
 
 

@@ -418,7 +418,7 @@ class Lacks(Honest):
 
 
 class NumpyScalars(Honest):
-    """Solver that returns numpy scalars, which json does not serialise."""
+    """Solver that returns integers of numpy, which json does not serialise."""
 
     def act(self, qp):
         return replace(

@@ -30,8 +30,8 @@ equilibrium and have no moment.
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is Φ = A N on each face with A = D_e M_e⁺,
 where M_e = ∫ N Nᵀ and D_e = diag ∫ N over the covered part of the face. Then ∫ Φ_j N_k
-is diagonal if M_e is regular, and Σ Φ_j = 1 in all cases, since D_e 1 = M_e 1. M_e is
-singular if only one triangle of a quadrilateral is covered.
+is diagonal if M_e is nonsingular, and Σ Φ_j = 1 in all cases, since D_e 1 = M_e 1. M_e
+is singular if only one triangle of a quadrilateral is covered.
 
 Each row is divided by ∫ N_j over the covered part, so that B is dimensionless, g̃ a
 length, and λ a nodal force.

@@ -39,7 +39,7 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Watcher:
-    """Progress that records its calls and may act after given records."""
+    """Progress callbacks that store records, and may act after a number of records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None

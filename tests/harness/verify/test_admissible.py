@@ -59,7 +59,7 @@ def test_a_closed_row_is_closed_though_it_is_not_violated():
 
 
 def test_supported_bodies_are_scaled_until_admissible():
-    """No component can move, so (2, 3) is halved to satisfy the limits (1, 2)."""
+    """Without softness no component can be corrected alone, so (2, 3) is halved."""
     found = moved(np.eye(2), [1, 2], [2, 3], softness=[0, 0])
 
     assert found.theta == pytest.approx(1 / 2)

@@ -131,7 +131,7 @@ def test_certificates_of_bodies_held_by_contact_are_those_of_one_process(found, 
 
 def test_eliminated_supports_are_certified_in_floating_subdomains(found):
     for answer in found(ELIMINATED):
-        # one process finds the nearest u_λ of the whole body
+        # one process uses the undivided body, whose u_λ is the nearest to û
         bound, least = answer["by_ranks"]["bounds"], answer["by_one"]["bound"]
 
         assert answer["same"]

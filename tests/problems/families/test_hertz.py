@@ -342,7 +342,7 @@ def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message)
 
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
 def test_cells_keep_their_area_if_the_contact_is_wider_than_the_cylinder(ratio):
-    """If the uniform part of the arc exceeds the half disc, K is indefinite."""
+    """If the uniformly meshed arc left the half disc, K would be indefinite."""
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)
     assert exact.a > 4 * 0.008

@@ -31,7 +31,8 @@ from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: example of Maros and Mészáros's report, with every kind of row, range and bound
+#: example from the report of Maros and Mészáros with further rows, ranges and bounds;
+#: contains every type of row
 QPS = """\
 * a comment
 NAME          EXAMPLE

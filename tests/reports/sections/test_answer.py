@@ -213,7 +213,8 @@ def test_no_winner_is_named_if_every_solver_failed_on_some_case(record, opened):
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "No solver is named the fastest over 8 cases at tol 1e-6: no solver was "
-        "verified on all cases; a was verified on most cases (7).",
+        "verified on all cases; a was verified on the largest number of cases "
+        "(7 of 8).",
     )
     assert "b crashed on 2 of 8 cases (signal 11)" in statement.remarks[0]
 

@@ -164,8 +164,8 @@ def test_lost_conjugacy_costs_no_more_products_than_the_presets(seed, tol):
 
 
 def test_rows_without_free_components_get_no_multiplier_from_rounding():
-    """On the free components, the rows of a tower on flat faces have a singular value
-    of 1e-14.
+    """For a tower of blocks with flat faces, the matrix of the equality rows, restricted
+    to the free components, has a singular value of 1e-14.
     """
     qp = generated_case(0).qp
     s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
