@@ -12,9 +12,9 @@ over all ranks, and M messages with b bytes in total to neighbouring ranks. A re
 has the latency α_R, a message has the latency α, and a byte takes β seconds.
 
 W and C are fitted to measured times; s, α_R, α and β are measured; R, M and b are
-counted. All of this is done on the ranks of the run. Superlinear speed-up cannot be fitted even
-with s = 1; it increases the misfit. Beyond the measured ranks, the model is extended as
-follows:
+counted. All of this is done on the ranks of the run. Superlinear speed-up cannot be
+fitted even with s = 1; it increases the misfit. Beyond the measured ranks, the model is
+extended as follows:
 
 - s is constant, because further ranks are assumed to bring their own memory;
 - α_R is proportional to ⌈log₂N⌉, the depth of a tree of ranks;

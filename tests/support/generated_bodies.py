@@ -99,7 +99,7 @@ def _block(
     *,
     least: int = 3,
 ) -> Mesh:
-    """Mesh a rectangle with crowned top and bottom, by at most `most` times its height."""
+    """Mesh a rectangle; crown top and bottom by at most `most` times its height."""
     divisions = int(rng.integers(least, least + 15)), int(rng.integers(2, 8))
     flat = rectangle(corner, size, divisions)
     x, y = ((flat.points - corner) / size).T

@@ -164,7 +164,7 @@ def test_lost_conjugacy_costs_no_more_products_than_the_presets(seed, tol):
 
 
 def test_rows_without_free_components_get_no_multiplier_from_rounding():
-    """For a tower of blocks with flat faces, the matrix of the equality rows, restricted
+    """The matrix of the equality rows of a tower of blocks with flat faces, restricted
     to the free components, has a singular value of 1e-14.
     """
     qp = generated_case(0).qp
