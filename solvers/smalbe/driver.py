@@ -35,7 +35,7 @@ from mortarbench.solvers.smalbe.projected import (
     projected_problem,
     times_projected,
 )
-from mortarbench.solvers.smalbe.scaled import Scaled
+from mortarbench.solvers.smalbe.scaled import Scaled, ScaledSparse
 from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
@@ -118,17 +118,20 @@ def prepared(
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
     kind, is_scaled = resolved(qp, options.preconditioner)
-    inner, scaled, eliminated = qp, None, None
+    inner, eliminated = qp, None
+    scaled: Scaled | None = None
     if options.eliminate == "always" or (
-        in_sequence and options.eliminate == "sequences"
+        options.eliminate == "sequences" and (in_sequence or has_discs)
     ):
         eliminated = _eliminated(qp, options, kind, carry)
     if eliminated is not None:
         inner = eliminated.qp
         kind = resolved_preconditioner(inner, options.preconditioner)
     elif is_scaled and not options.is_extended:
-        scaled = Scaled.of(qp, with_factor=kind == "incomplete")
-        inner = scaled.qp
+        scaled = ScaledSparse.of(qp, with_factor=kind == "incomplete")
+    if _may_scale_discs(inner, options, kind):
+        scaled = Scaled.over_discs(inner)
+    inner = inner if scaled is None else scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
     steps = _lanczos_steps(options, inner, in_sequence=in_sequence)
@@ -167,21 +170,40 @@ def _on_discs(qp: QP, options: Options) -> Options:
 def _eliminated(
     qp: QP, options: Options, kind: Preconditioner, carry: Carry | None
 ) -> Eliminated | None:
-    """Eliminate the free variables if one factor serves the whole sequence.
+    """Eliminate the free variables if this saves time.
 
-    If the free block changes between problems, as in Newton's method, a new factor for
-    each problem would cost more time than it saves.
+    Over bounds, one factor must serve the whole sequence. If the free block changes
+    between problems, as in Newton's method, a new factor for each problem would cost
+    more time than it saves. Over discs, a new factor always saves time. On
+    `contact-patch/dim=3` with friction and `ratio=10`, the number of products decreases
+    from 517 to 266, and for bodies whose moduli differ by 100 and whose slave nodes
+    have supports along the contact, from 18 936 to 261: tangential rows are then nearly
+    linearly dependent on the rows of supports.
     """
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (
         kind == "incomplete" and options.preconditioner == "auto"
     )
     # user-defined functions of a subclass expect all variables of the original QP
-    if options.is_extended or not may_follow or len(qp.sets) > 1:
+    if options.is_extended or not may_follow:
         return None
-    if options.eliminate == "always" or carry is None:
+    has_discs = len(qp.sets) > 1
+    if has_discs and not isinstance(qp.P, np.ndarray):  # the reduced P would be dense
+        return None
+    if options.eliminate == "always" or carry is None or has_discs:
         return eliminate_free(qp, carry and carry.block)
     reduced = None if carry.block is None else eliminate_free(qp, carry.block)
     return None if reduced is None or reduced.columns else reduced
+
+
+def _may_scale_discs(qp: QP, options: Options, kind: Preconditioner) -> bool:
+    """Return True if spectral steps over discs may work in scaled variables."""
+    return (
+        len(qp.sets) > 1
+        and isinstance(qp.P, np.ndarray)
+        and options.expansion == "spectral"
+        and kind == "none"
+        and not options.is_extended
+    )
 
 
 def _projected(
@@ -196,15 +218,16 @@ def _projected(
         # q is closer to the first eigenvector than a random vector, and does not depend
         # on the number of ranks; without rows, no step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
-    if scaled is not None and scaled.with_factor:
-        problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
-        problem.factor = scaled.factor()
+    sparse = scaled if isinstance(scaled, ScaledSparse) else None
+    if sparse is not None and sparse.with_factor:
+        problem = projected_problem(qp, lambda _F, _C: sparse.spectrum())
+        problem.factor = sparse.factor()
     else:
         problem = projected_problem(qp, find)
     norm, diagonal = problem.spectrum.norm, problem.diagonal
-    if scaled is not None:
+    if sparse is not None:
         problem.judge = compiled.Judge(
-            scaled.original, qp, scaled.root, scaled.diagonal, norm
+            sparse.original, qp, sparse.root, sparse.diagonal, norm
         )
     elif (
         options.expansion == "model"
@@ -274,10 +297,11 @@ def _start(task: _Task, tol: float) -> Iterate:
     x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
-        at = carry.x if task.scaled is None else carry.x * task.scaled.root
+        root = 1.0 if task.scaled is None else task.scaled.root
+        at = carry.x * root
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, at))
         x = np.where(np.isfinite(x), x, at)
-        mu = problem.rows.C @ carry.force / problem.spectrum.norm
+        mu = problem.rows.C @ (carry.force / root) / problem.spectrum.norm
     return task.loop.first(x, mu, M=task.options.M, rho=rho)
 
 
@@ -433,10 +457,11 @@ def _carry(task: _Task, at: Iterate) -> Carry:
     fixed = lower == upper
     side[fixed] = -np.sign(at.g[fixed])  # the bound towards which −g points
     x = problem.rows.x_tilde + at.nu
+    root = 1.0 if task.scaled is None else task.scaled.root
     return Carry(
-        x=x if task.scaled is None else x / task.scaled.root,
+        x=x / root,
         side=side,
-        force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
+        force=problem.spectrum.norm * (problem.rows.C.T @ at.mu) * root,
         spectrum=problem.spectrum,
         block=eliminated and eliminated.block,
     )
@@ -463,7 +488,7 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
         history=task.history.columns if task.history else {},
     )
     if task.scaled is not None:
-        return task.scaled.recovered(point), Fx * task.scaled.root
+        point, Fx = task.scaled.recovered(point), Fx * task.scaled.root
     return point if task.eliminated is None else task.eliminated.recover(point), Fx
 
 
@@ -530,12 +555,12 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
     """Return an upper bound of the worst KKT residual; exact if above `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
-    if task.scaled is not None:
-        diagonal = task.scaled.diagonal
-    if task.eliminated is not None:
-        task.problem.F.count += 1
-        G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
     if not task.problem.discs:
+        if isinstance(task.scaled, ScaledSparse):
+            diagonal = task.scaled.diagonal
+        if task.eliminated is not None:
+            task.problem.F.count += 1
+            G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
         over = task.problem.F.over
         bound = compiled.residual_bound(qp, point, Fx, diagonal, G, over)
         if bound <= enough or isinstance(qp.q, DistributedVector):

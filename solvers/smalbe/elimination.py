@@ -1,14 +1,15 @@
-"""Elimination of the variables without bounds from a QP, and recovery of their values.
+"""Elimination of the free variables from a QP, and recovery of their values.
 
-Let E be the variables without bounds and I the other variables. The stationarity
+A variable is free if it has no bounds and belongs to no disc. Let E be the free
+variables and I the other variables. The stationarity
 conditions of E and the equality rows that involve E,
 
     [P_EE G_Eᵀ] [x_E]   [−q_E − P_EI x_I]
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
 
 determine x_E and the multipliers y of these rows as affine functions of x_I. The
-reduced problem is a QP in x_I with the bounds, the equality rows that do not involve E,
-and the Schur complement
+reduced problem is a QP in x_I with the bounds and discs, the equality rows that do not
+involve E, and the Schur complement
 
     P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I.
 
@@ -29,7 +30,7 @@ from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
+from mortarbench.harness import QP, Box, Discs, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
 #: Thresholds for the singular values of the orthonormal rows restricted to E. Values of
@@ -50,7 +51,7 @@ class FreeBlock(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """A QP in the bounded variables, with the recovery of the other variables."""
+    """A QP without the free variables, with the recovery of their values."""
 
     qp: QP  #: reduced QP, with a dense P
     recover: Callable[[Solution], Solution]
@@ -86,16 +87,18 @@ class _Saddle:
 
 
 def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
-    """Eliminate the variables without bounds; return None if this is not possible.
+    """Eliminate the free variables; return None if this is not possible.
 
-    Elimination requires an explicit P with positive definite P_EE, variables with and
-    without bounds, and consistent equality rows. After orthonormalisation, each
+    Elimination requires an explicit P with positive definite P_EE, free and other
+    variables, and consistent equality rows. After orthonormalisation, each
     singular value of these rows restricted to E must be either zero up to rounding or
     far above rounding. A QP with inequality rows is not reduced.
 
     previous : block of an earlier problem, used if P_EE has not changed
     """
-    free = np.isinf(qp.lb) & np.isinf(qp.ub)
+    free = np.ones(qp.q.size, dtype=bool)
+    for one in qp.sets:
+        free[one.block] = False
     if free.all() or not free.any() or not qp.is_explicit or qp.h.size:
         return None
     rows = orthonormal_rows(qp.A, qp.b)
@@ -114,6 +117,7 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     except LinAlgError:  # G_E P_EE⁻¹ G_Eᵀ is singular to rounding
         return None
     G_I, P_EI = G[:, ~free], _block(qp.P, free, ~free)
+    number = np.cumsum(~free) - 1  # indices in x_I
     x_0, y_0 = solve(-qp.q[free], meets.T @ Cx)
     reduced = QP(
         P=solve.complement(P_EI, _block(qp.P, ~free, ~free), G_I),
@@ -122,8 +126,14 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
         b=others.T @ Cx,
         G=no_rows(int((~free).sum())),
         h=np.zeros(0),
-        lb=qp.lb[~free],
-        ub=qp.ub[~free],
+        sets=(
+            Box(qp.lb[~free], qp.ub[~free]),
+            *(
+                replace(one, index=number[one.index])
+                for one in qp.sets
+                if isinstance(one, Discs)
+            ),
+        ),
     )
 
     def recover(s: Solution) -> Solution:

@@ -1,9 +1,11 @@
-"""Scaling of the variables of a sparse QP by √diag P, and its inverse.
+"""Scaling of the variables of a QP by √diag P, and its inverse.
 
 With D = diag(P) and y = D¹ᐟ²x, the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ² with unit
 diagonal. This is Jacobi scaling, whose condition number is nearly the smallest among
 all diagonal scalings (van der Sluis, Numer. Math. 14, 1969, 14-23). Bounds of x become
-bounds of y. The stopping test uses KKT residuals of the original QP (`compiled.Judge`).
+bounds of y. On a disc, D is the mean of diag(P) over the variables of the disc, so that
+a disc of x becomes a disc of y. The stopping test uses KKT residuals of the original
+QP.
 """
 
 from __future__ import annotations
@@ -11,13 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
-from mortarbench.harness import QP, Matrix, Solution, Vector
+from mortarbench.harness import QP, Box, Discs, Matrix, Solution, Vector
 from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diagonal
 from mortarbench.solvers.smalbe.preconditioner import MAX_UNSCALED
 from mortarbench.solvers.smalbe.projected import Spectrum
 
+#: smallest entry of D relative to the largest one
+SMALLEST_DIAGONAL = 1e-10
 #: a negative sum Σⱼ Pᵢⱼwⱼ counts as zero if its absolute value is at most this factor
 #: times Pᵢᵢwᵢ
 ROUNDING = 1e-12
@@ -25,13 +29,59 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A QP in scaled variables, with data to compute a factor and to recover x."""
+    """A QP in scaled variables, with the recovery of x."""
 
     original: QP
+    qp: QP  #: QP in y = D¹ᐟ²x; `original` if D is nearly constant
+    root: Vector  #: (n,) D¹ᐟ², or ones
+
+    @classmethod
+    def over_discs(cls, qp: QP) -> Scaled:
+        """Scale a QP over discs with a dense P, by powers of two.
+
+        Powers of two cause no rounding errors, so that a point of a disc of y is a
+        point of the disc of x.
+        """
+        D = np.asarray(qp.P.diagonal()).copy()
+        discs = [one for one in qp.sets if isinstance(one, Discs)]
+        for one in discs:
+            D[one.index] = D[one.index].mean(axis=1, keepdims=True)
+        # along redundant rows, D is zero or a rounding error
+        D = np.maximum(D, SMALLEST_DIAGONAL * D.max(initial=0.0))
+        if D.max() <= MAX_UNSCALED * D.min():
+            return cls(qp, qp, np.ones(D.size))
+        root = np.exp2(np.round(np.log2(D) / 2))
+        inverse = 1 / root
+        scaled = QP(
+            P=inverse[:, None] * np.asarray(qp.P) * inverse,
+            q=qp.q * inverse,
+            A=qp.A @ diags_array(inverse),
+            b=qp.b,
+            G=qp.G,
+            h=qp.h,
+            sets=(
+                Box(qp.lb * root, qp.ub * root),
+                *(replace(d, radius=d.radius * root[d.index[:, 0]]) for d in discs),
+            ),
+        )
+        return cls(qp, scaled, root)
+
+    def recovered(self, s: Solution) -> Solution:
+        """Return the point of the original QP; components at bounds stay at bounds."""
+        if self.qp is self.original:
+            return s
+        x = np.clip(s.x / self.root, self.original.lb, self.original.ub)
+        x = np.where(s.x <= self.qp.lb, self.original.lb, x)
+        x = np.where(s.x >= self.qp.ub, self.original.ub, x)
+        return replace(s, x=x, z_box=s.z_box * self.root)
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledSparse(Scaled):
+    """A sparse QP in scaled variables, with data to compute a factor."""
+
     P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
     diagonal: Vector  #: (n,) diagonal of P
-    qp: QP  #: QP in y = D¹ᐟ²x; `original` if its diagonal is nearly constant
-    root: Vector  #: (n,) D¹ᐟ², or ones
     #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
     norm: float
     weights: Vector  #: (n,) w > 0; Pw ≥ 0 up to rounding if `has_weights`
@@ -39,7 +89,7 @@ class Scaled:
     with_factor: bool  #: True to use an incomplete factor as preconditioner
 
     @classmethod
-    def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
+    def of(cls, qp: QP, *, with_factor: bool) -> ScaledSparse:
         """Scale a QP with bounds only and a sparse P with a positive diagonal."""
         P = _canonical(qp.P)
         diagonal = P.diagonal()
@@ -64,7 +114,7 @@ class Scaled:
         if least < -ROUNDING:
             weights, has_weights = inverse, least_scaled >= -ROUNDING
         return cls(
-            qp, P, diagonal, scaled, root, norm, weights, has_weights, with_factor
+            qp, scaled, root, P, diagonal, norm, weights, has_weights, with_factor
         )
 
     def spectrum(self) -> Spectrum:
@@ -75,15 +125,6 @@ class Scaled:
         """Return the incomplete factor of H/norm, where H is the matrix of `qp`."""
         scale = np.sqrt(self.norm) * self.root * self.weights
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
-
-    def recovered(self, s: Solution) -> Solution:
-        """Return the point of the original QP; components at bounds stay at bounds."""
-        if self.qp is self.original:
-            return s
-        x = np.clip(s.x / self.root, self.original.lb, self.original.ub)
-        x = np.where(s.x <= self.qp.lb, self.original.lb, x)
-        x = np.where(s.x >= self.qp.ub, self.original.ub, x)
-        return replace(s, x=x, z_box=s.z_box * self.root)
 
 
 def _canonical(P: Matrix) -> Matrix:

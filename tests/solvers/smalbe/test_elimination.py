@@ -1,17 +1,41 @@
 """Elimination of the free variables: the same solution from a smaller QP."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.sparse import bsr_array, coo_array, csr_array, dia_array
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Box, Discs, Status, kkt_residuals, no_rows
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.elimination import eliminate_free
+from mortarbench.solvers.smalbe.scaled import Scaled
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support import ROOT
 
 EXACT = SMALBE(eliminate="never")
+#: the blocks of docs/solids.md with friction; supports prevent the upper from sliding
+BLOCKS = """
+mesh = "blocks.msh"
+length_unit = "mm"
+contact = "nts"
+steps = 1
+friction = "coulomb"
+mu = 0.3
+bodies = [
+    {{ name = "lower", E = {E}, nu = 0.3 }},
+    {{ name = "upper", E = 210e9, nu = 0.3 }},
+]
+supports = [
+    {{ boundary = "base", fix = ["x", "y", "z"] }},
+    {{ boundary = "foot", fix = ["x", "y"] }},
+]
+loads = [{{ boundary = "top", traction = [0, 0, -1e6] }}]
+contacts = [{{ slave = "foot", master = "table" }}]
+"""
 
 
 @pytest.fixture
@@ -180,3 +204,59 @@ def test_rows_nearly_independent_of_free_variables_are_not_eliminated(dual):
     A[0, :12] *= 1e-5
 
     assert eliminate_free(replace(qp, A=A)) is None
+
+
+def with_discs(qp):
+    """Replace the bounds of the last eight variables by four discs."""
+    lb = np.where(np.arange(24) < 16, qp.lb, -np.inf)
+    discs = Discs(np.arange(16, 24).reshape(4, 2), [0.1, 0.2, 0.0, 30.0])
+    return replace(qp, sets=(Box(lb, qp.ub), discs))
+
+
+@pytest.mark.parametrize("apart", [0, 1])
+def test_variables_of_discs_are_not_eliminated(dual, apart):
+    qp = with_discs(dual(271828, apart=apart))
+    small = eliminate_free(qp)
+    solution = small.recover(EXACT.prepare(small.qp, 1e-11)())
+
+    assert small.qp.sets[1].index.tolist() == [[4, 5], [6, 7], [8, 9], [10, 11]]
+    assert kkt_residuals(qp, solution).worst <= 1e-9
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e2, 1e4])
+def test_scaled_variables_have_the_same_solution(dual, spread):
+    """The variables of each disc have a common scale; bounds are reached exactly."""
+    qp = with_discs(dual(314159))
+    root = np.geomspace(1.0, spread, 24)
+    root[16:] = np.repeat(root[16::2], 2)
+    qp = replace(
+        qp, P=qp.P / root / root[:, None], q=qp.q / root, A=qp.A / root,
+        sets=(qp.box, replace(qp.sets[1], radius=qp.sets[1].radius * root[16::2])),
+    )  # fmt: skip
+    scaled = Scaled.over_discs(qp)
+    s = SMALBE().prepare(qp, 1e-9)()
+
+    diagonal = scaled.qp.P.diagonal().copy()
+    diagonal[16:] = np.repeat(diagonal[16:].reshape(4, 2).mean(axis=1), 2)
+    assert (np.abs(np.log2(diagonal)) <= 1).all() or spread == 1
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 5e-9
+    assert s.x / root == pytest.approx(reference_solution(qp).x / root, abs=1e-6)
+    assert (s.x[12:16] >= 0).all()
+    assert (s.z_box[12:16] < 0).any()
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4])
+def test_friction_along_supports_takes_few_products_for_any_stiffness(tmp_path, ratio):
+    """Supports along the contact make tangential rows nearly linearly dependent on the
+    rows of supports. In variables that include the support forces, the number of
+    products grows in proportion to the ratio of the moduli: 200 270 for 1e4.
+    """
+    shutil.copy(ROOT / "tests" / "data" / "blocks.msh", tmp_path)
+    path = tmp_path / "blocks.toml"
+    path.write_text(BLOCKS.format(E=210e9 * ratio))
+    case = parse(f"bodies:{path}/dual", PROBLEMS)
+    s = SMALBE().prepare(case.build(reference_solution).qp, 1e-8)()
+
+    assert s.status is Status.SOLVED
+    assert s.counts["P_products"] - s.counts["factorised_columns"] < 600
