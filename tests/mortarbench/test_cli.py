@@ -469,7 +469,7 @@ WRONG = {
     ),
     "scale": (
         (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
-        "--scale = nan; expected a number, at most 1e+09",
+        "--scale = nan; expected a number of magnitude at most 1e+09",
     ),
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),
