@@ -465,7 +465,7 @@ WRONG = {
     ),
     "scale without picture": (
         (*SOLVE, "--scale", "3"),
-        "--scale 3 without --plot; expected both options",
+        "--scale 3 without --plot; expected --plot FILE",
     ),
     "scale": (
         (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
