@@ -8,7 +8,8 @@
 
 Plug-ins import `QP`, `Solution`, `Status`, `Case` and `Family` from here.
 
-Functions print no output unless requested. If their input is invalid, they raise an
+Functions print no output unless requested, except that `run` shows its progress in a
+notebook. If their input is invalid, they raise an
 `InputError` with a one-line message. The command line calls the same functions.
 """
 

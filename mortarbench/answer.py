@@ -84,7 +84,7 @@ class Answer:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict of the harness, independent of the solver's claim."""
+        """Verdict of the harness; an answer is verified regardless of the claim."""
         return self.record.verdict
 
     @property
@@ -95,7 +95,7 @@ class Answer:
 
     @property
     def energy_bound(self) -> float | None:
-        """Certified bound of the relative error in the energy norm; None if unknown."""
+        """Certified bound on the relative error in the energy norm; None if unknown."""
         return self.record.energy_bound
 
     @property
@@ -130,7 +130,7 @@ class Answer:
     def to_dict(self) -> dict[str, Any]:
         """Return the record, the history and the remarks as plain data.
 
-        For a QP with discs or cones, the values of `normality` are included.
+        The values of `normality` are included unless it is None.
         """
         history = finite(plain(self.history))
         further = self.normality
@@ -187,7 +187,7 @@ class Answer:
         ------
         InputError
             If the case has no bodies, the answer has no point, the file cannot be
-            written, or `scale` is not a finite number.
+            written, or `scale` is NaN or too large.
 
         Examples
         --------
@@ -343,9 +343,9 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
             worst = float(lengths[nodes].max()) / size
             name = repr(mechanics.names[body]) if mechanics.names else str(body)
             text = (
-                f"body {name} moves by up to {lengths[nodes].max():.3g} m and is "
-                f"{size:.3g} m large; linear kinematics is valid only for small "
-                "displacements: check the moduli, the loads and the supports"
+                f"body {name} moves by up to {lengths[nodes].max():.3g} m, which "
+                f"exceeds its size of {size:.3g} m; linear kinematics is valid only "
+                "for small displacements: check the moduli, the loads and the supports"
             )
     if text:
         yield text
@@ -511,7 +511,7 @@ class Verification:
     optimum_error: float | None
     #: additional error measures for discs and cones; None if the QP has no such sets
     normality: Normality | None
-    tol: float  #: tolerance; a point is verified if every residual is at most 10·tol
+    tol: float  #: relative KKT accuracy, as passed to `verify`
 
     def __repr__(self) -> str:
         if self.optimum_error is not None:
@@ -534,7 +534,7 @@ def verify(
 
     Multipliers that are left out are computed by nonnegative least squares on the
     active rows and bounds, see `harness.verify.multipliers`. If the residuals are large
-    even with these multipliers, the point is not optimal.
+    even with these multipliers, the point is refuted.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ EXPORTS = (".npz", ".mat", ".parquet", ".qps", ".hdf5")  #: suffixes of exported
 PICTURES = (".png", ".pdf", ".svg")  #: suffixes of pictures
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
 GATES = ("worse", "slower")  #: values allowed in the argument `fail_on` of `report`
-MAX_SCALE = 1e9  #: largest magnification of displacements in pictures
+MAX_SCALE = 1e9  #: largest absolute magnification of displacements in pictures
 GRIDS = (".vtu", ".pvd")  #: suffixes of ParaView files: one state, or all steps
 
 
@@ -96,7 +96,9 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
         )
     twice = sorted(options.keys() & more.keys())
     if twice:
-        raise InputError(f"{twice[0]} is given twice, in `options` and as a keyword")
+        raise InputError(
+            f"option {twice[0]!r} is given twice: in `options` and as a keyword"
+        )
     return {**options, **more}
 
 
@@ -113,7 +115,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
     """
     if not abs(scale) <= MAX_SCALE:  # unlike `>`, this also rejects NaN
         raise InputError(
-            f"{where} = {scale:g}; expected a number, at most {MAX_SCALE:g}"
+            f"{where} = {scale:g}; expected a number of magnitude at most {MAX_SCALE:g}"
         )
     return scale
 

@@ -67,8 +67,8 @@ class Case(plugin.Case):
         """Non-dimensional QP; its energy in SI units is scale · objective + constant.
 
         The matrices have types that other libraries accept: ``scipy.sparse``
-        ``csc_matrix`` with 32-bit indices, or dense arrays. P of a decomposed problem
-        is an operator, whose matrix is ``P @ numpy.eye(n)``.
+        ``csc_matrix`` with 32-bit indices, or dense arrays. P may also be
+        an operator, as for a decomposed problem; its matrix is ``P @ numpy.eye(n)``.
         """
         return self.family_case.qp.with_matrices(_exported)
 
@@ -89,7 +89,7 @@ class Case(plugin.Case):
 
     @property
     def dualise_seconds(self) -> float | None:
-        """Time to factorise and assemble a dual form, in s; None for primal forms."""
+        """Time to factorise and assemble a dual form, in s; None if not recorded."""
         return self.family_case.dualise_seconds
 
     @property
@@ -99,7 +99,7 @@ class Case(plugin.Case):
 
     @property
     def unsettled(self) -> float:
-        """Relative residual of the fixed-point iteration, or 0 if the QP has none."""
+        """Relative residual of a fixed-point iteration; 0 for a QP outside of one."""
         return self.family_case.unsettled
 
     def recover(self, solution: Solution) -> Vector:

@@ -145,7 +145,7 @@ def is_notable(record: Record) -> bool:
 
 
 class _Bar(_Display):
-    """Progress bar of `rich`, with answers that are not verified printed above."""
+    """Progress bar of `rich`; `is_notable` measurements are printed above the bar."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
@@ -174,7 +174,7 @@ class _Bar(_Display):
 
 
 class _Notebook(_Display):
-    """Progress bar in a notebook, with answers that are not verified listed above."""
+    """Progress bar in a notebook; `is_notable` measurements are listed above it."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -59,7 +59,8 @@ class Reporter(Protocol):
     ) -> list[Path]:
         """Write the report.
 
-        factor : a point is verified if every residual is at most factor·tol
+        factor : a point is verified if every residual or, with a proven optimum, its
+            error relative to the optimum is at most factor·tol
         pool_forms : compare solvers over the cases of all forms together, instead of
             within each form
         """
@@ -90,7 +91,7 @@ def one_thread() -> Iterator[None]:
     """Limit every library to one thread, as in the processes of a run.
 
     With several threads, sums are evaluated in a different order, and the last digits
-    of a QP differ. Only one thread at a time can enter this context; others wait.
+    of a QP may differ. Only one thread at a time can enter this context; others wait.
     """
     from scipy import linalg  # threadpoolctl limits only libraries that are loaded
     from sksparse import cholmod

@@ -76,10 +76,11 @@ def report(
         `folder` to this further folder is written to its subfolder ``report``, instead
         of the report on `folder`
     formats : any of html, md, tex, csv, parquet
-    factor : a point is verified if every residual is at most factor·tol
+    factor : a point is verified if every residual or, with a proven optimum, its error
+        relative to the optimum is at most factor·tol
     fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
-        verdict became worse; ``slower``, the confidence interval of a ratio of times
-        lies above 1, see docs/statistics-growth.md
+        verdict became worse; ``slower``, a solver became slower by the criterion in
+        docs/statistics-growth.md
     pool_forms : True to compute means, ranks and profiles over the cases of all forms
         together, where a declined form counts as unsolved; False to compute them within
         each form

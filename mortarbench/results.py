@@ -84,9 +84,9 @@ class Results:
 
     @property
     def failed(self) -> tuple[Record, ...]:
-        """Requested measurements that ended without an answer.
+        """Requested measurements in which the solver crashed, gave up or hit a limit.
 
-        They include measurements that reached a limit, but not declined ones.
+        Declined measurements are not included.
         """
         excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(

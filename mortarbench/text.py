@@ -61,15 +61,15 @@ _LEGEND = {
     "n Newton",
     "outer": "outer: number of the outer iteration",
     "products": "products: number of products with the QP's matrix P so far",
-    "free_gradient": "‖φ‖: free gradient, of the variables that are not at a bound",
-    "chopped_gradient": "‖β‖: chopped gradient, of the variables that should leave "
-    "their bounds",
+    "free_gradient": "‖φ‖: free gradient (norm), of the variables not at a bound",
+    "chopped_gradient": "‖β‖: chopped gradient (norm), of the variables that should "
+    "leave their bounds",
     "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
-    "active": "at bound: variables at one of their bounds",
-    "two_sided": "of two: variables at a bound that have two bounds; with friction, "
-    "rows that slip",
-    "cost": "own cost: the function that the solver itself minimises, in its own "
-    "scaling;\n          neither a time nor the objective above",
+    "active": "at bound: number of variables at one of their bounds",
+    "two_sided": "of two: number of variables at a bound that have two bounds; with "
+    "friction, number of rows that slip",
+    "cost": "own cost: value of the function that the solver itself minimises, in its "
+    "own\n          scaling; neither a time nor the objective above",
 }
 #: columns of a history that are not shown, because times of single runs are unreliable
 _HIDDEN = ("seconds",)
@@ -127,7 +127,8 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
 def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
     """Count the claims and verdicts of each solver; return a table with a header row.
 
-    The rows of `solvers` come first, followed by those of other solvers in `records`.
+    The rows of `solvers` come first, followed by the rows of other solvers in
+    `records`.
     """
     latest = {r.run_id: r for r in records}.values()
     header = [
@@ -208,7 +209,7 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
 def _units(per: str) -> Mapping[str, str]:
     """Return the units of quantities by name.
 
-    per : "/m" for plane bodies, whose forces are per metre of thickness; "" in space
+    per : "/m" for plane bodies, whose forces are per metre of thickness; "" in 3D
     """
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
@@ -265,7 +266,7 @@ def convergence(history: History) -> str:
 
     Each row shows the end of an outer iteration or, if the solver has no outer
     iterations, a single iteration. If there are more than 15 rows, 15 evenly spaced
-    ones are shown. Steps are counted by type since the previous row, such as "c12 e3".
+    rows are shown. Steps are counted by type since the previous row, such as "c12 e3".
     """
     columns = {k: v for k, v in history.items() if v.size and k not in _HIDDEN}
     if not columns:
@@ -357,6 +358,6 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
 
 
 def printable(text: str) -> str:
-    """Join the lines of a foreign text, and replace its unprintable characters."""
+    """Join the lines of a text, and replace its unprintable characters."""
     line = " ".join(text.split())
     return "".join(c if c.isprintable() else "\ufffd" for c in line)

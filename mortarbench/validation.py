@@ -281,7 +281,7 @@ class Conformance:
             r.grade is Grade.PASS and name.startswith(SOLUTION_PREFIX)
             for name, r in self.results.items()
         ):
-            return f"passes no check {SOLUTION_PREFIX!r}: it solved nothing"
+            return f"passes no check {SOLUTION_PREFIX!r}: it solved no QP"
         return ""
 
     @property
@@ -316,8 +316,8 @@ def test_solver(
 ) -> Conformance:
     """Run the conformance suite on a solver, in a separate process.
 
-    If the process dies or hangs during a check, this check fails, and the remaining
-    checks are run in a new process.
+    If the process ends or hangs during a check, the check fails or, for a reformulated
+    QP, counts as a weakness; the remaining checks are run in a new process.
 
     Parameters
     ----------
@@ -361,7 +361,10 @@ def test_solver(
 
 
 def _run_check(worker: WorkerProcess, check: str) -> Result:
-    """Run one check, which fails if the process of the solver ends during the check."""
+    """Run one check; without a reply of the solver's process, return a failure.
+
+    For a check of an equivalent formulation, a weakness is returned instead.
+    """
     reply = worker.ask(
         {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
     )

@@ -60,8 +60,8 @@ DEGENERATE_HEAD = """\
 ## The degenerate cone
 
 min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁ has the solution (4, 4, 0) with multiplier
-zero. The error in x is of the order of the square root of the error in complementarity,
-even if the answer is verified.
+zero. The error in x of a verified answer may be of the order of the square root of the
+error in complementarity.
 
 | solver | largest error in x |
 | --- | --- |

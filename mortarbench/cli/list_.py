@@ -1,4 +1,4 @@
-"""The command `list`: list problems, solvers or suites; write docs/solvers.md."""
+"""The command `list`, and the text of the pages docs/solvers*.md."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ libraries](solvers-libraries.md) from the docstrings in `solvers/`.
 
 Every solver is called with the same `tol`, the relative KKT accuracy of the
 non-dimensional QP. The notes explain how each adapter translates `tol` to the stopping
-test of its solver. Whether a solver claims success is recorded, but verdicts do not
-depend on this claim ([comparison policy](fair-play.md)).
+test of its solver. The status that a solver claims is recorded, but whether its answer
+is verified does not depend on this claim ([comparison policy](fair-play.md)).
 
 | your QP | try first |
 | --- | --- |

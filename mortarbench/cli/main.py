@@ -269,7 +269,9 @@ _COMMANDS = {
                 "what to list",
                 {"choices": ("problems", "solvers", "suites")},
             ),
-            _Option(_MARKDOWN, "", "solvers: print docs/solvers.md"),
+            _Option(
+                _MARKDOWN, "", "solvers: print the notes on all solvers as Markdown"
+            ),
             _PLUGIN,
             _JSON,
         ],
@@ -341,8 +343,8 @@ _COMMANDS = {
             _Option(
                 "--mpi --ranks",
                 "N",
-                "solve on N MPI processes; only for cases of form dual with feti; "
-                "default: 1",
+                "solve on N MPI processes; N > 1 only for cases that are decomposed "
+                "into subdomains; default: 1",
                 {"default": 1},
             ),
             _Option(
@@ -427,8 +429,8 @@ _COMMANDS = {
             _Option(
                 "--factor",
                 "F",
-                "an answer is verified if every residual is "
-                "within F times the tolerance; default: 10",
+                "an answer is verified if every residual or, with a proven optimum, "
+                "its error is at most F times the tolerance; default: 10",
             ),
             _Option(
                 "--pool-forms",

@@ -21,7 +21,7 @@ def run(registries: Registries, options: Namespace) -> int:
     """Perform the missing measurements of a suite and write the report.
 
     Return 1 if a measurement is missing. With ``--strict``, also return 1 if a claim is
-    refuted or a measurement ended without an answer.
+    refuted or a solver crashed, gave up or reached a limit.
     """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)

@@ -39,7 +39,7 @@ def run(registries: Registries, options: Namespace) -> int:
         check_scale(options.scale, "--scale")
     if options.plot is None and options.scale is not None:
         raise InputError(
-            f"--scale {options.scale:g} without --plot; expected both options"
+            f"--scale {options.scale:g} without --plot; expected --plot FILE"
         )
     if options.vtu is not None:
         check_output_file(options.vtu, GRIDS)

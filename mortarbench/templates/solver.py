@@ -99,8 +99,8 @@ def iterates(
     p = d.size
     x, y = solve_kkt(P, A, C, np.ones(p), C.T @ d - q, b)
     gap = d - C @ x
-    # The starting point is far inside the feasible set relative to |gap|, so that it
-    # does not depend on units.
+    # The initial slacks and multipliers have the magnitude of the data, so that the
+    # starting point scales with the units.
     s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)
     z = np.full(p, np.abs(q).max(initial=0.0) or 1.0)
 

@@ -465,11 +465,11 @@ WRONG = {
     ),
     "scale without picture": (
         (*SOLVE, "--scale", "3"),
-        "--scale 3 without --plot; expected both options",
+        "--scale 3 without --plot; expected --plot FILE",
     ),
     "scale": (
         (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
-        "--scale = nan; expected a number, at most 1e+09",
+        "--scale = nan; expected a number of magnitude at most 1e+09",
     ),
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),

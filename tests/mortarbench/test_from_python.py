@@ -556,7 +556,7 @@ def test_a_qp_needs_no_plug_in_and_no_registry_to_be_a_case():
 
 
 def test_an_option_passed_twice_is_refused():
-    with pytest.raises(mb.InputError, match="max_iter is given twice"):
+    with pytest.raises(mb.InputError, match="option 'max_iter' is given twice"):
         mb.solve(
             "obstacle/dim=1/n=4/primal", "clarabel", options={"max_iter": 9}, max_iter=3
         )

@@ -54,7 +54,9 @@ def test_displacements_larger_than_the_body_cause_a_remark(
     assert len(found.remarks) == is_large
     if is_large:
         (told,) = found.remarks
-        assert told.startswith("body 'upper' moves by up to 2.4 m and is 2 m large")
+        assert told.startswith(
+            "body 'upper' moves by up to 2.4 m, which exceeds its size of 2 m"
+        )
         assert f"note: {told}" in repr(found).splitlines()
         assert told.replace("'", "&#x27;") in found._repr_html_()
         assert found.to_dict()["remarks"] == [told]

@@ -576,7 +576,7 @@ def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     assert command("test-solver", "declines", "--plugin", plugin, "--json") == 1
     assert capsys.readouterr().err == (
         "mortarbench: declines does not conform: it passes no check "
-        "'finds the planted solution': it solved nothing\n"
+        "'finds the planted solution': it solved no QP\n"
     )
 
     assert command("test-solver", "sound", "--plugin", plugin) == 0
