@@ -6,7 +6,7 @@ operator while the clock runs. Work before the first product, such as a factoris
 therefore counts as preparation of the solver.
 
 The function that builds P, called its *maker*, is looked up by name in a table, the
-``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
+``OPERATORS`` of a plug-in or of a package. A file refers to the maker only by its name,
 and therefore cannot cause the import of a module.
 """
 
