@@ -191,7 +191,7 @@ class Schedule:
                 turns.append(turn)
         if not turns:
             return None
-        # Two consecutive repeats have the same seed, and the second repeat reverses the
+        # Repeats 2k and 2k + 1 have the same seed, and the second of them reverses the
         # order of the first. All solvers thus have the same mean position in the two
         # repeats.
         seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
