@@ -130,7 +130,7 @@ class Solution:
         )
 
     def mismatch(self, qp: QP) -> str | None:
-        """Return a message if a vector has a shape that does not fit `qp`, else None."""
+        """Return a message if the shape of a vector does not fit `qp`, else None."""
         expected = {"x": qp.q, "y": qp.b, "z": qp.h, "z_box": qp.q}
         for name, like in expected.items():
             got = np.shape(getattr(self, name))

@@ -118,7 +118,7 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve as in a measurement; raise if the solver fails without returning a point."""
+    """Solve as in a measurement; raise if the solver declines or fails without x."""
     s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")

@@ -4,8 +4,8 @@ Let u and λ be the displacement and the multipliers of the answer, and u* and �
 displacement and the multipliers of the solution. Let ‖·‖ be the energy norm, and u_λ
 the displacement in equilibrium with the load and the contact forces −Bᵀλ. An answer is
 verified at tolerance t if its KKT residuals are at most 10t. The residual of the
-duality gap g is g/‖u*‖². By the identity of Prager and Synge
-(`harness.verify.certificate`, (2)),
+duality gap g is g/E with an energy E; here, E is taken to be ‖u*‖². By the identity of
+Prager and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
@@ -70,7 +70,7 @@ class Deviation(NamedTuple):
 
 
 def energy_allowed(tol: float) -> float:
-    """Return √(20 tol), a bound on the relative error of an answer verified at `tol`."""
+    """Return √(20 tol), a bound on the relative error of answers verified at `tol`."""
     return float(np.sqrt(2 * allowed(tol)))
 
 

@@ -3,11 +3,11 @@
 All residuals are scale-free: they do not change if the objective or a row is multiplied
 by a constant, so that one threshold suits every problem. A change of the unit of a
 variable can change only the dual residual, through the scale S of all components.
-All four residuals vanish if and only if the point is a KKT point. A KKT point is a
-solution if P is positive semidefinite, which is not checked here. docs/verdicts.md
-states what small residuals prove about the objective. If residuals do not suffice for a
-verdict, `harness.verify.optimum` compares the objective of the point with a proven
-optimum.
+Up to rounding, all four residuals vanish if and only if the point is a KKT point. Such
+a point is a solution if P is positive semidefinite, which is not checked here.
+docs/verdicts.md states what small residuals prove about the objective. If residuals do
+not suffice for a verdict, `harness.verify.optimum` compares the objective of the point
+with a proven optimum.
 """
 
 from __future__ import annotations

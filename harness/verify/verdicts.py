@@ -206,10 +206,11 @@ def evaluated_by_ranks(
 
     Returns
     -------
-    a dict with `values`: objective and residuals, or None if they require the whole QP;
-    `bounds`: fields of `certified`, or None if they require the whole QP; `quantities`:
-    physical quantities, or None if they require the whole QP; `recover_seconds`: time
-    to evaluate the quantities; `notes`: reasons of failures
+    a dict with `values`: objective and residuals, or None if they are not finite or
+    require the whole QP; `bounds`: fields of `certified`, or None if they require the
+    whole QP; `quantities`: physical quantities, or None if they require the whole QP;
+    `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
+    After a failure, the values concerned are None or empty
 
     """
     found: dict[str, Any] = {
