@@ -136,8 +136,8 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
     def least_eigenvalue(self) -> float | None:
         """Proven lower bound on the eigenvalues of P, or None if it is unavailable.
 
-        A positive bound yields an error bound for any answer over convex sets
-        (`harness.verify.certificate.certify_by_eigenvalue`).
+        A positive bound yields error bounds for answers to QPs over convex sets without
+        rows (`harness.verify.certificate.certify_by_eigenvalue`).
         """
         return getattr(self.build(), "least_eigenvalue", None)
 

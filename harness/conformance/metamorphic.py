@@ -194,7 +194,7 @@ def _selections(
 
 
 def _sorted(M: Matrix) -> Matrix:
-    """Sort the indices of a sparse matrix in place; products may yield unsorted ones."""
+    """Sort the indices of a sparse matrix in place; a product may not sort them."""
     if hasattr(M, "sort_indices"):
         M.sort_indices()
     return M

@@ -66,7 +66,7 @@ class Answer:
     residuals: Mapping[str, float]
     #: error relative to a proven optimum, which decides instead of the residuals
     optimum_error: float | None
-    allowed: float  #: largest residual of a verified answer
+    allowed: float  #: largest residual (or `optimum_error`) of a verified answer
     energy_allowed: float  #: largest permitted relative error in the energy norm
     energy_bound: float | None  #: certified error bound that the run stored
     doubt: float | None  #: bound on the relative error of the reference point

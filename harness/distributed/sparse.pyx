@@ -441,10 +441,10 @@ def factor_above(M, double share, L_0):
 
     M is a difference of matrices whose norms are similar to that of L₀L₀ᵀ. If `share`
     is smaller than the relative rounding errors of these matrices, the computed M may
-    have negative eigenvalues. In exact arithmetic, the pivots of M are at least the pivots of
-    share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is discarded, and
-    the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed.
-    Eigenvalues below `share` are set to `share`, and L follows from
+    have negative eigenvalues. In exact arithmetic, the pivots of M are at least the
+    pivots of share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is
+    discarded, and the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are
+    computed. Eigenvalues below `share` are set to `share`, and L follows from
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
 

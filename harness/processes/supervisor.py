@@ -10,8 +10,8 @@ The times that a worker reports are checked against the parent's clock and again
 CPU time that the kernel counts. While one worker executes a request, all other workers
 on its CPU are stopped by SIGSTOP, so that running threads of one solver do not disturb
 the measurement of another solver. Requests from several threads are therefore
-serialised. Signals are sent to pidfds, see pidfd_open(2), never to process IDs, which
-the kernel reuses.
+serialised. Signals to a worker and its descendants are sent to pidfds, see
+pidfd_open(2), since the kernel reuses process IDs.
 """
 
 from __future__ import annotations

@@ -379,7 +379,7 @@ def _proved(split: Undivided, *pair: Any) -> Certificate | str:
 
 
 def is_sharp(outcome: Certificate | str) -> bool:
-    """Return True if another pair could improve the certificate only slightly."""
+    """Return True if the bound is small, or another pair could hardly improve it."""
     return isinstance(outcome, Certificate) and (
         outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
     )

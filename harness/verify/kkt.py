@@ -587,12 +587,13 @@ def verdict(
 ) -> Verdict:
     """Return the verdict on a point, given its residuals.
 
-    A point is verified if every residual is at most factor·tol (`allowed`), regardless
-    of the claim of the solver. Otherwise, the claim determines the type of failure. If
-    the error relative to a proven optimum, `error`, is given, it replaces all
-    residuals. A refuted claim of success is `inaccurate` if the point has at least half
-    of the requested digits (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A
-    point with a residual above 0.1 is not verified at any tolerance.
+    A point is verified if every residual is at most factor·tol (`allowed`), even if the
+    solver claims no success, unless the QP was declined or is proven to be infeasible.
+    Otherwise, the claim determines the type of failure. If the error relative to a
+    proven optimum, `error`, is given, it replaces all residuals. A refuted claim of
+    success is `inaccurate` if the point has at least half of the requested digits
+    (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
+    above 0.1 is not verified at any tolerance.
 
     infeasible : True if the QP is proven to have no feasible point, which verifies a
         claim of infeasibility regardless of the point
