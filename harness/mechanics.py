@@ -551,7 +551,7 @@ class Mechanics:
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
     #: equilibrium
     rigid: NDArray[np.float64]
-    #: names of the bodies, in the order of the columns of `rigid`
+    #: names of the bodies, in the order of their columns in `rigid`
     names: tuple[str, ...] = ()
     scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0

@@ -423,8 +423,8 @@ def _triangle(P: Matrix) -> str:
     for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
         if not abs(other).max():
             return (
-                f"; P is {name} triangular, but is stored whole here: expected both "
-                "triangles, P + P.T - diag(diag(P))"
+                f"; P is {name} triangular: expected both triangles, "
+                "P + P.T - diag(diag(P))"
             )
     return ""
 
