@@ -1,7 +1,7 @@
 """Checks of plain data from users: entries of files, and arguments of functions.
 
-A failed check raises `InputError`. In all functions, `where` is the name of the value
-in the error message, such as a key of a file.
+A failed check raises `InputError`. The argument `where` of a check is the name of the
+value in the error message, such as a key of a file.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ _PIECE_BYTES = 2**20  #: number of bytes that are read in one call
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
-    """Return the SHA-256 of the concatenated `parts`, cut to its first digits.
+    """Return the first digits of the SHA-256 of the concatenated `parts`.
 
     digits : number of hexadecimal digits, at most 64
 
@@ -27,7 +27,7 @@ def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
 
 
 def running_digest(parts: Iterable[bytes]) -> Digest:
-    """Return a SHA-256 hash object that already contains the concatenated `parts`."""
+    """Return a SHA-256 hash object, to which all `parts` have been appended."""
     content = sha256()
     for part in parts:
         content.update(part)

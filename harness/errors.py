@@ -13,17 +13,17 @@ MAX_SHOWN = (
     200  #: largest number of characters of the user's input that a message repeats
 )
 _MAX_MESSAGE = 600  #: largest number of characters of a message, excluding paths
-#: A quotation or a word. Possessive quantifiers avoid backtracking, whose time could
-#: grow without bound for malicious input.
+#: A quotation or a word. Possessive quantifiers avoid backtracking, which could take
+#: very long for malicious input.
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 
 
 class InputError(Exception):
     """Error for invalid input.
 
-    The message is one line that states the place of the error, the value, and the
-    expected value. The command line prints this line without a traceback and exits with
-    code 2.
+    The message is one line, which usually states the place of the error, the value, and
+    the expected value. The command line prints this line without a traceback and exits
+    with code 2.
     """
 
     def __str__(self) -> str:
@@ -70,8 +70,8 @@ def shortened(text: str, most: int = MAX_SHOWN) -> str:
 def one_line(message: str) -> str:
     """Return a message as a single line of limited length.
 
-    Long words and quotations are shortened first. If the line is still too long, the
-    whole line is shortened. Existing paths are not shortened, since users copy them.
+    Long words and quotations are shortened first, except for existing paths, since
+    users copy them. If the rest of the line is still too long, the line is shortened.
     """
     line = " ".join(message.splitlines())
     if len(line) <= MAX_SHOWN:
@@ -109,7 +109,7 @@ def unknown(
     """
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
-    # the time of the search for similar names is quadratic in the length
+    # the time of the search for similar names is quadratic in the length of the name
     got = shortened(got)
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
@@ -119,7 +119,7 @@ def unknown(
 
 
 def some(names: Iterable[str], most: int = 3) -> str:
-    """Return the first `most` names as text, followed by the number of further names.
+    """Return the first `most` names as text, and the number of further names, if any.
 
     >>> from mortarbench.harness.errors import some
     >>> some(["a", "b", "c", "d", "e"])

@@ -1,7 +1,7 @@
 """Elastic contact problems from which QPs are derived, for error certificates.
 
-If a family attaches its `Mechanics` to a case (`harness.plugin.Case`), the error of
-every answer is bounded in the energy norm, for every form of the QP; see
+If a family attaches its `Mechanics` to a case (`harness.plugin.Case`), error bounds in
+the energy norm can be computed for the answers, whatever the form of the QP; see
 `harness.verify.certificate`.
 """
 
@@ -313,8 +313,8 @@ class AdmissibleForces:
         """Return g − ‖λ‖ of each friction vector, with rounding errors set to zero.
 
         The norm of a projected multiplier equals g only up to rounding in extended
-        precision, about 1e-19. If this error counted as work, it would dominate
-        certificates, which contain the square root of the work.
+        precision, about 1e-19. If this error counted as work, it could dominate a
+        certificate, which contains the square root of the work.
         """
         radius = self.discs.radius
         room = radius - norms(multipliers[self.discs.index])
@@ -424,9 +424,9 @@ KINDS = {
 }
 
 
-#: Corners of each facet, for each type of cell. In 2D, the cell is on the left
-#: of the edge. In 3D, the corners are in anticlockwise order when seen from outside,
-#: and a triangle repeats its last corner.
+#: Corners of each facet, by type of cell (triangles are stored as quadrilaterals). In
+#: 2D, the cell is on the left of the edge. In 3D, the corners are in anticlockwise
+#: order when seen from outside, and a triangular facet repeats its last corner.
 FACETS = {
     "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
     "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),
@@ -449,7 +449,7 @@ class CellBlock(NamedTuple):
 
 
 def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
-    """Split a table of cells (E, c) by type; types with few corners come first.
+    """Split a table of cells (E, c) by type; types with fewer corners come first.
 
     In a mixed table, a cell with fewer than c corners repeats some of its corners: a
     triangle among quadrilaterals is (a, b, c, c), a wedge among hexahedra is (a, b, c,
@@ -545,17 +545,18 @@ class Mechanics:
     to_primal: Callable[[Solution], Solution]
     factorise: Callable[
         [], Inverse
-    ]  #: factorises K and returns K⁺; called at most once
+    ]  #: factorises K and returns K⁺; called at the first access to `inverse`
     #: cell size of the contact side, in the unit of length of `primal`
     mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
     #: equilibrium
     rigid: NDArray[np.float64]
-    #: names of the bodies, in the order of the columns of `rigid`
+    #: names of the bodies, in the order of their columns in `rigid`
     names: tuple[str, ...] = ()
     scale: float = 1.0  #: energy = scale·(objective of `primal`) + constant
     constant: float = 0.0
-    #: mesh of u, needed to compare meshes, see `harness.crossval.discretisation`
+    #: mesh of u, needed to compare solutions on different meshes; see
+    #: `harness.crossval.discretisation`
     grid: Grid | None = None
     friction: Friction = NO_FRICTION
     #: returns the `Certificate` of a displacement (n,) and the multipliers (m,) of
@@ -722,7 +723,9 @@ def constrained_first(
 ) -> tuple[NDArray[np.float64], int]:
     """Return an orthogonal V (r, r) and the number p of nonzero columns of BRV.
 
-    The nonzero columns come first. Values up to `MOTION_ROUNDING` count as zero.
+    The nonzero columns come first. Each row of B is divided by its length. A column of
+    the product counts as zero if its length is at most `MOTION_ROUNDING` times the
+    largest entry of |B||R|.
 
     B : (m, n) rows of contact and friction
     R : (n, r) rigid motions

@@ -75,9 +75,9 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     Raises
     ------
     InputError
-        If a family, key or form is unknown, a key is set twice, a component is not
-        of the form key=value, a value has the wrong type, or ``family.check`` refuses
-        the values.
+        If a family, key or form is unknown, the form or the path is missing, a key is
+        set twice, a component is not of the form key=value, a value has the wrong type,
+        or ``family.check`` refuses the values.
 
     Examples
     --------
@@ -207,8 +207,8 @@ def unbuilt(name: object, e: BaseException) -> str:
 def is_shared(name: CaseId) -> bool:
     """Return True if MPI ranks can assemble the QP of a case, see `Family.emission`.
 
-    The result is False if the family raises an exception. A later call of `build`
-    raises the same exception, which is then reported.
+    The result is False if the family raises an exception. The case is then built by a
+    single process.
     """
     try:
         return name.family.emission(name.form, name.params) is not None

@@ -6,7 +6,7 @@ operator while the clock runs. Work before the first product, such as a factoris
 therefore counts as preparation of the solver.
 
 The function that builds P, called its *maker*, is looked up by name in a table, the
-``OPERATORS`` of a plug-in or of a package. A file contains only the name of the maker,
+``OPERATORS`` of a plug-in or of a package. A file refers to the maker only by its name,
 and therefore cannot cause the import of a module.
 """
 
@@ -136,8 +136,8 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
     def least_eigenvalue(self) -> float | None:
         """Proven lower bound on the eigenvalues of P, or None if it is unavailable.
 
-        A positive bound yields an error bound for any answer over convex sets
-        (`harness.verify.certificate.certify_by_eigenvalue`).
+        A positive bound yields error bounds for answers to QPs over convex sets without
+        rows (`harness.verify.certificate.certify_by_eigenvalue`).
         """
         return getattr(self.build(), "least_eigenvalue", None)
 

@@ -117,8 +117,8 @@ class Tightening(Chained, Protocol):
 class About:
     """Description of a solver, for lists and reports.
 
-    A solver may have an `About` as its attribute ``about``. Each text is Markdown and
-    has one or two sentences. The docstring of the solver's class, rather than this
+    A solver may have an `About` as its attribute ``about``. The texts are Markdown and
+    have at most a few sentences. The docstring of the solver's class, rather than this
     description, explains the translation of the tolerance.
     """
 
@@ -137,7 +137,7 @@ class About:
 
     @property
     def missing(self) -> str | None:
-        """Message with the package to install, or None if the library is installed."""
+        """Message with the package to install, or None if no package is missing."""
         module = self.module or self.package
         if not module or find_spec(module) is not None:
             return None
@@ -161,7 +161,8 @@ class ContactSide:
     pressure: Vector  #: (s,) contact pressure in Pa, positive in compression
     #: (s,) gap in m, positive if open; NaN at nodes without an opposite side
     gap: Vector
-    #: (s,) compressive force along the normal of the contact row of each node, N/m
+    #: (s,) compressive force along the normal of the contact row of each node: N/m in
+    #: 2D, N in 3D
     push: Vector | None = None
     #: (s,) tangential traction on the side, Pa; in 3D the magnitude of the traction
     shear: Vector | None = None
@@ -179,9 +180,9 @@ class ContactSide:
         With friction, a node is in contact if the node sticks or slips. A force is not
         a sufficient criterion, since under Tresca's law forces also act without
         contact. Without friction, a node is in contact if its `push`, or the norm of
-        its force if `push` is None, exceeds `least` (N/m). The norm of the force is a
-        less accurate criterion, because on a curved side a mortar row also causes
-        tangential forces at adjacent nodes.
+        its force if `push` is None, exceeds `least` (in the unit of forces). The norm
+        of the force is a less accurate criterion than `push`, because on a curved side
+        a mortar row also causes tangential forces at adjacent nodes.
         """
         mask: NDArray[Any]
         if self.friction is not None:
@@ -335,7 +336,7 @@ class Family(ABC):
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the geometry that `refined` does not refine; "" if there is none.
+        """Describe the geometry that `refined` does not refine, or return "".
 
         The text is appended to an estimate of the discretisation error, for instance
         "of the bodies as they are meshed".

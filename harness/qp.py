@@ -24,7 +24,7 @@ Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: absolute entry of P.
 SYMMETRY_TOLERANCE = 1e-12
 #: Largest number of rows of P for which convexity is checked by a Cholesky
-#: factorisation. The factorisation of a P of this size takes 0.25 s.
+#: factorisation. For a P of this size, the factorisation takes less than a second.
 _MAX_FACTORED_ROWS = 2000
 #: Smallest permitted eigenvalue of the scaled P. The limit is negative, since entries
 #: rounded to six digits, as in some text formats, may perturb zero eigenvalues.
@@ -192,7 +192,8 @@ class QP:
         ------
         InputError
             If an argument is missing, is not numeric, has the wrong shape or contains
-            NaN, if bounds cross, or if P is not symmetric or not positive semidefinite
+            NaN (or inf, except in bounds), if `sets` is not a valid tuple of convex
+            sets, if bounds cross, or if P is not symmetric or not positive semidefinite
             (see `check_convex`).
 
         Examples
@@ -296,7 +297,7 @@ class QP:
 def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
     """Check the sets, and convert discs of one variable to bounds.
 
-    Empty sets are omitted.
+    Sets without variables are omitted, except those of a class with `may_be_empty`.
 
     Raises
     ------
@@ -389,7 +390,8 @@ def check_convex(P: Matrix) -> None:
     Raises
     ------
     InputError
-        If P has a diagonal entry or an eigenvalue below these limits.
+        If D⁻½PD⁻½ has an eigenvalue of at most −1e-6, or if a diagonal entry of P is
+        below −1e-10 max|P|.
 
     """
     largest = float(abs(P).max()) if P.shape[0] else 0.0
@@ -421,8 +423,8 @@ def _triangle(P: Matrix) -> str:
     for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
         if not abs(other).max():
             return (
-                f"; P is {name} triangular, but is stored whole here: expected both "
-                "triangles, P + P.T - diag(diag(P))"
+                f"; P is {name} triangular: expected both triangles, "
+                "P + P.T - diag(diag(P))"
             )
     return ""
 

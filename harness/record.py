@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 #: Version of a journal line, which increases whenever the meaning of a field changes.
 #: Version 2 changed the scales of the four residuals (docs/verdicts.md).
 SCHEMA = 2
-#: Largest residual of a verified answer, relative to the tolerance.
+#: An answer counts as verified if its residuals are at most this multiple of the
+#: tolerance.
 VERIFIED_FACTOR = 10.0
 READABLE = (1, 2)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
@@ -81,7 +82,7 @@ class Verdict(StrEnum):
 class Measurement:
     """Time and memory needed to prepare and to solve; None if not measured.
 
-    Every field is also a field of the journal, with a value of at least 0.
+    Every field is also a field of the journal, with a nonnegative value or null.
     `harness.verify.measure` sets the fields in the worker, and all fields are
     transferred to the record.
     """
@@ -399,7 +400,7 @@ def _check(r: Record) -> None:
     if r.schema not in READABLE:
         raise ValueError(_WRONG_SCHEMA)
     if not r.run_id:
-        raise ValueError("run_id is empty; expected a string")
+        raise ValueError("run_id is empty; expected a nonempty string")
     for name, at in (
         ("tol", r.tol),
         ("accuracy", r.accuracy),
@@ -441,7 +442,7 @@ def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:
     for part, pair in spent.items():
         if not min(pair) >= 0:
             raise ValueError(
-                f"{where}[{shown(part)}] = {pair!r}; expected a number of at least 0"
+                f"{where}[{shown(part)}] = {pair!r}; expected two numbers of at least 0"
             )
 
 

@@ -3,7 +3,7 @@
 A registry maps names to solvers or families. In a registry of solvers, the entry
 ``"PREFIX:*"`` represents all backends of a generic adapter. In the name
 ``PREFIX:BACKEND``, the text after the last colon is the value of the adapter's field
-``backend``. If the adapter has a method ``backends()``, the method returns the
+``backend``. An adapter may have a method ``backends()``, which returns the names of the
 installed backends.
 
 A plug-in file is loaded as a separate Python package, whose path is the folder of the
@@ -136,10 +136,11 @@ class PluginFile:
         return replace(self, path=self.path.resolve())
 
     def content(self) -> Iterator[bytes]:
-        """Yield the bytes of the file, then of its neighbours, sorted by path.
+        """Yield the bytes of the file, then paths and bytes of imported neighbours.
 
-        Neighbours are the modules in the same folder that the file imports, directly or
-        through other neighbours. Import statements inside functions are included.
+        These are the modules in the same folder that the file imports, directly or
+        through other neighbours, sorted by path. Import statements inside functions
+        count.
 
         Raises
         ------
@@ -368,7 +369,7 @@ def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[s
     """
     if both := sorted(known.keys() & new.keys()):
         remedy = (
-            "rename the new one, or tell its plug-in apart by --plugin LABEL=FILE.py"
+            "rename the new one, or label its plug-in by --plugin LABEL=FILE.py"
             if what == "solver"
             else "rename the new one, or load one of the two"
         )

@@ -130,7 +130,7 @@ class Solution:
         )
 
     def mismatch(self, qp: QP) -> str | None:
-        """Return a message if a vector does not have the shape that `qp` requires."""
+        """Return a message if the shape of a vector does not fit `qp`, else None."""
         expected = {"x": qp.q, "y": qp.b, "z": qp.h, "z_box": qp.q}
         for name, like in expected.items():
             got = np.shape(getattr(self, name))
@@ -178,7 +178,7 @@ def _column(name: object, values: object) -> NDArray[Any]:
         raise ValueError(f"{name!r} is the name of a column, expected an identifier")
     column = np.asarray(values)
     if column.ndim != 1:
-        raise ValueError(f"{name} has shape {column.shape}, expected one row each")
+        raise ValueError(f"{name} has shape {column.shape}, expected one dimension")
     kind = column.dtype.kind
     if kind == "U" and column.dtype.itemsize <= 4 * _MAX_TEXT:
         return column

@@ -52,7 +52,7 @@ from mortarbench.harness.verify.measure import (
     reason_to_decline,
 )
 
-#: beginning of the names of checks that need a solution
+#: beginning of the names of checks that compare the answer with a planted solution
 SOLUTION_PREFIX = "finds the planted solution"
 #: beginning of the names of checks of QPs over discs and cones
 SETS_PREFIX = "solves over"
@@ -118,7 +118,7 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve as in a measurement; require a point, unless the solver declines the QP."""
+    """Solve as in a measurement; raise if the solver declines or fails without x."""
     s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
@@ -287,7 +287,7 @@ def _many_bounds_and_no_rows(solver: Solver) -> None:
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Require that a solve uses one thread: CPU time must not exceed wall time."""
+    """Require that a solve uses one thread: CPU time is at most about the wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
     # permit all CPUs, because on a single CPU the CPU time of two threads would not

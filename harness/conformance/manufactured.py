@@ -37,10 +37,10 @@ def manufactured(
 ) -> tuple[QP, Solution]:
     """Return a random QP with a known KKT point.
 
-    The point, its multipliers and the active set are drawn at random, and q follows
-    from stationarity. The entries of the matrices are of order one. Some constraints of
-    every type in the shape are active. The minimiser is unique except for the shape
-    "singular".
+    The point and its multipliers are drawn at random, the active set is fixed, and q
+    follows from stationarity. The entries of the matrices are of order one. Some
+    constraints of every type in the shape are active. The minimiser is unique for every
+    shape except "singular".
 
     shape : a key of `SHAPES`
 
@@ -69,8 +69,8 @@ def _plant(
     y = rng.standard_normal(m)
     # multipliers of active rows are at least 0.5, so that complementarity is strict
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of every four variables, one is at its lower bound, one is at its upper bound, and
-    # two are between their bounds
+    # of every four variables, one is at its lower bound and one is at its upper bound,
+    # if these bounds exist; no other bounds are active
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
     bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
@@ -105,12 +105,12 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
     """Return a random QP over discs and cones, with its solution.
 
     Each block has two tangential components; a cone also has a normal component. Radii
-    and normal components are between 0.1 and 10. Two of three successive discs are
-    active. Of three successive cones, one has the point on its boundary (slip), one at
-    its apex (open), and one in its interior (stick). Multipliers of active blocks have
-    a distance of at least 0.5 from the boundary of the normal cone, so that
-    complementarity is strict. The eigenvalues of P exceed 0.1. Two further variables
-    have lower bounds, one of which is active.
+    and nonzero normal components are between 0.1 and 10. Two of three successive discs
+    are active. Of three successive cones, one has the point on its boundary (slip), one
+    at its apex (open), and one in its interior (stick). Multipliers of active blocks
+    have a distance of at least 0.35 from the relative boundary of the normal cone, so
+    that complementarity is strict. The eigenvalues of P exceed 0.1. Two further
+    variables have lower bounds, one of which is active.
 
     shape : a key of `SET_SHAPES`
 

@@ -16,10 +16,10 @@ of rows. Such relations are called metamorphic (T. Y. Chen et al., ACM Computing
 
       y = Mᵀy',  z = Nᵀz'
 
-If all factors are powers of two, every change except a shift is exact in floating-point
-arithmetic. The structure of the QP is also transformed: P = BK⁺Bᵀ becomes P' = B'K'⁺B'ᵀ
-with B' = TᵀB and K' = K/t. Substitutions of unknowns require P as a matrix and raise
-ValueError if P is an operator.
+If all factors are powers of two, the data of every changed QP except a shifted one are
+exact in floating-point arithmetic. The structure of the QP is also transformed: P =
+BK⁺Bᵀ becomes P' = B'K'⁺B'ᵀ with B' = TᵀB and K' = K/t. Substitutions of unknowns
+require P as a matrix and raise ValueError if P is an operator.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _selections(
 
 
 def _sorted(M: Matrix) -> Matrix:
-    """Sort the indices of a sparse matrix in place; products leave them unsorted."""
+    """Sort the indices of a sparse matrix in place; a product may not sort them."""
     if hasattr(M, "sort_indices"):
         M.sort_indices()
     return M

@@ -4,14 +4,14 @@ Let u and λ be the displacement and the multipliers of the answer, and u* and �
 displacement and the multipliers of the solution. Let ‖·‖ be the energy norm, and u_λ
 the displacement in equilibrium with the load and the contact forces −Bᵀλ. An answer is
 verified at tolerance t if its KKT residuals are at most 10t. The residual of the
-duality gap g is g/‖u*‖². By the identity of Prager and Synge
-(`harness.verify.certificate`, (2)),
+duality gap g is g/E with an energy E; here, E is taken to be ‖u*‖². By the identity of
+Prager and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
 
 so that a verified answer has errors ‖u − u*‖ and ‖u_λ − u*‖ of at most √(20t)‖u*‖. The
 error ‖u_λ − u*‖ equals the error ‖Bᵀ(λ − λ*)‖ of the contact forces in the dual norm.
-The multipliers need not be unique.
+It is used instead of the error of λ, since the multipliers need not be unique.
 
 A contact row i with the estimated compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. Errors
 within this bound change λᵢDᵢ or gapᵢ by about sᵢ = √(20t Dᵢ)‖u*‖. A reference and an
@@ -70,7 +70,7 @@ class Deviation(NamedTuple):
 
 
 def energy_allowed(tol: float) -> float:
-    """Return √(20 tol), the largest relative error of an answer verified at `tol`."""
+    """Return √(20 tol), a bound on the relative error of answers verified at `tol`."""
     return float(np.sqrt(2 * allowed(tol)))
 
 
@@ -80,8 +80,8 @@ def assess(
 ) -> tuple[Assessment, Deviation]:
     """Compute the errors of an answer to a problem with mechanics.
 
-    If the displacement of the solution is zero, errors are relative to the displacement
-    under the load without contact.
+    If ‖u*‖ = 0, errors are relative to the energy norm of the displacement under the
+    load without contact.
 
     truth : reference point
     s : answer as a finite point, returned by ``mechanics.to_primal``

@@ -2,9 +2,11 @@
 
 The reference is a point with a proven error bound (`harness.verify.references`), which
 is computed independently of the solvers under test. An answer is refuted if a residual
-is too large. It is also refuted if its distance to the reference, minus the error bound
-of the reference, exceeds the error that the claim of the answer permits
-(`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
+is too large or, if an optimum is proven, if the error relative to this optimum is too
+large. It is also refuted if a multiplier is inadmissible, or if its distance to the
+reference, minus the error bound of the reference, exceeds the error that the claim of
+the answer permits (`harness.crossval.assessment`). Agreement of several answers is not
+used as evidence.
 If two answers differ by more than the sum of the permitted errors, and neither answer
 is refuted, the disagreement is unresolved.
 """
@@ -40,7 +42,8 @@ from mortarbench.harness.verify.kkt import allowed, verdict
 from mortarbench.harness.verify.optimum import Proves, decided, proves
 from mortarbench.harness.verify.verdicts import note_of
 
-#: Smallest error of an outlier, relative to the median error of the other solvers.
+#: An answer is an outlier if its error exceeds this multiple of the median error of the
+#: other solvers.
 OUTLIER_RATIO = 100
 #: smallest number of answers of other solvers for which a median is computed
 MIN_PEERS = 3
@@ -63,7 +66,7 @@ class Answer:
     residuals: Mapping[str, float]
     #: error relative to a proven optimum, which decides instead of the residuals
     optimum_error: float | None
-    allowed: float  #: largest residual of a verified answer
+    allowed: float  #: largest residual (or `optimum_error`) of a verified answer
     energy_allowed: float  #: largest permitted relative error in the energy norm
     energy_bound: float | None  #: certified error bound that the run stored
     doubt: float | None  #: bound on the relative error of the reference point

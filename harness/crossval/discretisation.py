@@ -2,7 +2,7 @@
 
 Let u be the exact solution, û the reference solution on the mesh of the case, and u_h,
 u_{h/2}, u_{h/4} solutions on meshes with successively halved cell size h. Each solution
-is interpolated on the next mesh. The distances of successive solutions in the energy
+is interpolated onto the next mesh. The distances of successive solutions in the energy
 norm ‖·‖ determine the rate of convergence and the remaining error (Richardson
 extrapolation of squared errors):
 
@@ -139,8 +139,8 @@ def estimate_error(
     if rate <= 0:
         return replace(
             found,
-            note="the error does not decrease on these meshes: the next halving "
-            f"changes {2 ** (-rate / 2):.3g} times as much",
+            note="the error does not decrease on these meshes: the second halving "
+            f"changes u {2 ** (-rate / 2):.3g} times as much as the first",
         )
     if rate < MIN_RATE:
         return replace(

@@ -1,8 +1,9 @@
 """Reference point with which the answers to one problem are compared.
 
 The reference point is computed by the reference solve. If this solve fails, the answer
-with the smallest certified error replaces the reference point, and the report states
-this. Agreement of several answers is not used as evidence.
+with the smallest certified error (for a QP without mechanics, with the smallest KKT
+residual) replaces the reference point, and the report states this. Agreement of several
+answers is not used as evidence.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ FACES = ((0, 2), (4, 6), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
 class NonNestedMeshError(ValueError):
-    """The refined mesh is not the coarse mesh with every cell halved."""
+    """Error for a mesh that is not the refinement of the coarse mesh."""
 
     def __init__(self) -> None:
         super().__init__("the refined mesh is not the mesh with every cell halved")

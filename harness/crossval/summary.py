@@ -27,7 +27,7 @@ class Row:
     tol: float
     answers: int  #: number of answers with a stored point
     refuted: int  #: number of refuted claims
-    unanswered: int  #: number of measurements without a claim of success
+    unanswered: int  #: number of measurements in `Validation.unanswered`
     #: median of the bounds on the relative error in the energy norm
     error_median: float | None
     error_worst: float | None  #: largest bound on the relative error in the energy norm

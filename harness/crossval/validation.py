@@ -1,8 +1,8 @@
 """Cross-validation of a result folder, case by case.
 
-No quantity that the run computed from the answers is reused. Cases are rebuilt, and
-residuals, errors and distances are computed from the stored points. Answers that cannot
-be assessed are listed with the reason.
+No quantity that the run computed from the answers is used as evidence. Cases are
+rebuilt, and residuals, errors and distances are computed from the stored points.
+Answers that cannot be assessed are listed with the reason.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class Validation:
     solvers: tuple[str, ...]  #: labels of all solvers with a record
     #: false claims without a point, which are not in `problems`
     false_claims: tuple[Listed, ...]
-    #: measurements that ended without a claim of success, such as crashes and limits
+    #: measurements that ended without a claim of success, such as crashes and limits;
+    #: without declined QPs, proven claims of infeasibility, and `false_claims`
     unanswered: tuple[Listed, ...]
     #: stored points and claims of infeasibility that could not be assessed
     not_validated: tuple[Listed, ...]
@@ -75,7 +76,10 @@ class Validation:
 
     @property
     def agreed(self) -> bool:
-        """True if no claim is refuted and no two answers contradict each other."""
+        """True if no claim is refuted, and no pair of answers is unresolved.
+
+        Certificates of the run must not contradict the references either.
+        """
         return not self.false_claims and not any(
             p.unresolved or any(a.refuted or a.contradiction for a in p.answers)
             for p in self.problems
@@ -116,7 +120,8 @@ def validate_folder(
 ) -> Validation:
     """Assess all answers of a result folder.
 
-    reference : function that solves a QP accurately, independent of all solvers
+    reference : function that solves a QP accurately, independent of the solvers under
+        test
     tell : progress callback, called with the name of each case before it is assessed
 
     Raises

@@ -198,10 +198,10 @@ class SummedFactor:
     def shifted(self, shift: float, less: Dense) -> SummedFactor:
         """Factorise (1 + shift)A − Σ_p `less`_p, where L is the factor of A.
 
-        less : (b, b) matrix of this rank on its border, such that Σ_p `less`_p ≤ A. The
-            factorised matrix is then at least shift·A. Since Schur complements are
-            monotone, its Schur complements are at least `shift` times the Schur
-            complements of A, whose factors are L_cc and L_ss.
+        less : (b, b) matrix of this rank on its border, such that Σ_p `less`_p ≤ A as
+            quadratic forms. The factorised matrix is then at least shift·A. Since Schur
+            complements are monotone, its Schur complements are at least `shift` times
+            the Schur complements of A, whose factors are L_cc and L_ss.
         """
         local, c, scale = self.local, self.local.changing, 1 + shift
         T = scale * local.complement - less

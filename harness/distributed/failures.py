@@ -1,11 +1,11 @@
 """Collective handling of failures: all ranks raise, or all processes end.
 
-If a single rank raised an exception, the other ranks would wait for its messages for
-ever. Work that may fail is therefore called by `run_collectively`. This function then
-exchanges the outcomes of all ranks on a communicator that is used only for this
+If a single rank raised an exception, the other ranks might wait for its messages
+forever. Work that may fail is therefore called by `run_collectively`. This function
+then exchanges the outcomes of all ranks on a communicator that is used only for this
 purpose. A rank whose work failed waits in this exchange for the other ranks. If another
-rank does not arrive in time, it must be waiting for a message of the failed rank. In
-this case, the failed rank ends all processes (`abort`).
+rank does not arrive in time, it is probably waiting for a message of the failed rank.
+In this case, the failed rank ends all processes (`abort`).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-#: size in bytes of a message, so large that its time depends only on bandwidth
+#: size in bytes of a message, so large that its time depends mainly on the bandwidth
 LARGE_BYTES = 2**20
 #: number of batches of timed calls; the first batch is discarded as warm-up
 _BATCHES = 5

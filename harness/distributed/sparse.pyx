@@ -1,12 +1,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 """Linear maps that compiled code applies to vectors without calling Python.
 
-A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, or a composition
-of other maps. Operators of decomposed bodies, and the rows of their coarse problem, are
-implemented as linear maps. For short vectors, a product takes less time than the
-overhead of a library call. Products that are combined with a linear combination save
-another pass over the vectors. The module is compiled when the package is installed. `sparse.pyi` declares
-its types for Python, `sparse.pxd` for compiled callers.
+A `LinearMap` is a sparse matrix, the inverse of a factorised matrix, the identity, or a
+composition, sum or direct sum of other maps. Operators of decomposed bodies, and the
+rows of their coarse problem, are implemented as linear maps. For short vectors, a
+product takes less time than the overhead of a library call. Products that are combined
+with a linear combination save another pass over the vectors. The module is compiled
+when the package is installed. `sparse.pyi` declares its types for Python, and
+`sparse.pxd` declares them for compiled callers.
 """
 
 from libc.math cimport sqrt
@@ -438,16 +439,16 @@ cdef double PIVOT_TOLERANCE = 1e-3
 def factor_above(M, double share, L_0):
     """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
 
-    M is a difference of matrices of similar norm as L₀L₀ᵀ. If `share` is smaller than
-    the relative rounding errors of these matrices, the computed M may have negative
-    eigenvalues. In exact arithmetic, the pivots of M are at least the pivots of
-    share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is discarded, and
-    the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are computed.
-    Eigenvalues below `share` are set to `share`, and L follows from
+    M is a difference of matrices whose norms are similar to that of L₀L₀ᵀ. If `share`
+    is smaller than the relative rounding errors of these matrices, the computed M may
+    have negative eigenvalues. In exact arithmetic, the pivots of M are at least the
+    pivots of share·L₀L₀ᵀ. If a computed pivot is smaller, the Cholesky factor is
+    discarded, and the eigenvalues λ and eigenvectors Q of L₀⁻¹ML₀⁻ᵀ ≥ share·I are
+    computed. Eigenvalues below `share` are set to `share`, and L follows from
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   by a QR factorisation of √λ QᵀL₀ᵀ,
 
-    which contains no subtraction and therefore preserves the lower bound.
+    which contains no difference of matrices and therefore preserves the lower bound.
 
     M : (k, k) symmetric
     share : small positive factor of the lower bound
@@ -486,7 +487,9 @@ cdef bint factorised_above(
 
 
 cdef class BorderedFactor(LinearMap):
-    """Cholesky factor of a sparse A (n, n) whose last rows, the *border*, are dense.
+    """Cholesky factor of a sparse A (n, n), with a dense block for the last rows.
+
+    These last rows are called the *border*.
 
     ::
 

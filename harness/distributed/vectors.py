@@ -2,8 +2,8 @@
 
 Every rank runs the same code, and stores a slice of each vector. Elementwise operations
 need no communication. Reductions to a number are collective and return the same number
-on every rank, so that all ranks take the same branches. An algorithm written for NumPy
-vectors therefore runs unchanged on several ranks:
+on every rank, so that all ranks take the same branches. An algorithm that applies only
+such operations to NumPy vectors therefore runs unchanged on several ranks:
 
     x + alpha*p, np.where(free, g, 0)   elementwise, on the local slice
     x @ y, v.max(), moves.any()         reduction over all ranks

@@ -1,10 +1,10 @@
 """Copies of the input files of cases: ``FOLDER/files/DIGEST.SUFFIX``.
 
 To make a result folder self-contained, each file that defines a QP is copied into the
-folder, unless the file is too large. Files with equal content share one copy. The list
-``files/copies.json`` contains the paths that occur in the names of cases, including the
-paths of files that were too large to copy. Readers compare these paths with the names
-of cases and never open them.
+folder, unless the file, or the total size of the copies, would be too large. Files with
+equal content share one copy. The list ``files/copies.json`` contains the paths that
+occur in the names of cases, including the paths of files that were not copied. Readers
+compare these paths with the names of cases and never open them.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class _Entry(NamedTuple):
 class Copies:
     """Lookup of input files of cases, with the copies in a result folder as fallback.
 
-    The folder is read only if an original file is missing or has changed.
+    A copy is used only if the original file is missing or has changed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -191,7 +191,7 @@ def keep_copies(
 ) -> None:
     """Copy the input files of cases into a result folder; equal files share one copy.
 
-    tell : called with a message for each file that is too large
+    tell : called with a message for each file that is too large to be copied
 
     Raises
     ------

@@ -20,8 +20,8 @@ _FORMULA = frozenset("=+-@＝＋－＠")
 #: Unicode categories of characters that programs may skip at the start of a cell
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})
 _CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})  #: Unicode categories that are escaped
-#: Direction controls, which are escaped. They are listed singly because the other
-#: characters of their category, Cf, join letters and symbols and are harmless.
+#: Direction controls, which are escaped. They are listed individually because other
+#: characters of their category, Cf, are harmless, e.g. joiners of letters.
 _DIRECTIONS = frozenset(
     "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
 )

@@ -164,8 +164,8 @@ def _variable(element: _Element) -> tuple[str, Any]:
     """Return the name and the value of a variable.
 
     The value is a text, an array or a sparse matrix, or None if the type is not
-    supported. SciPy's reader is not used, since it crashes on some damaged files (SciPy
-    1.17.1).
+    supported. SciPy's reader is not used for version 5 files, since it crashes on some
+    damaged files (SciPy 1.17.1).
     """
     if element.kind == _COMPRESSED:
         element = _decompressed(element)

@@ -38,7 +38,7 @@ _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
 
 class _PickledError(ValueError):
-    """Array of Python objects, such as a SciPy matrix saved by NumPy."""
+    """Error for an array of Python objects, such as a SciPy matrix saved by NumPy."""
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -102,7 +102,7 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
             except _PickledError:
                 raise InputError(
                     f"{path}: {shortened(name)} is a pickled Python object, which is "
-                    "never read; expected an array of numbers (of a sparse matrix "
+                    "never read; expected an array of numbers (for a sparse matrix, "
                     "toarray(), or its parts as in docs/plugins.md)"
                 ) from None
         return arrays

@@ -65,8 +65,8 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
                     f"expected {expected}"
                 )
             yield file
-        # Errors with a file name, or about a full disk, come from other files that the
-        # block writes.
+        # Errors with a file name, or about a full disk, concern other files that the
+        # block opens or writes.
         except OSError as e:
             if e.errno in (None, *FULL) or e.filename is not None:
                 raise

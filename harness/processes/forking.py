@@ -1,6 +1,6 @@
 """Workers that are forked from the parent instead of started as new interpreters.
 
-A fork saves half a second of CPU time for loading numpy and scipy. Like a worker
+A fork saves about half a second of CPU time for loading numpy and scipy. Like a worker
 started by its command, a forked worker runs below a sub-reaper
 (`harness.processes.reaper`), in its own session, and on one CPU. Its only open files
 are its log and its two pipes. A forked worker starts with a copy of the parent's

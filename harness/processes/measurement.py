@@ -70,8 +70,9 @@ class JudgedMeasurement(NamedTuple):
     record: Record
     #: answer of the solver; None if the worker ended without an answer
     solution: Solution | None
-    #: True if there is a point but its quantities or error bounds are missing. False if
-    #: the ranks that solved the QP have evaluated their answer completely.
+    #: False if the quantities and error bounds of the answer need not be computed any
+    #: more, because the ranks that solved the QP have evaluated their answer completely
+    #: or have returned no point
     needs_evaluation: bool = True
 
 

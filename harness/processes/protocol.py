@@ -1,6 +1,6 @@
 """Protocol between the parent and its workers: lines of JSON over two pipes.
 
-The parent writes one request per line, and the worker answers each request by one or
+The parent writes one request per line, and the worker answers each request with one or
 more events. The worker ends when the pipe of requests is closed.
 
 * ``{"event": "ready"}`` is sent once, when the worker accepts requests.
@@ -12,8 +12,8 @@ more events. The worker ends when the pipe of requests is closed.
   the worker's CPU time. If MPI ranks emit the QP of a case, rank 0 sends ``{"event":
   "emitted", …}`` before "start". After "timed", and before the ranks evaluate the
   answer, rank 0 sends ``{"event": "measured"}``.
-* ``{"event": "fault", "what": …}`` replaces any other event if code of the harness
-  fails.
+* ``{"event": "fault", "what": …}`` is sent instead of the next event if code of the
+  harness fails.
 
 A library that writes to the wrong file descriptor can mix other bytes into the replies;
 `event_of` rejects such lines.
@@ -103,7 +103,7 @@ def _send(replies: TextIO, **event: Any) -> None:
 
 
 class ForeignReplyError(Exception):
-    """Reply that violates the protocol; the message quotes the start of the reply."""
+    """Error for a reply that violates the protocol; the message quotes its start."""
 
 
 def event_of(line: bytes, expected: str) -> dict[str, Any]:

@@ -298,7 +298,7 @@ class RankCosts(NamedTuple):
     The tables are empty for a solve in a single process.
     """
 
-    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by phase
+    seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
     counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
     network: Mapping[
         str, tuple[float, float]
@@ -404,7 +404,9 @@ class ParallelSolver:
             return reason_to_decline(self._solver, self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
-            return "P cannot be shared by ranks; expected a case in subdomains"
+            return (
+                "P cannot be shared by ranks; expected a case divided into subdomains"
+            )
         if product.parts < self._ranks.size:
             return (
                 f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "
@@ -458,7 +460,7 @@ def _emit_on_ranks(
     InputError
         If the family raises an InputError on every rank.
     RankFailedError
-        If some ranks fail with another error.
+        If the emission fails in any other way on at least one rank.
 
     """
     start = time.perf_counter()

@@ -76,7 +76,7 @@ def read_solver(path: Path) -> Any:
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
     """Yield loaded modules that a worker would not find in the same file."""
-    importable: dict[str, bool] = {}  # result of the test by top-level package
+    importable: dict[str, bool] = {}  # True if workers find it, by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if not isinstance(module, ModuleType) or not str(file).endswith(".py"):

@@ -1,17 +1,17 @@
 """Supervision of a worker process: requests, limits and diagnosis of exits.
 
-Only SIGKILL to all processes of a worker stops every solver, because C code ignores
-alarms and some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above
-each worker keeps these processes in one tree. Memory is limited by polling the resident
-size, because RLIMIT_AS includes address space that libraries reserve and never touch.
-The module requires the /proc file system of Linux.
+Only SIGKILL to all processes of a worker stops every solver, because Python handles an
+alarm only after C code has returned, and some solvers ignore SIGTERM. A sub-reaper
+(`harness.processes.reaper`) above each worker keeps these processes in one tree. Memory
+is limited by polling the resident size, because RLIMIT_AS includes address space that
+libraries reserve and never touch. The module requires the /proc file system of Linux.
 
 The times that a worker reports are checked against the parent's clock and against the
 CPU time that the kernel counts. While one worker executes a request, all other workers
 on its CPU are stopped by SIGSTOP, so that running threads of one solver do not disturb
 the measurement of another solver. Requests from several threads are therefore
-serialised. Signals are sent to pidfds, see pidfd_open(2), never to process IDs, which
-the kernel reuses.
+serialised. Signals to a worker and its descendants are sent to pidfds, see
+pidfd_open(2), since the kernel reuses process IDs.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class WorkerProcess:
 
     Two file descriptors, for requests and for replies, are appended to `command`. The
     worker runs in its own session, on the last CPU that this process may use.
-    Environment variables set the thread pools of all common libraries to one thread.
+    Environment variables set the thread pools of common libraries to one thread.
     The output of the worker goes to the file `log`.
 
     Several threads of a process may have workers, or share a worker: each request waits

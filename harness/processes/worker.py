@@ -119,8 +119,8 @@ class _SolverHost:
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds and a QP with constraint rows; ignore the results.
 
-        Code that is compiled or loaded at its first use must not be timed. The QP
-        models a chain of springs, long enough for solvers to enter all of their
+        Code that is compiled or loaded at its first use must not be timed. The QPs
+        model a chain of springs, long enough for solvers to enter most of their
         branches.
         """
         n = 32
@@ -148,7 +148,7 @@ class _SolverHost:
             return dict(run_check(request["check"], self._solver)._asdict())
         # Place the arrays at different addresses in each measurement. Otherwise, their
         # alignment to cache lines is random but fixed for the life of the process. The
-        # times of two processes of one solver then differ by 10 % and more, however
+        # times of two processes of one solver may then differ by 10 % or more, however
         # often they are measured (Mytkowicz et al., ASPLOS 2009). A varying alignment
         # converts this bias into scatter, which confidence intervals include.
         self._ballast = np.empty(0)

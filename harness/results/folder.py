@@ -1,4 +1,4 @@
-"""Result folders, each with one suite and one environment; a run locks its folder."""
+"""Result folders: checks of their content, suite, environments and lock."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, read_stored
 
 #: Folders and files that commands write to a result folder. ``--fresh`` deletes or
-#: overwrites only these folders and files.
+#: overwrites only these, those in `_RESULT_FILES`, and copies of input files.
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
 #: results of `mortarbench validate`, and faults of runs
@@ -60,7 +60,7 @@ def refuse_links(folder: Path) -> None:
     """Refuse a result folder with links, pipes, devices or too deeply nested folders.
 
     The folder may come from an untrusted source. Through a link, files outside the
-    folder could be overwritten or deleted. Opening a pipe could block for ever. Deeply
+    folder could be overwritten or deleted. Opening a pipe could block forever. Deeply
     nested folders could cause a stack overflow.
 
     Raises
@@ -270,7 +270,8 @@ def _open_lock(folder: Path) -> int:
         except BlockingIOError:
             os.close(fd)
             raise InputError(
-                f"{folder} is being written by another run; wait, or choose another"
+                f"{folder} is being written by another run; wait, or choose another "
+                "folder"
             ) from None
         except BaseException:
             os.close(fd)

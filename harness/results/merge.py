@@ -172,7 +172,7 @@ def _refuse_nested(source: Path, out: Path) -> None:
     for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
             raise InputError(
-                f"--out {out}: {inner} lies inside of {outer}; expected a folder "
+                f"--out {out}: {inner} lies inside {outer}; expected a folder "
                 "outside the folders to merge"
             )
 
@@ -186,7 +186,7 @@ def _refuse_run(out: Path) -> None:
     if others:
         raise InputError(
             f"{out} contains measurements of a run (journal/{min(others)}); expected a "
-            "new folder, or one that was merged before; choose another --out"
+            "new folder, or the result of an earlier merge; choose another --out"
         )
 
 

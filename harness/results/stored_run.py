@@ -33,7 +33,7 @@ class StoredRun:
     """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    #: records that differ from `record` only in the repeat, including `record`
+    #: records of all repeats of the measurement, including `record`
     repeats: list[Record]
     #: cases to measure: the case of the measurement, preceded by the earlier steps if
     #: it belongs to a sequence

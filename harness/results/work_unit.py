@@ -84,7 +84,8 @@ class MeasurementFault:
 
     record: Record  #: incomplete record of the missing measurement
     reason: str  #: reason in one line
-    tried_again: bool  #: True if the measurement is repeated and has another outcome
+    #: True if the measurement is repeated, which yields a further outcome
+    tried_again: bool
 
 
 Outcome = Result | BuildFailure | MeasurementFault

@@ -75,7 +75,7 @@ def on_cluster(
 
     address : address of a scheduler, or "local" to start a scheduler with a worker for
         each CPU of this machine
-    plugins : files that exist under the same paths on every node
+    plugins : files that must exist under the same paths on every node
     operators : makers of operators P by name, except those of `plugins`
     environment : environment of this process, with which nodes are compared
     keep : stores a node's environment under its digest

@@ -1,7 +1,8 @@
 """Dask plug-in that executes the blocks of a run on one machine of a cluster.
 
 Each Dask worker keeps an `Executor` open for the duration of the run. The solver
-processes of the executor are bound to a CPU that no other executor on the machine uses.
+processes of the executor are bound to a CPU that no other Dask worker on the machine
+uses.
 """
 
 from __future__ import annotations

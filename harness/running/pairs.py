@@ -34,11 +34,12 @@ class Ratio(NamedTuple):
 
 
 def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None:
-    """Return the mean ratio of two solvers' times over their common blocks.
+    """Return the geometric mean of the ratios of two solvers' times in common blocks.
 
     The logarithms of the ratios within blocks are averaged, and the interval follows
-    from Student's t distribution. A disturbance that slows down a whole block cancels
-    in the ratio. If there are fewer than two common blocks, return None.
+    from Student's t distribution. A disturbance that slows down a whole block by the
+    same factor cancels in the ratio. If there are fewer than two common blocks, return
+    None.
 
     a, b : times of the two solvers by block, in s
 

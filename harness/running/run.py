@@ -1,7 +1,7 @@
 """Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process selects the measurements. No other process writes to the result folder. An
-engine for this machine or for a cluster executes the blocks of measurements.
+This process selects the measurements, and it alone writes their results to the result
+folder. An engine for this machine or for a cluster executes the blocks of measurements.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def run(
 
     resolve : returns a solver with its options set; all options are stored in records
     environment, digest : content of environment.json, and the digest of that content
-    fresh : delete the content of `out` first
+    fresh : delete the previous results in `out` first
     engine : opens the engine that executes the blocks
 
     Returns

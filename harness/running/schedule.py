@@ -2,7 +2,7 @@
 
 The experimental design is a randomised complete block design. In each block, every
 solver is measured once on one case (or sequence) at one tolerance, in random order.
-Every second block reverses the order of the previous block. If the suite sets a
+Every second repeat reverses the order of the previous repeat. If the suite sets a
 precision, further blocks are measured after the prescribed repeats. The ratio of the
 time of each verified solver to the time of the fastest solver has a confidence interval
 (`harness.running.pairs`). No further blocks are measured when all these intervals are
@@ -191,7 +191,7 @@ class Schedule:
                 turns.append(turn)
         if not turns:
             return None
-        # Two consecutive repeats have the same seed, and the second repeat reverses the
+        # Repeats 2k and 2k + 1 have the same seed, and the second of them reverses the
         # order of the first. All solvers thus have the same mean position in the two
         # repeats.
         seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"

@@ -2,7 +2,7 @@
 
 The feasible set of a QP without its rows is the product S₀ × S₁ × …, where S₀ is a
 `Box` of all variables. Each further set constrains a block of variables that are free
-in S₀ and in all other sets. KKT residuals, verdicts, transforms and files use only the
+in S₀ and in all other sets. KKT residuals, verdicts and transforms use only the
 operations of `ConvexSet` and are therefore independent of the class of a set.
 
 A vector z is normal to S at x ∈ S if zᵀ(y − x) ≤ 0 for all y ∈ S. With the support

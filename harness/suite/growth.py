@@ -1,9 +1,10 @@
 """Permitted changes of a suite that has a result folder, and unions of suites.
 
-Such a suite may only be extended: solvers, cases and tolerances may be added, the
-number of repeats may be raised, and a precision may be set or tightened. The limits,
-the accuracy and the solver of each label must not change, since the stored measurements
-depend on these settings. Suites in which these settings agree can be united.
+Such a suite may only be extended: solvers, cases, tolerances and a `null_arm` may be
+added, the number of repeats and the budget may be raised, and a precision may be set or
+tightened. The limits, the accuracy and the solver of each label must not change, since
+the stored measurements depend on these settings. Suites in which these settings agree
+can be united.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def _text(value: object) -> str:
 
 
 def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
-    """Return a suite with the settings of the first suite and the measurements of all.
+    """Return a suite with the measurements of all suites; the first sets the rest.
 
     tables : results of `harness.suite.suite.read_stored` by folder
 

@@ -178,7 +178,7 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
 
 
 def _copied(pattern: str, family: Family) -> list[str]:
-    """Return the paths of copies in the result folder whose last components match."""
+    """Return the listed paths of copied files whose last components match a pattern."""
     if not PurePath(pattern).parts:
         return []
     return [path for path in family.copied_paths() if PurePath(path).match(pattern)]
@@ -191,8 +191,8 @@ def _located(
 
     If the path does not exist relative to the working directory, the path is
     interpreted relative to the folder of the suite. If the file is also missing in this
-    folder, and exactly one copy in the result folder matches, the path of the copy is
-    returned.
+    folder, and the result folder lists exactly one copied file that matches, the listed
+    path is returned.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():

@@ -10,7 +10,8 @@ precision. The multiplier of a row that is not closed is on the boundary of the 
 admissible multipliers: an open contact has λ = 0, and a slipping node with the friction
 bound g has ‖λ‖ = g. As in a primal-dual active set method, a closed row leaves A if its
 multiplier is not in Λ. A row of N enters A if its motion contradicts its multiplier
-(for contact, if the gap is negative). The exchange ends when A does not change.
+(for contact, if the gap is negative). The exchange ends when A does not change, or at
+the latest after a given number of exchanges.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Admissible pairs near an answer: no penetration, and forces in equilibrium.
 
-Moving each slave node separately cannot remove every penetration, because end nodes of
-an arc may be prescribed and a mortar row couples several nodes. Corrections are
-therefore computed simultaneously for a set of rows.
+Moving each slave node separately does not always remove every penetration, because end
+nodes of an arc may be prescribed and a mortar row couples several nodes. Corrections
+are therefore computed simultaneously for a set of rows.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def admissible(
     equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Here, F_VV = B_V
     K⁺B_Vᵀ is the compliance of the rows, and the columns of R are rigid motions. V
     initially consists of the closed and the violated rows and is extended until Bû ≤ c.
+    If this fails and c ≥ 0, û = θu with θ ≤ 1, without equality on the closed rows.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
@@ -131,7 +132,7 @@ def _feasible_near(
 
 
 def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
-    """Return θu with the largest θ ≤ 1 such that Bθu ≤ c holds despite rounding."""
+    """Return θu ≈ u with θ ≤ 1 such that Bθu ≤ c despite rounding; None if c ≱ 0."""
     B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
         return None
@@ -265,7 +266,7 @@ def _compliance(
     Up to MAX_DENSE_ROWS rows, the solver is a Cholesky factorisation. The matrix may be
     singular up to rounding, so its diagonal is shifted by 1e-13 of its largest entry;
     the next round of `_feasible_near` corrects the resulting error. Larger systems are
-    solved by CG, preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    solved by CG, preconditioned by the inverse of B_V K B_Vᵀ.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:
@@ -295,7 +296,8 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
     ------
     UncertifiableError
         If contact cannot balance the load along a rigid motion: the motion does not
-        change any gap, or only tensile contact forces could balance the load.
+        change any gap or slip, or only tensile contact forces, or friction above its
+        bound, could balance the load.
 
     """
     exact, motions = mechanics.exact, mechanics.motions
@@ -394,7 +396,8 @@ class Balance(NamedTuple):
         Raises
         ------
         UncertifiableError
-            If only tensile contact forces could balance the load.
+            If only tensile contact forces, or friction above its bound, could balance
+            the load.
 
         """
         if not self.G.shape[1]:

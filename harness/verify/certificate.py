@@ -29,7 +29,7 @@ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2). Hence, for 
 where the right-hand side is at most √(2g) if u is û or u_λ.
 
 Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ minus the root in (3).
-This bound differs noticeably from ‖û‖ only if the error is as large as the solution.
+This bound differs much from ‖û‖ only if the error is comparable with the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
 rigid motions R; otherwise D(λ̂) = −∞. In this case ‖v‖ is a seminorm, the energy norm
@@ -379,7 +379,7 @@ def _proved(split: Undivided, *pair: Any) -> Certificate | str:
 
 
 def is_sharp(outcome: Certificate | str) -> bool:
-    """Return True if another pair could improve the certificate only slightly."""
+    """Return True if the bound is small, or another pair could hardly improve it."""
     return isinstance(outcome, Certificate) and (
         outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
     )

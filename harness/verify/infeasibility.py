@@ -45,9 +45,9 @@ from mortarbench.harness.verify.rational import (
 #: contradict one another by a smaller margin if their right-hand sides are rounded sums
 #: of thousands of terms.
 MIN_MARGIN = 1e-12
-#: Fractions of the largest multiplier of the scaled rows, which are tried in turn.
-#: Smaller multipliers are set to zero. Iterative solvers return small multipliers for
-#: rows that do not contribute to the proof.
+#: Multipliers of scaled rows that are at most this fraction of the largest multiplier
+#: are set to zero; the fractions are tried in turn. Iterative solvers return small
+#: multipliers for rows that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 #: Largest |cⱼ| that counts as an approximation of 0, relative to the sum of its
 #: absolute terms.
@@ -156,9 +156,10 @@ def _corrected(
     """Yield rays near w that satisfy cⱼ = 0 exactly where required.
 
     cⱼ = 0 is required for variables without bounds. It is also required for variables
-    with a single bound if cⱼ is small and has the sign for which V is infinite. Three
-    rays are tried: w itself, a ray with cⱼ = 0 wherever cⱼ is small, and a ray with cⱼ
-    = 0 only where required.
+    with a single bound if cⱼ is small and has the sign for which V is infinite. The
+    first ray is w itself. It is followed by rays with cⱼ = 0 wherever cⱼ is small, and
+    by rays with cⱼ = 0 only where required, each as an enclosure and, for few pivots,
+    also as an exact solution.
 
     M, w : rows with a nonzero multiplier, and their multipliers
     """

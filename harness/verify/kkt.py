@@ -3,11 +3,11 @@
 All residuals are scale-free: they do not change if the objective or a row is multiplied
 by a constant, so that one threshold suits every problem. A change of the unit of a
 variable can change only the dual residual, through the scale S of all components.
-All four residuals vanish if and only if the point is a KKT point. A KKT point is a
-solution if P is positive semidefinite, which is not checked here. docs/verdicts.md
-states what small residuals prove about the objective. If residuals do not suffice for a
-verdict, `harness.verify.optimum` compares the objective of the point with a proven
-optimum.
+Up to rounding, all four residuals vanish if and only if the point is a KKT point. Such
+a point is a solution if P is positive semidefinite, which is not checked here.
+docs/verdicts.md states what small residuals prove about the objective. If residuals do
+not suffice for a verdict, `harness.verify.optimum` compares the objective of the point
+with a proven optimum.
 """
 
 from __future__ import annotations
@@ -587,12 +587,13 @@ def verdict(
 ) -> Verdict:
     """Return the verdict on a point, given its residuals.
 
-    A point is verified if every residual is at most factor·tol (`allowed`), regardless
-    of the claim of the solver. Otherwise, the claim determines the type of failure. If
-    the error relative to a proven optimum, `error`, is given, it replaces all
-    residuals. A refuted claim of success is `inaccurate` if the point has at least half
-    of the requested digits (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A
-    point with a residual above 0.1 is not verified at any tolerance.
+    A point is verified if every residual is at most factor·tol (`allowed`), even if the
+    solver claims no success, unless the QP was declined or is proven to be infeasible.
+    Otherwise, the claim determines the type of failure. If the error relative to a
+    proven optimum, `error`, is given, it replaces all residuals. A refuted claim of
+    success is `inaccurate` if the point has at least half of the requested digits
+    (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
+    above 0.1 is not verified at any tolerance.
 
     infeasible : True if the QP is proven to have no feasible point, which verifies a
         claim of infeasibility regardless of the point

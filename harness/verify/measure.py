@@ -247,7 +247,9 @@ def _inner(seconds: float, sample_seconds: float) -> int:
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:
-    """Return VmRSS (resident memory) or VmHWM (its peak) in MiB, or None if unknown.
+    """Return a size such as VmRSS (resident memory) in MiB, or None if it is unknown.
+
+    key : name of the size in /proc/PID/status, such as VmHWM for the peak of VmRSS
 
     ``ru_maxrss`` is not used: a process inherits this value from its parent, even after
     exec.

@@ -54,7 +54,7 @@ from mortarbench.harness.verify.rational import rational, solutions
 from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
 #: Largest number of coupled variables and rows of a QP that is passed to the reference
-#: solver, whose dense solve takes several times as long as the solve under test.
+#: solver, whose dense solve may take several times as long as the solve under test.
 MAX_COUPLED = 400
 #: Largest number of variables of a QP that is passed to the reference solver; an
 #: uncoupled variable costs one division.
@@ -111,8 +111,9 @@ def decided(
     Returns
     -------
     the larger of the error |f(x) − f*| and the violation of the constraints, both
-    relative to the scales of the optimum; the scale of the error is 10 times the
-    smaller of 500·|f*| and the sum of the absolute terms of f*
+    relative to the scales of the optimum. Unless f* is zero up to rounding, the scale
+    of the error is 10 times the smallest of 500·|f*|, max(xᵀPx, Σ|qᵢxᵢ|) at the
+    optimum, and the generous scale of energy (`harness.verify.kkt.energy_at`)
 
     """
     if not is_small(qp):

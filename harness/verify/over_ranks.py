@@ -3,16 +3,16 @@
 The method is described in `harness.verify.substructured`; MPI reductions complete the
 sums. Each rank stores the components of its subdomains. A component that several ranks
 store has the same value on all these ranks. The contact and friction rows and the
-coarse problem are replicated on all ranks. The number of these rows is similar to the
-number of nodes of the contact sides.
+coarse problem are replicated on all ranks. The number of contact and friction rows is
+of the order of the number of nodes of the contact sides.
 
 If only contact supports a body, its rigid motions are the few columns of a distributed
 matrix R, and products with Rᵀ are reductions in extended precision. The equilibrium of
 λ̂ with the load (`harness.verify.admissible.Balance`) requires only the load along R
 and the replicated motion of the contact rows.
 
-K is defined as the sum TᵀK_T T over subdomains. K is not assembled, so that the
-certificate includes no rounding from assembly.
+K is defined as the sum TᵀK_T T over subdomains. On several ranks, K is not assembled,
+so that the certificate includes no rounding from assembly.
 """
 
 from __future__ import annotations
@@ -191,7 +191,7 @@ class MPIReduction:
         """
         r, comm = self._local.motions, self._local.ranks.comm
         place = self._place[at]
-        # the local matrix contains unshared components; only shared components are sent
+        # components on this rank only are eliminated here; shared ones are sent
         inner, jointly = place < 0, place >= 0
         S_inner = csr_array(S[inner])
         mine = coo_array(M - S_inner.T @ scaled_rows(S_inner, scale[inner]))
@@ -455,8 +455,9 @@ def _largest(local: LocalBodies, R: Any) -> Extended:
 class _OnRanks:
     """Bodies distributed over ranks; see `harness.verify.substructured.Split`.
 
-    K is not assembled. Residuals are evaluated with TᵀK_T T and the exact kernels of
-    the subdomains. E is estimated by sampling the rounding of double precision.
+    Residuals are evaluated with TᵀK_T T and the exact kernels of the subdomains, since
+    K is not assembled on several ranks. E is estimated by sampling the rounding of
+    double precision.
     """
 
     def __init__(self, local: LocalBodies) -> None:

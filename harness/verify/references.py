@@ -36,7 +36,7 @@ from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-#: largest error bound of a cached result; a result with a larger bound is discarded
+#: a result computed from the cache is discarded if its error bound exceeds this value
 MAX_CACHED_BOUND = 1e-7
 #: Names and types of the cached arrays.
 STORED = {"states": np.dtype(np.int8), "multipliers": np.dtype(float)}

@@ -25,8 +25,8 @@ the diagonal matrix W of the stiffnesses of all copies,
 where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on all other
 components. The range of Z contains the gluing and support forces. Then K_T d = b is a
 small Neumann problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three
-rows per subdomain in 2D. The matrix is singular along motions of whole bodies that only
-contact resists; λ̂ balances the load along these motions
+rows per subdomain in 2D and six in 3D. The matrix is singular along motions of whole
+bodies that only contact resists; λ̂ balances the load along these motions
 (`harness.verify.admissible.balanced`). The multipliers of gluing and supports in an
 answer are not used.
 """
@@ -207,12 +207,13 @@ def sample(
 ) -> Extended:
     """Return a sample (n,) of the rounding of Ku in the precision `real`.
 
-    The error of each sum is a few units in the last place of √`variances`, the root of
-    the sum of the squared terms. The first contribution is RANDOM_ULPS with a random
-    sign, which excites all modes. The second is SMOOTH_ULPS with the sign of u, since u
-    is softer than most modes. The random sign is a hash of the number of the component,
-    so that all ranks use the same sign. The hash function is splitmix64, because signs
-    that alternate too regularly would do no work along smooth modes.
+    The error of each sum is modelled as a few units in the last place of √`variances`,
+    the root of the sum of the squared terms. The first contribution is RANDOM_ULPS with
+    a random sign, which excites all modes. The second is SMOOTH_ULPS with the sign of
+    u, since u is softer than most modes. The random sign is a hash of the number of the
+    component, so that all ranks use the same sign. The hash function is splitmix64,
+    because signs that alternate too regularly would do hardly any work along smooth
+    modes.
 
     variances : (n,) sums of the squared terms
     components : (n,) global numbers of the components
@@ -258,8 +259,8 @@ class _Stored(ABC):
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
         """Return Ku, the energy vᵀKv of the deformation v = u − RRᵀu, and v.
 
-        Ku is evaluated as Kv + (KR)Rᵀu. The terms of KR cancel, so that KR is stored
-        with twice the digits.
+        Ku is evaluated as Kv + (KR)Rᵀu, where KR was computed by `cancelling`, since
+        its terms cancel.
         """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u

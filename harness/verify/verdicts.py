@@ -170,9 +170,10 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     ``energy_bound`` bounds the errors of the answer and of the displacements û and u_λ
     that prove the bound (`harness.verify.certificate`). ``certificate`` contains the
     components of the bound, relative to a lower bound on ‖u*‖: `pair` = √(2(J − D)),
-    `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer
-    alone), `moved` = ‖u − û‖, and `friction`, the frictional part of `work`. `seminorm`
-    is 1 if bodies can move rigidly; the errors of these motions are not bounded.
+    `distance` = ‖û − u_λ‖, `work` (√(2λ̂ᵀ(c − Bû)) without friction), `answer` (the
+    bound of the answer alone), `moved` = ‖u − û‖, and `friction`, the frictional part
+    of `work`. `seminorm` is 1 if bodies can move rigidly; the errors of these motions
+    are not bounded.
 
     If the case has no mechanics but an operator P with a positive `least_eigenvalue`,
     the error of x is bounded in the norm of P (`certify_by_eigenvalue`).
@@ -206,10 +207,11 @@ def evaluated_by_ranks(
 
     Returns
     -------
-    a dict with `values`: objective and residuals, or None if they require the whole QP;
-    `bounds`: fields of `certified`, or None if they require the whole QP; `quantities`:
-    physical quantities, or None if they require the whole QP; `recover_seconds`: time
-    to evaluate the quantities; `notes`: reasons of failures
+    a dict with `values`: objective and residuals, or None if they are not finite or
+    require the whole QP; `bounds`: fields of `certified`, or None if they require the
+    whole QP; `quantities`: physical quantities, or None if they require the whole QP;
+    `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
+    After a failure, the values concerned are None or empty
 
     """
     found: dict[str, Any] = {

@@ -90,7 +90,7 @@ def refused(capsys, monkeypatch, tmp_path):
             "status = 'fine'; expected one of verified, verified_infeasible",
         ),
         ({"params": {"n": [1]}}, "params.n = [1]; expected a number or a string"),
-        ({"run_id": ""}, "run_id is empty; expected a string"),
+        ({"run_id": ""}, "run_id is empty; expected a nonempty string"),
         ({"options": {"x": [[[[[[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]]]]]]}}, "deeper"),
         ({"message": 10**5000 // 7 % 10**300}, "expected str"),
     ],
