@@ -13,11 +13,11 @@ ranks share, and all other operators and preconditioners call Python functions.
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free block of a sparse P
-* judge.pxi: KKT residuals of the original problem, computed from the gradient
+* judge.pxi: an upper bound on the KKT residuals for QPs with bounds only
 * mprgp.pxi: the inner loop
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
-* residuals.pxi: an upper bound of the KKT residuals of the QP
+* residuals.pxi: an upper bound on the KKT residuals of any QP that SMALBE solves
 
 tests/support/textbook contains the same algorithm in NumPy. Tests check that both
 versions take equal numbers of steps and reach the same points up to rounding.

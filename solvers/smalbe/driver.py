@@ -61,7 +61,7 @@ DISC_ROUNDING = 32 * EPS
 #: lower bound of the limit of Lanczos steps; applies to few unknowns
 MIN_LANCZOS_STEPS = 5
 #: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
-#: products. With 1e4, two or three outer iterations suffice
+#: products. With 1e4, two or three outer iterations usually suffice
 RHO = 1e4
 #: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG,
 #: so fewer outer iterations save time for decomposed bodies with thousands of rows
@@ -293,7 +293,8 @@ class OuterLoop:
     solver: compiled.SMALBE
     problem: Projected
     options: Options
-    #: k, right-hand side → observer of the steps of outer iteration k; None without one
+    #: k, right-hand side → observer of the steps of outer iteration k; None if no
+    #: history is recorded
     watch: Callable[[int, Vector], Note] | None
 
     def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
@@ -528,7 +529,10 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
-    """Return an upper bound of the worst KKT residual; exact if above `enough`."""
+    """Return an upper bound on the worst KKT residual.
+
+    The result is exact if it exceeds `enough` and the QP is not distributed.
+    """
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
         diagonal = task.scaled.diagonal

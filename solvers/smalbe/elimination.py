@@ -14,7 +14,7 @@ and the Schur complement
 
 The assembly of the Schur complement costs about as much as the factorisation of P_EE.
 In duals of contact problems, E contains the support forces, and P_EE = F_EE is the same
-in every load step.
+in every load step if the bodies are linearly elastic.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ cdef class IncompleteFactor:
                     m += 1
                 if far and m == count:
                     if count == MAX_DIAGONALS:
-                        count = n + 1  # too many diagonals diagonals
+                        count = n + 1  # too many diagonals
                     else:
                         offset[count] = far
                         count += 1

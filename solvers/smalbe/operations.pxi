@@ -1,6 +1,6 @@
 # The basic operations of SMALBE: sums over processes, products with F, and products
-# with orthonormal rows. On one process, these operations run without Python. Sums over
-# MPI ranks call Python.
+# with orthonormal rows. On one process, these operations run without Python, except
+# products with an operator that is not compiled. Sums over MPI ranks call Python.
 
 
 # --- numbers ------------------------------------------------------------------------

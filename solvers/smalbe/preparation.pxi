@@ -93,9 +93,9 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
 
 
 # A spectrum counts as flat if the ratio of the largest to the smallest Ritz value after
-# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG halves its
-# error in every step, and further products of the Lanczos process would cost more than
-# they save.
+# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG about halves
+# its error in every step, and further products of the Lanczos process would cost more
+# than they save.
 cdef double FLAT_RATIO = 10.0
 
 cdef enum:
