@@ -266,8 +266,8 @@ class Clusters:
 
     with arbitrary β. The columns of N are an orthonormal basis of ker CR. They describe
     the motions of clusters as rigid bodies, and the columns of RN span the kernel of K
-    on {v : Cv = 0}. M is block diagonal, with one block per cluster. Its Moore-Penrose
-    inverse M⁺ exists even if rows of C are linearly dependent. K̃⁺ is positive
+    on {v : Cv = 0}. M is block diagonal, with one block per cluster. The Moore-Penrose
+    inverse M⁺ is used because rows of C may be linearly dependent. K̃⁺ is positive
     semidefinite.
 
     The modes of a face are its rigid motions, orthonormal over its nodes. The columns

@@ -1,7 +1,7 @@
 """Line contact of cylinders, with Hertz's exact solution (Johnson 1985, Section 4.2).
 
 With 1/R = 1/R₁ + 1/R₂, 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ) and the force P per
-thickness, two elastic half spaces with radii of curvature R₁ and R₂ touch over |x| ≤ a
+thickness, two elastic bodies with radii of curvature R₁ and R₂ touch over |x| ≤ a
 with the pressure
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
