@@ -46,7 +46,7 @@ part, and N̄_j = N_j(ξ̄), the only linear solution is
 For a fully covered segment, Φ_1 = 2N_1 − N_2 and Φ_2 = 2N_2 − N_1.
 
 Friction rows have (−ν_y, ν_x) in place of ν; across an open gap, their forces have a
-moment. For both bases, the friction bound of a row under Tresca's law is the bound of
+moment. For both bases, the friction bound of a row under Tresca's law is the bound on
 the traction times ∫ N_j |ν|.
 
 Each row is divided by ∫ N_j |ν| over the covered part. Thus B is dimensionless, g̃ a

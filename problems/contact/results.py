@@ -129,9 +129,10 @@ def friction_quantities(
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
     inactive, active below the bound, and active at the bound. `sliding_without_contact`
     is the number of inactive rows with shear, which Tresca's law allows; these rows do
-    not count as open. `shear_without_contact` is their fraction of Σ‖λ_t‖.
-    `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for Tresca's.
-    `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m (J in 3D).
+    not count as open. `shear_without_contact` is the fraction of Σ‖λ_t‖ that acts on
+    these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for
+    Tresca's. `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m (J
+    in 3D).
     """
     state = states(primal, s, friction)
     shear = norms(s.z[primal.h.size :][friction.vectors])

@@ -46,8 +46,8 @@ class SubdomainClass:
 
     K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where ρ is the largest diagonal entry of K, and R*
     consists of the rows of R at the fixing components, orthonormalised, and zeros
-    elsewhere (see `problems.fem.inverse`). All subdomains of a class are solved at
-    once, as columns of one right-hand side.
+    elsewhere (see `problems.fem.inverse`). The systems of all subdomains of a class are
+    solved at once, with one column of the right-hand side for each subdomain.
     """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain

@@ -202,7 +202,8 @@ def _header(model: _QPSModel, section: str, words: list[str]) -> None:
         raise unknown("section", words[0], known)
     if section == "QSECTION" and words[1:] not in ([], [model.objective]):
         raise InputError(
-            f"QSECTION {words[1]} belongs to a constraint; expected {model.objective!r}"
+            f"QSECTION {words[1]!r} belongs to a constraint; expected "
+            f"{model.objective!r}"
         )
     if section == "OBJSENSE" and words[1:]:
         _sense(model, words[1:])

@@ -105,7 +105,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         linearise=keyed_linearisation(p),
         results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
-        # the first slip bound of Coulomb's law must be large enough for friction to
+        # the first friction bound of Coulomb's law must be large enough for friction to
         # support blocks that nothing else supports
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )

@@ -53,7 +53,7 @@ class Clarabel:
     Clarabel equilibrates the objective.
 
     Equalities are assigned to the zero cone; inequalities and finite bounds, one row
-    each, to the nonnegative cone.
+    each, to the nonnegative cone; discs and cones, to second-order cones.
     """
 
     max_iter: int = 200

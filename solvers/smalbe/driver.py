@@ -58,7 +58,7 @@ EPS = float(np.finfo(float).eps)
 #: feasible_set.pxi. With 16 EPS times the radius alone,
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-#: lower bound of the limit of Lanczos steps; applies to few unknowns
+#: smallest value of the limit on Lanczos steps; applies to small problems
 MIN_LANCZOS_STEPS = 5
 #: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
 #: products. With 1e4, two or three outer iterations usually suffice
@@ -193,8 +193,8 @@ def _projected(
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and qp.q.any():
-        # q is closer to the first eigenvector than a random vector, and does not depend
-        # on the number of ranks; without rows, no step depends on the norm
+        # q is closer to the first eigenvector than a random vector is, and does not
+        # depend on the number of ranks; without rows, no step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
@@ -564,7 +564,7 @@ COLUMNS = (
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
     "active",  # number of components at bounds
-    "two_sided",  # number of active components with two bounds; omitted without any
+    "two_sided",  # active components with two bounds; omitted if no component has two
     "cost",  # value of the augmented Lagrangian
     "seconds",  # time since the start of `prepare`
 )

@@ -47,20 +47,19 @@ cdef enum:
     SPECTRAL = 5
     # Number of previous costs with which the nonmonotone line search compares. In a
     # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
-    # and with 40, 2 % more with 5, and 35 % more with 1 (a monotone search). With
-    # 10 428 discs, it takes 12 % more products with 10.
+    # and with 40 as with 20, 2 % more with 5, and 35 % more with 1 (a monotone search).
+    # With 10 428 discs, it takes 12 % more products with 10.
     MEMORY = 20
     # Number of steps on an unchanged face before a Newton step. On contact patches with
     # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
     # by up to a half.
     SETTLED_FACE = 3
     # Number of steps before the first Newton step, about the number of products of a
-    # Newton step on these patches. With 10, Mindlin's problem with 1468 discs takes up
-    # to 40 % more products.
-    # With n unknowns, the number is √n if this is larger than 100. Mindlin's problem,
-    # ν = 0.3, then takes 57, 148 and 344 products with 1468, 41 684 and 166 740 discs.
-    # With 100 steps in all three cases, an earlier version took 61, 217 and 444
-    # products, and five times the memory.
+    # Newton step on the contact patches mentioned above. With 10, Mindlin's problem
+    # with 1468 discs takes up to 40 % more products. With n unknowns, the number is √n
+    # if this is larger than 100. Mindlin's problem, ν = 0.3, then takes 57, 148 and 344
+    # products with 1468, 41 684 and 166 740 discs. With 100 steps in all three cases,
+    # an earlier version took 61, 217 and 444 products, and five times the memory.
     FIRST_NEWTON = 100
     # Number of bits of the length of a spectral step. A small change of a length leads
     # to another sequence of spectral steps. If lengths are rounded, sums in another

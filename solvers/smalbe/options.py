@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mortarbench.harness import QP
-from mortarbench.solvers.common.conversion import check_positive
+from mortarbench.solvers.common.conversion import check_choice, check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
@@ -55,7 +55,7 @@ class Options:
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # if P is sparse, conjugation against stored directions costs more than a product
     recycle: bool = (
-        True  #: conjugate to all stored directions of the face unless P is sparse
+        True  #: make CG directions conjugate to all stored ones, unless P is sparse
     )
     reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
@@ -94,8 +94,7 @@ class Options:
             "eliminate": get_args(Eliminate),
         }
         for name, known in choices.items():
-            if (value := getattr(self, name)) not in known:
-                raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")
+            check_choice(name, getattr(self, name), known)
         if self.is_extended and self.preconditioner == "incomplete":
             raise ValueError(
                 "preconditioner = 'incomplete' works in scaled variables, which the "

@@ -2,7 +2,7 @@
 
 
 cdef double gain_of_projection(MPRGP at) except? -1:
-    """Return a lower bound of the decrease of the cost in the step to Π(x − g/τ).
+    """Return a lower bound on the decrease of the cost in the step to Π(x − g/τ).
 
     With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
     −gᵀs/2, because gᵀs ≤ −τ‖s‖².
