@@ -131,7 +131,7 @@ def one_step(
 
     """
     if form not in FORMS:
-        raise InputError(f"form {form!r}; expected one of {', '.join(FORMS)}")
+        raise InputError(f"form {form!r}; expected {' or '.join(map(repr, FORMS))}")
     GLUES["glue"].check("one_step", "glue", {"glue": glue})
     if parts and form != "dual":
         raise InputError(
@@ -147,7 +147,7 @@ def one_step(
         bodies=elastic,
         linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
-        # the first slip bound of Coulomb's law must be large enough for friction to
+        # the first friction bound of Coulomb's law must be large enough for friction to
         # support bodies that nothing else supports
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )
@@ -159,7 +159,8 @@ def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
     """Check the name, the parameter and the reference of a law, and return the law."""
     if law.kind not in LAWS:
         raise InputError(
-            f"friction {law.kind!r} is unknown; expected one of {', '.join(LAWS)}"
+            f"friction {law.kind!r} is unknown; expected "
+            + " or ".join(map(repr, LAWS))
         )
     if key := LAWS[law.kind]:
         value = physical(f"friction {law.kind}: {key}", getattr(law, key))

@@ -89,7 +89,8 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         raise InputError(
             _message([bodies.names[first]], f"its load in {' and '.join(axes)}")
         )
-    # the least-squares residual is a motion that closes no gap and gains energy
+    # the least-squares residual is a motion that closes no gap and on which the load
+    # does positive work
     motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
     if np.linalg.norm(motion) <= threshold:
         return

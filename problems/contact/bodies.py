@@ -121,7 +121,7 @@ class UnassembledBodies:
 
     @property
     def interface(self) -> Nodes:
-        """Displacement components with entries in contact rows, ascending."""
+        """Displacement components of the nodes of all contact sides, ascending."""
         sides = [np.zeros(0, dtype=np.int64), *(pair.nodes for pair in self.pairs)]
         return np.unique(dofs_of(np.concatenate(sides), self.mesh.dim))
 

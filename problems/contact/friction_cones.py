@@ -45,8 +45,8 @@ from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
 
 LOOPS = ("cones", "tresca")
 #: largest asymmetry of W, relative to its largest entry, that counts as rounding.
-#: Symmetrising W changes the scaled natural map by about the same amount, which is far
-#: below the required 1e-6
+#: Symmetrising W changes the scaled natural map by about the same amount, that is, by
+#: about FIXED_POINT_TOLERANCE at most
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9

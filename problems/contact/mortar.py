@@ -23,8 +23,8 @@ outside the integrals, the moments would be O(h²). A body supported by contact 
 would then rotate until a row far from the contact, at the end of an arc, balances the
 moments of the active rows.) Because ν is not normalised, the gap has the weight |ν| = 1
 − O(h²). In return, the integrands of D are polynomials, which the Gauss rule integrates
-exactly: D is independent of the position of the master's nodes, and a row of the dual
-basis acts on the slave along n_j.
+exactly: on fully covered segments, D is independent of the position of the master's
+nodes, and the resultant force of a row of the dual basis on the slave acts along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
 *integration segments*, the overlaps of one slave with one master segment, where the
@@ -46,7 +46,7 @@ part, and N̄_j = N_j(ξ̄), the only linear solution is
 For a fully covered segment, Φ_1 = 2N_1 − N_2 and Φ_2 = 2N_2 − N_1.
 
 Friction rows have (−ν_y, ν_x) in place of ν; across an open gap, their forces have a
-moment. For both bases, the friction bound of a row under Tresca's law is the bound of
+moment. For both bases, the friction bound of a row under Tresca's law is the bound on
 the traction times ∫ N_j |ν|.
 
 Each row is divided by ∫ N_j |ν| over the covered part. Thus B is dimensionless, g̃ a
@@ -75,8 +75,8 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-#: integration segments whose length in ξ is below this value are due to rounding of the
-#: projection and are dropped
+#: integration segments whose length in ξ is at most this value count as rounding errors
+#: of the projection and are dropped
 MIN_SEGMENT = 1e-8
 #: averaged normals of a straight side differ by at most this value. Smaller components
 #: of ν − n_j count as zero, so that B is as sparse on straight sides as with a single

@@ -58,7 +58,7 @@ class ContactRows(NamedTuple):
 
     B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
     c: Vector  #: (m_I,) c_M of eq. (5), m
-    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
+    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
     row: Nodes  #: (k,) contact row of each tangential row
     #: (m_I,) ∫N_j over the slave side, the length in m (2D) or the area in m² (3D) that
     #: is assigned to the row

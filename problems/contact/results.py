@@ -129,10 +129,10 @@ def friction_quantities(
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
     inactive, active below the bound, and active at the bound. `sliding_without_contact`
     is the number of inactive rows with shear, which Tresca's law allows; these rows do
-    not count as open. `shear_without_contact` is their fraction of Σ‖λ_t‖.
-    `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for Tresca's.
-    `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m, or J in
-    space.
+    not count as open. `shear_without_contact` is the fraction of Σ‖λ_t‖ that acts on
+    these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for
+    Tresca's. `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m (J
+    in 3D).
     """
     state = states(primal, s, friction)
     shear = norms(s.z[primal.h.size :][friction.vectors])
@@ -157,10 +157,11 @@ def pair_results(
 
     `force` is the force on each body of the pair in N/m; `largest_pressure` is the
     largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if bodies
-    overlap; `half_width` is half the undeformed length in m of the slave side under
-    pressure (in 3D, `pressed_area` is its area in m²). With friction,
-    `friction_force` is the contribution of friction to the force on the slave in N/m,
-    and `stick` and `slip` are the numbers of sticking and slipping slave nodes.
+    overlap, and None if no slave node has a row; `half_width` is half the undeformed
+    length in m of the slave side under pressure (in 3D, `pressed_area` is its area in
+    m²). With friction, `friction_force` is the contribution of friction to the force on
+    the slave in N/m, and `stick` and `slip` are the numbers of sticking and slipping
+    slave nodes.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)

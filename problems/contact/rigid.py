@@ -7,8 +7,8 @@ x = X + u^k and n fixed there,
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
 This linearisation is exact for planes. The nonzero entries of a row belong to a single
-node; therefore, the contact rows are orthonormal. Friction rows are T = −t at the node,
-with the tangents t.
+node; therefore, the contact rows of a pair are orthonormal. Friction rows are T = −t at
+the node, with the tangents t.
 """
 
 from __future__ import annotations

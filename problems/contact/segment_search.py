@@ -40,7 +40,7 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Reach:
-    """Limits on the angle and distance between points of two sides that may touch."""
+    """Limits on the angle between the normals, and on the distance, of two sides."""
 
     #: largest n_s·n_m of the normals of slave and master; −½ admits normals that are at
     #: most 60° from opposite

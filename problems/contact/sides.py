@@ -105,8 +105,8 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     A vector of an inactive row is open, or `SLIDING` if its shear is nonzero, which
     Tresca's law allows and Coulomb's does not. A vector of an active row sticks if its
     slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, with the bound g, the shear λ_t and the
-    rows T. This is the slip that the unused part of the bound would cause if only the
-    nodes of the row could move.
+    rows T. This value estimates the slip that the unused part of the bound would cause
+    if only the nodes of the row could move.
     """
     vectors = friction.vectors
     if not vectors.size:

@@ -1,7 +1,7 @@
 """Load steps of decomposed elastic bodies in contact, on one process or several ranks.
 
-No array of global size is allocated, because the linearisation of contact only requires
-the positions and displacements of the nodes on the contact sides.
+No displacement vector of global size is allocated, because the linearisation of contact
+only requires the positions and displacements of the nodes on the contact sides.
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ def load_path(
 def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Return the load path of a contact problem on undivided bodies.
 
-    Only the contact rows are dualised. In 3D, the dense matrix of the dual would have
+    Only the contact rows are dualised. In 3D, the dense matrix of the dual could have
     several times as many rows if the support rows were included.
     """
     elastic, bodies = problem.bodies, problem.bodies.assembled

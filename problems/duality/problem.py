@@ -204,7 +204,7 @@ class Meshed:
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by name."""
+        """Contact sides by name: chains of nodes in 2D, faces in 3D."""
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:

@@ -16,7 +16,7 @@ The neo-Hookean energy is taken from Bonet and Wood 2008, "Nonlinear Continuum M
 for Finite Element Analysis", Section 6.4, with the invariant I₁ = F:F + 1 in plane
 strain. At F = I both tangents are those of linear elasticity. The St. Venant-Kirchhoff
 material softens under compression: if a uniaxial stretch decreases below 1/√3, the
-magnitude of the stress decreases as well. Its energy remains finite as J → 0.
+magnitude of the nominal stress decreases as well. Its energy remains finite as J → 0.
 """
 
 from __future__ import annotations

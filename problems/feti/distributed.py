@@ -10,11 +10,12 @@ owner, so that the result is
 
     F λ = Σ_p B_p K_p⁺ B_pᵀ λ
 
-No rank stores a vector of global size: each rank stores only the columns of B for its
-subdomains, and the entries of vectors for the rows that touch these subdomains. Graph
-partitioning (METIS) distributes the subdomains so that the work is balanced and few
-rows are shared. If a class of congruent subdomains occurs on several ranks, one of
-these ranks computes the explicit blocks of the class and sends them to the other ranks.
+In these products, no rank stores a vector of global size: each rank stores only the
+columns of B for its subdomains, and the entries of vectors for the rows that touch
+these subdomains. Graph partitioning (METIS) distributes the subdomains so that the work
+is balanced and few rows are shared. If a class of congruent subdomains occurs on
+several ranks, one of these ranks computes the explicit blocks of the class and sends
+them to the other ranks.
 """
 
 from __future__ import annotations
@@ -459,11 +460,11 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, with a diagonal matrix W of weights.
 
-        Most equality rows (all of them if gluing is orthonormal) are uncoupled and only
-        require a division. The system of the coupled equality rows is solved
-        redundantly on all ranks. Contact rows are coupled along the contact sides. The
-        system of these rows is factorised in distributed form, or redundantly if ranks
-        share many of the rows.
+        Most equality rows (all of them if gluing is orthonormal and the copies of each
+        node have equal weights) are uncoupled and only require a division. The system
+        of the coupled equality rows is solved redundantly on all ranks. Contact rows
+        are coupled along the contact sides. The system of these rows is factorised in
+        distributed form, or redundantly if ranks share many of the rows.
 
         part : (t, t) contribution of the local subdomains to B W Bᵀ, which is the sum
             of the contributions of all ranks

@@ -25,12 +25,13 @@ or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its
 block for the equality rows is itself block diagonal, with one block per node. The
 Moore-Penrose inverse of this block keeps λ free of components in ker Bᵀ.
 
-Entries of B W Bᵀ that couple contact rows with equality rows are dropped. Such entries
-exist only where contact touches supports. They would adapt the weights of the equality
-rows to contact rows that are mostly inactive. The final face consists of the
-multipliers that are free at the solution. In beam-ring/Nr=8/Nh=5/steps=1/feti=8, the
-condition number on this face is 58 with the coupling entries and 3.7 without them. It
-is also 3.7 if B contains only the rows of the face.
+Entries of B W Bᵀ that couple contact rows with equality rows are dropped. In
+homogeneous bodies, such entries exist only where contact touches supports. They would
+adapt the weights of the equality rows to contact rows that are mostly inactive. The
+final face consists of the multipliers that are free at the solution. In
+beam-ring/Nr=8/Nh=5/steps=1/feti=8, the condition number on this face is 58 with the
+coupling entries and 3.7 without them. It is also 3.7 if B contains only the rows of the
+face.
 """
 
 from __future__ import annotations

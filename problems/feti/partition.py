@@ -2,12 +2,12 @@
 
 In this graph, two cells are neighbours if they share a facet: an edge in 2D, a
 face in 3D. METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) partitions the
-graph of each body into parts of about equal size, and minimises the total weight of the
-facets between parts. The weight of a facet is its size relative to the adjacent cells,
-so that parts are compact even where the cells of graded meshes are long and thin. The
-cells of a part must be connected through facets: cells that share only a node (or, in
-space, an edge) can rotate relative to each other, so that the kernel of the stiffness
-matrix would contain more than the rigid motions of the part.
+graph of each body into parts of about equal size, and approximately minimises the total
+weight of the facets between parts. The weight of a facet is its size relative to the
+adjacent cells, so that parts are compact even where the cells of graded meshes are long
+and thin. The cells of a part must be connected through facets: cells that share only a
+node (or, in 3D, an edge) can rotate relative to each other, so that the kernel of the
+stiffness matrix would contain more than the rigid motions of the part.
 """
 
 from __future__ import annotations

@@ -46,8 +46,8 @@ class SubdomainClass:
 
     K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where ρ is the largest diagonal entry of K, and R*
     consists of the rows of R at the fixing components, orthonormalised, and zeros
-    elsewhere (see `problems.fem.inverse`). All subdomains of a class are solved at
-    once, as columns of one right-hand side.
+    elsewhere (see `problems.fem.inverse`). The systems of all subdomains of a class are
+    solved at once, with one column of the right-hand side for each subdomain.
     """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
@@ -266,8 +266,8 @@ class Clusters:
 
     with arbitrary β. The columns of N are an orthonormal basis of ker CR. They describe
     the motions of clusters as rigid bodies, and the columns of RN span the kernel of K
-    on {v : Cv = 0}. M is block diagonal, with one block per cluster. Its Moore-Penrose
-    inverse M⁺ exists even if rows of C are linearly dependent. K̃⁺ is positive
+    on {v : Cv = 0}. M is block diagonal, with one block per cluster. The Moore-Penrose
+    inverse M⁺ is used because rows of C may be linearly dependent. K̃⁺ is positive
     semidefinite.
 
     The modes of a face are its rigid motions, orthonormal over its nodes. The columns

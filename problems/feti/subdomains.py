@@ -22,8 +22,9 @@ This row is orthogonal to the gluing rows.
 
 Support and gluing rows are scaled by √E, with Young's modulus E of their body. Contact
 rows are normalised, then scaled by √E of the softest body they touch. If each body is
-homogeneous, F = BK⁺Bᵀ is therefore independent of E. In support and gluing rows, E may
-be multiplied by a factor for the shape of the cells (`problems.feti.structured`).
+homogeneous, the block of F = BK⁺Bᵀ for supports and gluing is therefore independent of
+E, and all other entries depend only on ratios of moduli. In support and gluing rows, E
+may be multiplied by a factor for the shape of the cells (`problems.feti.structured`).
 """
 
 from __future__ import annotations

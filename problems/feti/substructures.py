@@ -87,7 +87,8 @@ class LocalProblems:
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P, with P of `product`, to b (N,).
 
-        All subdomains of a class are solved at once, as columns of one right-hand side.
+        The systems of all subdomains of a class are solved at once, with one column of
+        the right-hand side for each subdomain.
         """
         solution, domains = np.zeros_like(b), self.torn.domains
         acting = np.logical_or.reduceat(b != 0, domains.start[:-1])

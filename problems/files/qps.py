@@ -12,15 +12,15 @@ Softw. 11/12:
 * BOUNDS default to [0, ∞); a negative UP without LO removes the lower bound, as in
   commercial readers.
 * QUADOBJ and QSECTION contain one triangle of P, and QMATRIX contains both triangles.
-The
-  objective is ½xᵀPx + qᵀx; the diagonal entries are stored as in P, not halved.
+  The objective is ½xᵀPx + qᵀx; the diagonal entries are stored as in P, not halved.
 
 Undefined names and malformed numbers raise an error that states the line number. (The
 reader of HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
 
-Writing and reading a QP reproduces every number to the last digit. If P is symmetric
-only up to rounding, its symmetric part is written. The objective depends only on this
-part, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
+Writing and reading a QP whose P is exactly symmetric reproduces every number to the
+last digit. If P is symmetric only up to rounding, its symmetric part is written. The
+objective depends only on this part, and HiGHS rejects a QMATRIX whose triangles differ
+in the last digit.
 """
 
 from __future__ import annotations
@@ -202,7 +202,8 @@ def _header(model: _QPSModel, section: str, words: list[str]) -> None:
         raise unknown("section", words[0], known)
     if section == "QSECTION" and words[1:] not in ([], [model.objective]):
         raise InputError(
-            f"QSECTION {words[1]} belongs to a constraint; expected {model.objective!r}"
+            f"QSECTION {words[1]!r} belongs to a constraint; expected "
+            f"{model.objective!r}"
         )
     if section == "OBJSENSE" and words[1:]:
         _sense(model, words[1:])

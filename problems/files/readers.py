@@ -36,9 +36,7 @@ def read(path: Path) -> Loaded:
     Raises
     ------
     InputError
-        If the file is damaged or its QP is not convex.
-    KeyError
-        If the suffix is not supported.
+        If the suffix is unknown, the file is damaged, or its QP is not convex.
 
     """
     qp, scale, constant = _READERS[format_of(path)](path)

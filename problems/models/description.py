@@ -61,10 +61,11 @@ for volumes.
 The keys from length_unit to units are optional. The values above are their defaults,
 except for units: the default of units.length is the longest side of the bounding box of
 the mesh, and that of units.force is the sum of |load| over the nodes. Bodies supported
-by contact alone have no form dual-bounds and, for linear kinematics, require
-``steps = 1``. A pair that sets no friction law has the law of the top-level keys
-friction, bound and mu, whose default is no friction. With the top-level key
-``loading = "static"``, slip is measured from the undeformed state.
+by contact alone have no form dual-bounds. If neither supports nor friction prevent a
+rigid motion along the contacts, linear kinematics require ``steps = 1`` and ``relin =
+1``. A pair that sets no friction law has the law of the top-level keys friction, bound
+and mu, whose default is no friction. With the top-level key ``loading = "static"``,
+slip is measured from the undeformed state.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
         bodies=elastic,
         linearise=keyed_linearisation(p),
         stages=stages,
-        # the first slip bound of Coulomb's law must be large enough for friction to
+        # the first friction bound of Coulomb's law must be large enough for friction to
         # support bodies that nothing else supports
         initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )

@@ -178,9 +178,9 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
 
         Errors are relative; the error of q is in the l² norm. `energy` is the elastic
         energy minus Q·displacement in J/m; `dissipation` is Σg|slip| of this loading or
-        unloading in J/m, with the slip bounds g; `stick_half_width` is the half width
-        of the stick zone for which the exact traction has the same ∫x²q; `shear_centre`
-        is the mean of q over the one or two elements next to x = 0.
+        unloading in J/m, with the friction bounds g; `stick_half_width` is the half
+        width of the stick zone for which the exact traction has the same ∫x²q;
+        `shear_centre` is the mean of q over the one or two elements next to x = 0.
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)

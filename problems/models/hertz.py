@@ -1,7 +1,7 @@
 """Line contact of cylinders, with Hertz's exact solution (Johnson 1985, Section 4.2).
 
 With 1/R = 1/R₁ + 1/R₂, 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ) and the force P per
-thickness, two elastic half spaces with radii of curvature R₁ and R₂ touch over |x| ≤ a
+thickness, two elastic bodies with radii of curvature R₁ and R₂ touch over |x| ≤ a
 with the pressure
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
@@ -26,15 +26,15 @@ the lower body have no reactions. Exact tractions are those of
 
 * normal-first: P without friction, then Q, then Q reduced from its peak, one step each;
 * proportional: P and Q grow together in steps k = 1, 2, … with friction, with P ∝ k² so
-  that a grows by equal increments. If slip is measured in each step (quasi-static), the
-  shear traction is (Q/P)p and nothing slips. For a single static load, the tractions
-  are as if Q had been applied last.
+  that a grows by equal increments. If slip is measured from the end of the preceding
+  step (quasi-static), the shear traction is (Q/P)p and nothing slips. For a single
+  static load, the tractions are as if Q had been applied last.
 
-Two errors do not vanish with the mesh size: the bodies are finite (0.1 %), and a/R is
-not zero. Contact of two cylinders is linearised at the undeformed state, along normals
-that differ from the vertical by up to a/R. The deviation from Hertz's solution is of
-order a²/R² ∝ P, and 1 % at P = 10; the default load of two cylinders is therefore
-smaller.
+Two errors do not vanish as the mesh is refined, because the bodies are finite (0.1 %)
+and a/R is not zero. Contact of two cylinders is linearised at the undeformed state,
+along normals that differ from the vertical by up to a/R. The deviation from Hertz's
+solution is of order a²/R² ∝ P, and 1 % at P = 10; the default load of two cylinders is
+therefore smaller.
 """
 
 from __future__ import annotations

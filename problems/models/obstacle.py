@@ -9,7 +9,7 @@ distance r from the origin, the contact region is r ≤ 1, and for r ≥ 1
 
 both with u = u′ = 0 at r = 1. The pressure of the obstacle in the contact region is q,
 and its total force is 2q for the string and πq for the membrane. (The membrane is a
-standard test of obstacle problems, for instance in Bartels and Carstensen 2004.)
+standard test problem, for instance in Bartels and Carstensen 2004.)
 
 *Hemisphere.* A membrane over Ω = (−2, 2)² without load lies on the unit ball,
 ψ = √(1 − r²) for r ≤ 0.9, continued by its tangent for r > 0.9 (tutorial 9 of PETSc's

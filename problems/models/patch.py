@@ -10,7 +10,7 @@ block; bilinear elements therefore represent it exactly:
 A contact discretisation passes the test if it reproduces this solution, that is, if it
 transfers constant pressures exactly (Taylor and Papadopoulos 1991). Mortar methods
 pass. One-pass node-to-segment contact fails: its error in σ_y is of order one and does
-not vanish with the mesh size. Friction has no effect if the blocks are of the same
+not vanish as the mesh is refined. Friction has no effect if the blocks are of the same
 material. The upper block is supported by contact alone; therefore, the form
 ``dual-bounds`` does not exist.
 
@@ -105,7 +105,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         linearise=keyed_linearisation(p),
         results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
-        # the first slip bound of Coulomb's law must be large enough for friction to
+        # the first friction bound of Coulomb's law must be large enough for friction to
         # support blocks that nothing else supports
         initial_force=float(np.abs(elastic.forces.value).sum()),
     )

@@ -11,9 +11,9 @@ units.
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
-Supports are rows of B as in all families (Total FETI), or they are ``eliminated``. In
-the latter case, subdomains at the clamped edge do not float, as in FETI-1 (Farhat and
-Roux 1991).
+Supports are rows of B as in the other decomposed problems (Total FETI), or they are
+``eliminated``. In the latter case, subdomains at the clamped edge do not float, as in
+FETI-1 (Farhat and Roux 1991).
 
 In 3D (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
 is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or

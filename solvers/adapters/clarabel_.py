@@ -48,12 +48,12 @@ class Clarabel:
     tol, either in absolute terms or relative to max(1, |objective|). For a small
     objective, these tests are absolute: at an energy of 1e-5, tol = 1e-6 would lose
     five digits. The adapter scales the objective to ‖q‖∞ = 1e4 and passes tol
-    unchanged. Each test is then relative if x is of order one, as in every QP of this
-    project. If the units make x tiny, Clarabel may stop early. The scaling hardly
-    changes the steps, because Clarabel equilibrates the objective.
+    unchanged. Each test is then relative if x is at least of order one. If the units
+    make x tiny, Clarabel may stop early. The scaling hardly changes the steps, because
+    Clarabel equilibrates the objective.
 
     Equalities are assigned to the zero cone; inequalities and finite bounds, one row
-    each, to the nonnegative cone.
+    each, to the nonnegative cone; discs and cones, to second-order cones.
     """
 
     max_iter: int = 200

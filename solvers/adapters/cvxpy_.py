@@ -1,4 +1,4 @@
-"""Every backend of cvxpy, called through its modelling language.
+"""The backends of cvxpy, called through its modelling language.
 
 Reference: S. Diamond, S. Boyd, CVXPY: a Python-embedded modeling language for convex
 optimization, J. Mach. Learn. Res. 17(83) (2016) 1-5.
@@ -81,11 +81,10 @@ class CVXPY:
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
     a stopping test is the sum of an absolute and a relative term, `tol` is the relative
     tolerance and the absolute tolerance is negligible. A backend without an entry in
-    `CALLS` runs with cvxpy's defaults. As in the native adapters, the objective is
-    scaled to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (HIGHS,
-    DAQP). The adapter declines QPs for backends that would receive them as cone
-    programs. It also declines QPs for ProxQP, because cvxpy cannot enable ProxQP's test
-    of the duality gap.
+    `CALLS` runs with cvxpy's defaults. The objective is scaled to ‖q‖∞ = 1e4, or to
+    ‖q‖∞ = 1 if the backend's test is absolute (HIGHS, DAQP). The adapter declines QPs
+    for backends that would receive them as cone programs. It also declines QPs for
+    ProxQP, because cvxpy cannot enable ProxQP's test of the duality gap.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME

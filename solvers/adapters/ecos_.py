@@ -34,9 +34,9 @@ PRIMAL = 1  #: exit flag with a certificate of infeasibility
 #: eigenvalues of P below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-14
 #: Units of the corrections, relative to ‖x‖∞, four per decade. The adapter tries the
-#: units in this order, because the best unit depends on the QP: ECOS breaks down near
-#: the optimum, at a residual that varies by two orders of magnitude between
-#: neighbouring units.
+#: units in this order until the residual is at most tol, because the best unit depends
+#: on the QP: ECOS breaks down near the optimum, at a residual that varies by two orders
+#: of magnitude between neighbouring units.
 CORRECTION_SIZES = tuple(10.0 ** -np.linspace(1, 4, 13))
 #: largest KKT residual of a point that is reported as solved, relative to tol
 CLAIM_FACTOR = 10.0
@@ -47,8 +47,9 @@ class ECOS:
     """https://github.com/embotech/ecos.
 
     The adapter replaces ½xᵀPx = ½‖Lᵀx‖² by a second-order cone, and computes L from the
-    eigenvalues and eigenvectors of P. A gap of tol permits errors of √tol in x. The
-    adapter therefore calls ECOS again for corrections of x.
+    eigenvalues and eigenvectors of P. A gap of tol permits errors of √tol in x. If a
+    KKT residual exceeds tol, the adapter therefore calls ECOS again for corrections of
+    x.
     """
 
     max_iter: int = 200

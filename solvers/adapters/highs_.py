@@ -75,8 +75,8 @@ class HiGHS:
             "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, where the condition "
             "number of F is 260 (suites/friction.toml).",
             "Without the free row, the result for a membrane of 225 nodes has a "
-            "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
-            "400 nodes touches').",
+            "residual of 1 (HiGHS 1.15.1); the conformance check 'finds where a "
+            "membrane of 400 nodes touches' tests for this error.",
             "Without highspy-extras, HiGHS silently runs qpasm instead of hipo; the "
             "adapter then reports a failure.",
             "qpasm stores a dense Hessian on the null space of the active rows. A QP "

@@ -42,7 +42,7 @@ class OSQP:
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
     are each below eps_abs + eps_rel·(their largest term). With eps_rel = tol and a
-    negligible eps_abs, this test equals the relative test of the harness. OSQP
+    negligible eps_abs, this test is relative, like the test of the harness. OSQP
     evaluates the test every 25 iterations. Each bounded variable becomes a row of the
     identity.
 

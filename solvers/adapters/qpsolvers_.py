@@ -98,10 +98,9 @@ class QPSolvers:
     The tolerance is passed in the backend's own keywords (`CALLS`). If the threshold of
     a stopping test is the sum of an absolute and a relative term, `tol` is the relative
     tolerance and the absolute tolerance is negligible. A backend without an entry in
-    `CALLS` runs with its defaults. As in the native adapters, the objective is scaled
-    to ‖q‖∞ = 1e4, or to ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp).
-    Backends that accept both dense and sparse matrices receive dense matrices if P is
-    dense.
+    `CALLS` runs with its own defaults. The objective is scaled to ‖q‖∞ = 1e4, or to
+    ‖q‖∞ = 1 if the backend's test is absolute (highs, daqp). Backends that accept both
+    dense and sparse matrices receive dense matrices if P is dense.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME

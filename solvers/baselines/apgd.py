@@ -4,8 +4,8 @@ With the projection Π on the product of sets and a curvature L,
 
     x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x).
 
-Nesterov's weights β restart from 0 if the objective would increase. In each step, L
-increases until it bounds the curvature along the step; after the step, L is reduced
+Nesterov's weights β restart from 0 if x⁺ − x is an ascent direction at y. In each step,
+L increases until it bounds the curvature along the step; after the step, L is reduced
 (Mazhar, Heyn, Negrut and Tasora, Using Nesterov's method to accelerate multibody
 dynamics with friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Py is a
 linear combination of the last two products Px. A step therefore takes one product with

@@ -13,7 +13,7 @@ I − QGᵀ(GQGᵀ)⁻¹G and a preconditioner M, its steps are:
 
 Every Q that is positive definite on the range of Gᵀ is admissible. With Q = I, the
 projector depends only on G. With Q = M (Klawonn and Widlund 2001), the number of steps
-stays bounded if the stiffness jumps within a body.
+has a bound that does not depend on jumps of the stiffness within a body.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ Weight = Literal["identity", "preconditioner"]
 CLAIM_FACTOR = 5.0
 #: the solve fails if its stopping bound falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
-#: the solve fails after this number of consecutive steps that have not halved ‖w‖
+#: the solve fails after this number of consecutive steps if none of them halved the
+#: smallest ‖w‖ so far
 PATIENCE = 100
 STAGNATED = (
     "no further progress because of rounding, or the objective is unbounded below"

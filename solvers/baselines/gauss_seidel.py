@@ -2,14 +2,14 @@
 
 A sweep minimises the objective over one block of variables at a time, with all other
 variables fixed. A block consists of the variables of one disc or cone, or of a single
-variable with bounds. The method is known as NSGS (nonsmooth Gauss–Seidel: Jourdan,
-Alart and Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato
-2008, Chapter 13). The problem on a block is solved by projected gradient steps of
-length 1/λ, where λ is the largest eigenvalue of the diagonal block of P. The steps end
-when they become short.
+other variable. The method is known as NSGS (nonsmooth Gauss–Seidel: Jourdan, Alart and
+Jean, Comput. Methods Appl. Mech. Engrg. 155, 1998, 31–47; Acary and Brogliato 2008,
+Chapter 13). The problem on a block is solved by projected gradient steps of length 1/λ,
+where λ is the largest eigenvalue of the diagonal block of P. The steps end when they
+become short.
 
 After each change of a block, the gradient is updated with the columns of P of this
-block. A sweep over all blocks therefore costs as much as a product with P.
+block. A sweep over all blocks therefore costs about as much as a product with P.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Tests of certificates which prove that a QP has no solution.
 
-If a certificate exists, the differences of successive proximal iterates converge to
-one. Banjac et al. prove this for ADMM, a related method (Infeasibility detection in the
-alternating direction method of multipliers for convex optimization, JOTA 183, 2019).
+If a certificate exists, the differences of successive proximal iterates converge to a
+certificate. Banjac et al. prove this for ADMM, a related method (Infeasibility
+detection in the alternating direction method of multipliers for convex optimization,
+JOTA 183, 2019).
 """
 
 from __future__ import annotations

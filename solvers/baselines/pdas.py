@@ -64,13 +64,13 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
 )
 from mortarbench.solvers.common.conversion import check_positive
 
-#: Factor by which ρ increases after two changes of the centre that have not halved the
-#: residuals. With these increases, all of 600 random QPs were solved; without them, 522
-#: were solved.
+#: Factor by which ρ increases after every two consecutive changes of the centre,
+#: neither of which halved the smallest residual so far. With these increases, all of
+#: 600 random QPs were solved; without them, 522 were solved.
 RHO_GROWTH = 100.0
-MAX_KAPPA = 1e10  #: largest value of ρ·aD⁻¹aᵀ for which ρ is still increased
-#: the solve fails after this number of changes of the centre that have not halved the
-#: residuals
+MAX_KAPPA = 1e10  #: ρ is increased only while ρ·aD⁻¹aᵀ is below this value
+#: the iteration ends after this number of consecutive changes of the centre, none of
+#: which halved the smallest residual so far
 PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
 #: largest KKT residual of a point that is claimed as a solution, relative to tol
@@ -91,9 +91,9 @@ class PDAS:
     The iteration stops when the KKT residuals of the QP are at most tol. If rounding
     prevents further progress, the solver also claims a point with residuals of at most
     5·tol. The solver reports the number of linear solves as iterations. It counts
-    factorisations (one per face, and one more if unbounded variables are condensed),
-    constraints that entered or left the active set, steps that exchanged a single
-    constraint, proximal centres, and products with P.
+    factorisations (one per face, plus one if the block of unbounded variables is
+    eliminated in advance), constraints that entered or left the active set, steps that
+    exchanged a single constraint, proximal centres, and products with P.
 
     The solver starts from the point of the box nearest to zero, which is a state
     without contact in both primal and dual forms. On the duals of contact problems, a

@@ -21,7 +21,7 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 class PolygonalQP:
     """Approximation of a QP in which polygons replace discs and sections of cones."""
 
-    qp: QP  #: QP without discs and cones; G contains one row for each side of a polygon
+    qp: QP  #: QP without discs and cones; G has one additional row per polygon side
     #: 1 − cos(π/k) for k sides; each polygon contains the disc with (1 − error)·radius
     error: float
     #: Maps a point of `qp` to a point of the original QP. The resulting `z_box` is
@@ -87,7 +87,7 @@ def _sides(one: ConvexSet, sides: int, n: int) -> tuple[csr_array, Vector]:
         tangents, radius, slope = one.index[:, 1:], 0 * one.slope, one.slope
     else:
         raise InputError(
-            f"{type(one).__name__} has no polygon; expected Discs and Cones"
+            f"{type(one).__name__} has no polygon; expected Discs or Cones"
         )
     k, d = tangents.shape
     if d != 2:

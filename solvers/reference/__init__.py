@@ -1,1 +1,1 @@
-"""Reference solvers, which share no code with the solvers under test."""
+"""Reference solvers, which use none of the solvers under test."""

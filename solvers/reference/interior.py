@@ -11,9 +11,9 @@ centring parameter σ, a step solves
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
 first for r_sz = sz (predictor), then for r_sz = sz + ds dz − σμ (corrector), where
-products are componentwise and μ = sᵀz/(number of rows of C). A step covers 0.995 of the
-distance to the boundary of the set s, z ≥ 0. The step length is the same for x, y, z
-and s.
+products are componentwise and μ = sᵀz/(number of rows of C). The step length is 1, or
+0.995 times the length that leads to the boundary of the set s, z ≥ 0, whichever is
+smaller. It is the same for x, y, z and s.
 
 A disc ‖x_I‖ ≤ r is treated as the smooth constraint  ‖x_I‖²/2r + s = r/2.  The row of C
 for the disc is x_I/r at the current x, and the multiplier z of the disc adds z/r to the
@@ -52,10 +52,10 @@ DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
 #: be identified, which `polish` then treats as equations
 STOP_RESIDUAL = 1e-11
 MAX_ITERATIONS = 100
-#: the iteration ends after this number of consecutive iterations that have not halved
-#: the residual
+#: the method ends after this number of consecutive iterations, none of which halved the
+#: smallest residual so far
 PATIENCE = 12
-#: fraction of the distance to the boundary that a step covers
+#: largest fraction of the distance to the boundary that a step covers
 BOUNDARY_FRACTION = 0.995
 
 

@@ -237,7 +237,8 @@ class _Task:
         except CholmodNotPositiveDefiniteError:
             raise ArithmeticError(
                 "the reference solve over ranks reached a face with linearly dependent "
-                "equality rows; some body is not supported if these contacts are open"
+                "equality rows; a body whose contacts are open on this face may lack "
+                "supports"
             ) from None
 
         def spread(t: Vector) -> Vector:

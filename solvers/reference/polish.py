@@ -7,10 +7,10 @@ iterative refinement (Higham 2002, Accuracy and Stability of Numerical Algorithm
     [P_FF + δ  B_Fᵀ]     F: variables not at a bound,
     [B_F       −δ  ]     B: A and the active rows of G.
 
-The shift δ makes the matrix nonsingular for every P and B. The refinement steps are
-steps of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1), so
-their limit does not depend on δ. If the solution or its multipliers are not unique, the
-steps converge to a solution near the starting point.
+The shift δ makes the matrix nonsingular for every positive semidefinite P and every B.
+The refinement steps are steps of the proximal method of multipliers (Rockafellar 1976,
+Math. Oper. Res. 1), so their limit does not depend on δ. If the solution or its
+multipliers are not unique, the steps converge to a solution near the starting point.
 
 After convergence, violated constraints enter the active set, and constraints with a
 multiplier of the wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J.

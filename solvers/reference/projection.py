@@ -9,9 +9,9 @@ normal to C at w. The remaining KKT conditions state that the normal map is zero
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM with penalty R approaches a zero of (1) from any start (Stellato et al. 2020,
-   Math. Prog. Comp. 12). If P is singular, ADMM needs Anderson acceleration with a
-   safeguard (Zhang, O'Donoghue and Boyd 2020, SIAM J. Optim. 30).
+1. ADMM with penalty R approaches a zero of (1) from any starting point (Stellato et al.
+   2020, Math. Prog. Comp. 12). If P is singular, ADMM needs Anderson acceleration with
+   a safeguard (Zhang, O'Donoghue and Boyd 2020, SIAM J. Optim. 30).
 2. Newton's method then converges to this zero. The derivative of Π is approximated by
    difference quotients, and residuals are evaluated in extended precision. The error √ε
    of the quotients affects only the rate of convergence: each step reduces the residual

@@ -12,8 +12,8 @@ are then solved with refinement in extended precision (`polish`). The result is 
 point for which the harness measures the smallest KKT residual of the original QP.
 
 If the sets are bounds and discs, a method that uses projections (`projection`) refines
-the point of the interior-point method. The projection method alone solves QPs with
-other sets.
+the point of the interior-point method. QPs with other sets are solved by the projection
+method alone.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ OUTLIER_FACTOR = 1e4
 
 
 def reference_solution(qp: QP) -> Solution:
-    """Return a solution of a convex QP, with x and multipliers accurate to rounding.
+    """Return a solution of a convex QP, usually accurate to rounding.
 
     The field `iterations` contains the number of interior-point steps, if that method
-    ran. The remaining residual is caused by the rounding of x to double precision. The
-    residual is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for the
-    displacements of stiff bodies. The function does not check that P is positive
+    ran. The remaining residual is then caused by the rounding of x to double precision.
+    This residual is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for
+    the displacements of stiff bodies. The function does not check that P is positive
     semidefinite.
 
     Raises
@@ -147,7 +147,8 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
     """Yield points of a QP over arbitrary sets until the residual is small.
 
     The QP is scaled if its sets consist of blocks: with a single penalty for all
-    variables, the method does not converge if their curvatures differ by 1e7.
+    variables, the method does not converge if their curvatures differ by a factor of
+    1e7.
     """
     has_blocks = all(isinstance(one, Blocks) for one in qp.sets[1:])
     scaled = equilibrate(qp) if has_blocks else None

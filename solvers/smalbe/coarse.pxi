@@ -101,7 +101,7 @@ cdef class Coarse:
 
 @cython.final
 cdef class LocalCoarse(Coarse):
-    """Variant of `Coarse` for rows on one process; operations run without Python."""
+    """Variant of `Coarse` for one process; products and solves run without Python."""
 
     cdef CompressedRows rows  # G
     cdef CompressedRows by_components  # Gᵀ

@@ -13,22 +13,22 @@ ranks share, and all other operators and preconditioners call Python functions.
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free block of a sparse P
-* judge.pxi: KKT residuals of the original problem, computed from the gradient
+* judge.pxi: an upper bound on the KKT residuals for QPs with bounds only
 * mprgp.pxi: the inner loop
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
-* residuals.pxi: an upper bound of the KKT residuals of the QP
+* residuals.pxi: an upper bound on the KKT residuals of any QP that SMALBE solves
 
 tests/support/textbook contains the same algorithm in NumPy. Tests check that both
 versions take equal numbers of steps and reach the same points up to rounding.
 
-P is dense (one triangle is read), sparse, or an operator called through Python. A
-sparse P with few nonzero diagonals, such as a difference or finite element matrix on a
-grid, is stored by diagonals. Products then process neighbouring rows at the same time,
-and read only half of the entries because P is symmetric. A CG step then passes over
-memory twice: once for the direction, its product and the step lengths, and once for the
-step and the new gradient. The free gradient is not stored. The loops over vectors are
-in `vectors.h`.
+P is dense (one triangle is read), sparse, a compiled linear map, or an operator called
+through Python. A sparse P with few nonzero diagonals, such as a difference or finite
+element matrix on a grid, is stored by diagonals. Products then process neighbouring
+rows at the same time, and read only half of the entries because P is symmetric. A CG
+step then passes over memory twice: once for the direction, its product and the step
+lengths, and once for the step and the new gradient. The free gradient is not stored.
+The loops over vectors are in `vectors.h`.
 """
 
 cimport cython

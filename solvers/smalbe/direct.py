@@ -11,9 +11,9 @@ P. The following steps are repeated for k = 0, 1, …:
 2. a ← a + ρC(x − x̃), x_{k+1} = x.
 
 These steps are the outer loop of SMALBE (the paper's reference [3], Algorithm 6.1) with
-exact inner solves, that is, M = 0. Even if P is singular on a face, P + ρCᵀC + δD is
-positive definite because of the proximal term. This term is zero at the solution, where
-x = x_k.
+exact inner solves, that is, with M = 0 in the stopping criterion ‖g^P‖ ≤ M‖C(x − x̃)‖.
+Even if P is singular on a face, P + ρCᵀC + δD is positive definite because of the
+proximal term. This term is zero at the solution, where x = x_k.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-#: largest number of unknowns; because a face costs O(n³), `smalbe` is faster even for
-#: fewer unknowns than this
+#: largest number of unknowns; because a factorisation costs O(n³), `smalbe` is often
+#: faster even below this number
 MAX_UNKNOWNS = 2000
 INITIAL_RHO = 1e3  #: initial ρ/‖P‖ with the Frobenius norm
 #: largest ρ/‖P‖, up to which ρ is increased if ‖C(x − x̃)‖ decreases slowly
@@ -96,7 +96,7 @@ class _Point(NamedTuple):
     x: Vector
     y: Vector
     z_box: Vector
-    residual: float  #: upper bound of the worst KKT residual
+    residual: float  #: upper bound on the worst KKT residual
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Multiply ρ by 100 if the matrix can still be factorised; return the largest ρ."""
+    """Multiply ρ by 100 unless the factorisation fails; return the new limit on ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)
@@ -191,7 +191,7 @@ def _claimed(
 ) -> Solution:
     """Return the final point, with status SOLVED if all KKT residuals are ≤ 5·tol.
 
-    If the bound of the residuals exceeds 5·tol, the residuals themselves are evaluated.
+    If the bound on the residuals exceeds 5·tol, the residuals themselves are evaluated.
 
     otherwise : message if the point is not a solution
     """

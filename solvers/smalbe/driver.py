@@ -58,10 +58,10 @@ EPS = float(np.finfo(float).eps)
 #: feasible_set.pxi. With 16 EPS times the radius alone,
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-#: lower bound of the limit of Lanczos steps; applies to few unknowns
+#: smallest value of the limit on Lanczos steps; applies to small problems
 MIN_LANCZOS_STEPS = 5
 #: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
-#: products. With 1e4, two or three outer iterations suffice
+#: products. With 1e4, two or three outer iterations usually suffice
 RHO = 1e4
 #: default penalty ρ if P provides a preconditioner. Each multiplier step restarts CG,
 #: so fewer outer iterations save time for decomposed bodies with thousands of rows
@@ -215,8 +215,8 @@ def _projected(
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and qp.q.any():
-        # q is closer to the first eigenvector than a random vector, and does not depend
-        # on the number of ranks; without rows, no step depends on the norm
+        # q is closer to the first eigenvector than a random vector is, and does not
+        # depend on the number of ranks; without rows, no step depends on the norm
         find = partial(by_lanczos, steps=steps if qp.b.size else 1, start=qp.q)
     sparse = scaled if isinstance(scaled, ScaledSparse) else None
     if sparse is not None and sparse.with_factor:
@@ -317,7 +317,8 @@ class OuterLoop:
     solver: compiled.SMALBE
     problem: Projected
     options: Options
-    #: k, right-hand side → observer of the steps of outer iteration k; None without one
+    #: k, right-hand side → observer of the steps of outer iteration k; None if no
+    #: history is recorded
     watch: Callable[[int, Vector], Note] | None
 
     def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
@@ -553,7 +554,10 @@ def _normal_part(x: Vector, v: Vector) -> Vector:
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
-    """Return an upper bound of the worst KKT residual; exact if above `enough`."""
+    """Return an upper bound on the worst KKT residual.
+
+    The result is exact if it exceeds `enough` and the QP is not distributed.
+    """
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if not task.problem.discs:
         if isinstance(task.scaled, ScaledSparse):
@@ -585,7 +589,7 @@ COLUMNS = (
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
     "active",  # number of components at bounds
-    "two_sided",  # number of active components with two bounds; omitted without any
+    "two_sided",  # active components with two bounds; omitted if no component has two
     "cost",  # value of the augmented Lagrangian
     "seconds",  # time since the start of `prepare`
 )

@@ -13,9 +13,10 @@ involve E, and the Schur complement
 
     P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I.
 
-The assembly of the Schur complement costs about as much as the factorisation of P_EE.
-In duals of contact problems, E contains the support forces, and P_EE = F_EE is the same
-in every load step.
+For k variables in E and b other variables, the factorisation of P_EE costs O(k³)
+operations, and the assembly of the Schur complement O(k²b + kb²). In duals of contact
+problems, E contains the support forces, and P_EE = F_EE is the same in every load step
+if the bodies are linearly elastic.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ from scipy.linalg.cython_lapack cimport dpotrf
 import numpy as np
 
 cdef double ROUNDING = 8 * 2.0 ** -52  # rounding of a sum, relative to the absolute terms
-# initial `share` of `minimise`: components whose gradient is at least this fraction of
-# the largest gradient are released together
+# initial `share` of `minimise`: components whose gradient, divided by √Pᵢᵢ, is at least
+# this fraction of the largest such value are released together
 cdef double RELEASE_SHARE = 0.9
 # diagonal entries below this factor times their mean count as zero
 cdef double FLAT = 1e-12
@@ -271,9 +271,9 @@ cdef class Faces:
            times the largest such value, and repeat step 1. Halve `share` if no
            component left the face, otherwise reset it to RELEASE_SHARE. If the cost has
            decreased, go to 2.
-        4. Otherwise release only the component with the largest gradient. Step to the
-           minimiser on the new face, or to the first bound; in the latter case, fix the
-           component that reached the bound, and repeat the step. Go to 2.
+        4. Otherwise release only the component with the largest of these values. Step
+           to the minimiser on the new face, or to the first bound; in the latter case,
+           fix the component that reached the bound, and repeat the step. Go to 2.
 
         Steps 3 and 4 decrease the cost, and each of them ends at the minimiser on a
         face. Therefore no face occurs twice, and the method is finite.

@@ -7,7 +7,7 @@
 cdef double KEEP = 0.95
 
 # Smallest pivot, relative to the diagonal entry. The relative rounding error of entries
-# is 2⁻⁵², so larger pivots have at least six correct digits.
+# is 2⁻⁵², so larger pivots have about six correct digits or more.
 cdef double LEAST_PIVOT = 1e-10
 
 # If a pivot is too small although no dropped entries are added to the diagonal, the
@@ -140,7 +140,7 @@ cdef class IncompleteFactor:
                     m += 1
                 if far and m == count:
                     if count == MAX_DIAGONALS:
-                        count = n + 1  # too many diagonals diagonals
+                        count = n + 1  # too many diagonals
                     else:
                         offset[count] = far
                         count += 1

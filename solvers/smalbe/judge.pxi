@@ -1,14 +1,14 @@
-# KKT residuals of a QP with bounds only. They are computed without a product, from the
-# gradient of the scaled and normalised problem that MPRGP solves.
+# Upper bound on the KKT residuals of a QP with bounds only, computed without a product
+# from the gradient of the scaled and normalised problem that MPRGP solves.
 
 
 @cython.final
 cdef class Judge:
-    """Upper bound of the worst KKT residual of a QP at a point of its normalised form.
+    """Upper bound on the worst KKT residual of a QP at a point of its normalised form.
 
     With the scale d of the variables, x = y/d componentwise (exactly at a bound if y is
     at a bound), and the gradient g of the normalised form satisfies Px + q = ‖H‖ d g.
-    The bound of the residual is computed from x and Px as in `residual_bound`.
+    The bound is computed from x and Px as in `residual_bound`.
 
     qp : the original QP
     scaled : the QP in y = d x

@@ -5,7 +5,7 @@ cdef enum:
     # Limits of Newton's method and of its line search. The search keeps a distance of
     # 5 % from the ends of its interval, so that 60 steps reduce the interval to at most
     # 5 %. If Newton's method does not end, the step is computed with the model norm·I,
-    # where norm is the largest eigenvalue. Without the line search,
+    # where norm is the largest eigenvalue of B. Without the line search,
     # `test_friction_takes_fewer_products_than_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
@@ -13,7 +13,7 @@ cdef enum:
 
 @cython.final
 cdef class Model:
-    """B = τI + Uᵀ diag(w) U, where U (k, n) are the first rows of an orthonormal basis.
+    """B = τI + Uᵀ diag(w) U with the first k rows U (k, n) of an orthonormal basis.
 
     The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
     bounds H on the complement of these directions. If B ≥ H, then f(x + s) ≤ f(x) + gᵀs

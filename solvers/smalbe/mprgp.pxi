@@ -47,20 +47,19 @@ cdef enum:
     SPECTRAL = 5
     # Number of previous costs with which the nonmonotone line search compares. In a
     # prototype, Mindlin's problem with 88 to 1468 discs takes as many products with 10
-    # and with 40, 2 % more with 5, and 35 % more with 1 (a monotone search). With
-    # 10 428 discs, it takes 12 % more products with 10.
+    # and with 40 as with 20, 2 % more with 5, and 35 % more with 1 (a monotone search).
+    # With 10 428 discs, it takes 12 % more products with 10.
     MEMORY = 20
     # Number of steps on an unchanged face before a Newton step. On contact patches with
     # condition numbers of 1e4 to 6e5, values from 1 to 6 change the number of products
     # by up to a half.
     SETTLED_FACE = 3
     # Number of steps before the first Newton step, about the number of products of a
-    # Newton step on these patches. With 10, Mindlin's problem with 1468 discs takes up
-    # to 40 % more products.
-    # With n unknowns, the number is √n if this is larger than 100. Mindlin's problem,
-    # ν = 0.3, then takes 57, 148 and 344 products with 1468, 41 684 and 166 740 discs.
-    # With 100 steps in all three cases, an earlier version took 61, 217 and 444
-    # products, and five times the memory.
+    # Newton step on the contact patches mentioned above. With 10, Mindlin's problem
+    # with 1468 discs takes up to 40 % more products. With n unknowns, the number is √n
+    # if this is larger than 100. Mindlin's problem, ν = 0.3, then takes 57, 148 and 344
+    # products with 1468, 41 684 and 166 740 discs. With 100 steps in all three cases,
+    # an earlier version took 61, 217 and 444 products, and five times the memory.
     FIRST_NEWTON = 100
     # Number of bits of the length of a spectral step. A small change of a length leads
     # to another sequence of spectral steps. If lengths are rounded, sums in another
@@ -96,8 +95,8 @@ cdef double NEWTON_ACCURACY = 0.01
 # from 1e2 to 1e6 lead to similar numbers of products.
 cdef double MIN_PROJECTING = 1e4
 
-# Factor of Γ² for spectral steps, which decrease both φ and β. With 0.01 and with 1,
-# Mindlin's problem with 60 to 1468 discs takes 5 % more products on average.
+# Factor of Γ² for spectral steps, which act on φ and β at the same time. With 0.01 and
+# with 1, Mindlin's problem with 60 to 1468 discs takes 5 % more products on average.
 cdef double SPECTRAL_GAMMA = 0.1
 
 EXPANSIONS = {
@@ -214,7 +213,7 @@ cdef class MPRGP:
     The projected gradient is g^P = φ + β. Each step is one of the following:
 
     * c, conjugate gradient: minimise along p on the face if the step is feasible; p is
-      conjugate to all `Directions` of the face, not only to the last one
+      conjugate to all stored `Directions` of the face, not only to the last direction
     * b, beyond: take a CG step on the face without its bounds, to prepare an expansion
     * e, expansion: expand the active set by one of the rules of
       `solvers.smalbe.options`
@@ -243,9 +242,9 @@ cdef class MPRGP:
     Every step decreases the cost, except spectral steps and projcg steps. With the
     model τI, the decrease is at least the amount on which the rate of convergence in
     the book is based. An expansion does not release components that its half step moved
-    to the boundary, except the first expansion by a model with directions. Between
-    proportioning steps, the active set therefore only grows. docs/smalbe-theory.md
-    discusses the consequences.
+    to the boundary, except the first expansion by a model with directions. Apart from
+    this exception, and from spectral and Newton steps, the active set therefore only
+    grows between proportioning steps. docs/smalbe-theory.md discusses the consequences.
     """
 
     cdef Product F
@@ -958,10 +957,11 @@ cdef class MPRGP:
         1/‖H‖. Components that the half step (the step to the boundary) moves to the
         boundary stay there. The first expansion with a model that has directions is an
         exception, because the active set before this expansion is only a guess. From
-        the half step, the method moves to z + r if the cost at z + r is below the cost
-        at x, otherwise to the minimiser along the line. If B = τI and the decrease is
-        less than φ̃ᵀφ/2τ, the decrease of gradient projection from x for τ ≥ ‖H‖, a
-        gradient projection step from x is taken instead.
+        the half step, the method moves along the line through z + r: at least to z + r
+        if the cost there is below the cost at x, otherwise to the minimiser along the
+        line. If B = τI and the decrease is less than φ̃ᵀφ/2τ, the decrease of gradient
+        projection from x for τ ≥ ‖H‖, a gradient projection step from x is taken
+        instead.
         """
         cdef Py_ssize_t n = self.n
         cdef double *s = self.s

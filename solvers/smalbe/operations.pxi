@@ -1,6 +1,6 @@
 # The basic operations of SMALBE: sums over processes, products with F, and products
-# with orthonormal rows. On one process, these operations run without Python. Sums over
-# MPI ranks call Python.
+# with orthonormal rows. On one process, these operations run without Python, except
+# products with an operator that is not compiled. Sums over MPI ranks call Python.
 
 
 # --- numbers ------------------------------------------------------------------------
@@ -398,8 +398,8 @@ cdef class Rows:
         return multipliers
 
 
-# If ‖x̃‖/‖ν‖ is at most this value, which is several hundred times 2⁻⁵³, x̃ counts as a
-# rounding error of e = 0. Without this test,
+# If ‖x̃‖/‖ν‖ is at most this value, which is several hundred times 2⁻⁵³, e counts as
+# zero, and x̃ as its rounding error. Without this test,
 # `test_a_right_hand_side_of_rounding_size_counts_as_zero` fails.
 cdef double SHIFT_ROUNDING = 1e-13
 # Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face with free

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mortarbench.harness import QP
-from mortarbench.solvers.common.conversion import check_positive
+from mortarbench.solvers.common.conversion import check_choice, check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
@@ -24,14 +24,14 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: projected Barzilai-Borwein step with a nonmonotone line search (1 or 2).
 #: Barzilai-Borwein steps also replace every proportioning step, and CG if the first CG
 #: step would leave the set (1). With discs, the value model selects spectral, because
-#: model steps require bounds
+#: the model is minimised only over boxes
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
-#: Rule of the proportioning step, which takes 1 product.
+#: Rule of the proportioning step, which usually takes 1 product.
 #: cg: minimise along −β as far as feasible (textbook). With discs, −β is not a feasible
 #: direction, so the rule model is used instead
 #: model: minimise the model over the box; for the model B = I/ᾱ this is a projected
-#: gradient step. After two model steps that did not halve ‖β‖², a step of the rule cg
-#: follows
+#: gradient step. Unless B = τI, a step of the rule cg follows after two model steps
+#: that did not halve ‖β‖²
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 Norm = Literal["lanczos", "power"]
@@ -55,7 +55,7 @@ class Options:
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
     # if P is sparse, conjugation against stored directions costs more than a product
     recycle: bool = (
-        True  #: make the CG directions of a face conjugate unless P is sparse
+        True  #: make CG directions conjugate to all stored ones, unless P is sparse
     )
     reduced: bool = True  #: proportion if ‖β‖² > Γ²φ̃ᵀφ; False: if ‖β‖² > Γ²φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection; relaxation factor of model steps
@@ -94,8 +94,7 @@ class Options:
             "eliminate": get_args(Eliminate),
         }
         for name, known in choices.items():
-            if (value := getattr(self, name)) not in known:
-                raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")
+            check_choice(name, getattr(self, name), known)
         if self.is_extended and self.preconditioner == "incomplete":
             raise ValueError(
                 "preconditioner = 'incomplete' works in scaled variables, which the "
@@ -104,8 +103,9 @@ class Options:
         model = self.expansion == "model" or self.preconditioner in ("auto", "model")
         if self.norm == "power" and model:
             raise ValueError(
-                "norm = 'power' computes no Ritz vectors; expected 'lanczos', or "
-                "expansion and preconditioner other than 'model'"
+                "norm = 'power' computes no Ritz vectors; expected 'lanczos', or an "
+                "expansion other than 'model' and a preconditioner other than 'auto' "
+                "and 'model'"
             )
 
     def preconditioner_for(self, qp: QP) -> Operator | None:

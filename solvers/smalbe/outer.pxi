@@ -119,8 +119,8 @@ cdef class SMALBE(MPRGP):
         show. The models contain ρQ exactly. In a flat spectrum, a short Lanczos process
         does not converge even to the first eigenvector, and Ritz vectors that are not
         eigenvectors would slow down CG. In this case, only the norm is used. With
-        sparse rows, also only the norm is used, because sparse rows come from many
-        subdomains, for which the spectrum is flat.
+        sparse rows, also only the norm is used, because sparse rows usually come from
+        many subdomains, for which the spectrum is flat.
         """
         cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef Py_ssize_t first = 0, last = n
@@ -265,7 +265,7 @@ cdef class SMALBE(MPRGP):
 
         1. Run MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
         2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²
-           since the last k: M ← βM, and ρ ← ρ·growth.
+           since the previous outer iteration: M ← βM, and ρ ← ρ·growth.
         3. μ ← μ + ρCν. The gradient changes by ρQν, without a product. H is unchanged,
            so the directions of CG remain conjugate on an unchanged face.
 
@@ -420,7 +420,7 @@ cdef class SMALBE(MPRGP):
         """Estimate the relative energy error from the remaining gradient.
 
         With the gradient r on the free components f, ‖x − x*‖_F² = rᵀF_ff⁻¹r, and each
-        rᵢ²/F_ii is a lower bound of this number. On contact problems, the certified
+        rᵢ²/F_ii is a lower bound on this number. On contact problems, the certified
         error was 0.8 to 8.4 times the square root of the sum of these bounds.
         Components of the gradient within the rounding of q are omitted. The estimate is
         zero for an operator F without a known diagonal.
@@ -465,9 +465,9 @@ cdef class SMALBE(MPRGP):
         violation is the error of the force balance, which is visible when users compare
         contact forces with the load. Projections onto {Cν = 0} and onto the free
         components alternate (von Neumann). Active bounds and discs therefore remain
-        active, and multipliers remain valid. Each projection multiplies the violation
-        by 1 − λ, where λ is the smallest eigenvalue of C_F C_Fᵀ on the free components
-        F. For a sphere on a plane, this factor is 0.5.
+        active, and multipliers remain valid. Each pair of projections multiplies the
+        violation by at most 1 − λ, where λ is the smallest eigenvalue of C_F C_Fᵀ on
+        the free components F. For a sphere on a plane, this factor is 0.5.
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []

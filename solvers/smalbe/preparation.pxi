@@ -93,9 +93,9 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
 
 
 # A spectrum counts as flat if the ratio of the largest to the smallest Ritz value after
-# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG halves its
-# error in every step, and further products of the Lanczos process would cost more than
-# they save.
+# FLAT_STEPS steps is at most FLAT_RATIO. With the condition number 10, CG about halves
+# its error in every step, and further products of the Lanczos process would cost more
+# than they save.
 cdef double FLAT_RATIO = 10.0
 
 cdef enum:
@@ -110,7 +110,8 @@ cdef void diagonalise(double *diagonal, double *off, double *S, int k) noexcept 
 
     The algorithm takes QR steps with Wilkinson's shift (Golub and Van Loan, Matrix
     Computations, 4th ed., Algorithm 8.3.3). For k = 6, LAPACK's `dstev` takes 1.3 µs,
-    which is twice as long, and the time of four products with 73 unknowns.
+    which is twice as long as this function, and as long as four products with 73
+    unknowns.
 
     diagonal : (k,) receives the eigenvalues
     off : (k − 1,) off-diagonal entries, overwritten
@@ -209,12 +210,12 @@ def lanczos(Product F, Rows C, start, int steps):
     """Compute upper Ritz pairs of 𝒫F𝒫 from `start` (n,); return the fields of `Ritz`.
 
     The Lanczos process with full reorthogonalisation takes one product per step, and at
-    most rank(𝒫) steps. After the three-term recurrence, the vector is about as long as
-    the next β, so one pass of reorthogonalisation suffices. The residual of the pair
-    (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
-    FLAT_STEPS steps if the spectrum `is_flat`, because CG then needs few steps and no
-    model. If the first pair has not converged, no vectors are returned, because no
-    model would use them.
+    most rank(𝒫) steps. After the three-term recurrence, the norm of the vector is
+    already close to the next β, so one pass of reorthogonalisation suffices. The
+    residual of the pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The
+    process ends after FLAT_STEPS steps if the spectrum `is_flat`, because CG then needs
+    few steps and no model. If the first pair has not converged, no vectors are
+    returned, because no model would use them.
 
     C : rows that span the kernel of 𝒫
     """

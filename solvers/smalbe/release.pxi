@@ -2,7 +2,7 @@
 
 
 cdef double gain_of_projection(MPRGP at) except? -1:
-    """Return a lower bound of the decrease of the cost in the step to Π(x − g/τ).
+    """Return a lower bound on the decrease of the cost in the step to Π(x − g/τ).
 
     With the projection Π onto the set, s = Π(x − g/τ) − x and τ ≥ ‖H‖, the bound is
     −gᵀs/2, because gᵀs ≤ −τ‖s‖².
@@ -20,14 +20,15 @@ cdef bint step_by_factor(MPRGP at) except -1:
         s = Π(x − M⁻¹g_F) − x,    x ← x + αs
 
     where M ≈ P_FF is the incomplete factorisation and α minimises the cost along s
-    within the set. The step is a projected Newton step if M is exact. The boundary of a
-    contact zone moves by only one component in this step, because only adjacent
-    components are released. Therefore neighbours in the graph of P, up to a distance of
-    `layers` edges, are also released; a neighbour that the step would move out of the
-    set stays at its bound. If most of the neighbours leave their bounds, the number of
-    layers is doubled, otherwise halved. The number is reset to zero after an expansion.
-    The step is accepted only if the cost decreases by at least `gain_of_projection`;
-    otherwise a gradient projection step is taken, which costs one more product.
+    within the set. The step is a projected Newton step if M is exact. If no other
+    components were released, the boundary of a contact zone would move by only about
+    one component in a step, because −g points into the set only at adjacent components.
+    Therefore neighbours in the graph of P, up to a distance of `layers` edges, are also
+    released; a neighbour that the step would move out of the set stays at its bound. If
+    most of the neighbours leave their bounds, the number of layers is doubled,
+    otherwise halved. The number is reset to zero after an expansion. The step is
+    accepted only if the cost decreases by at least `gain_of_projection`; otherwise a
+    gradient projection step is taken, which costs one more product.
     """
     cdef Py_ssize_t i, count = 0, released, freed = 0, n = at.n
     cdef IncompleteFactor factor = at.factor

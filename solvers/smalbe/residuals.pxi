@@ -1,10 +1,10 @@
-# Upper bound of the KKT residuals of the original QP, computed without a product with
+# Upper bound on the KKT residuals of the original QP, computed without a product with
 # P. Scales and errors are defined as in `harness.verify.kkt`, by
 # `harness/verify/scales.h`.
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
-    """Return an upper bound of the worst of `harness.kkt_residuals`, without products.
+    """Return an upper bound on the worst of `harness.kkt_residuals`, without products.
 
     The bound uses the smallest energy scale that `kkt_residuals` may use, and
     attributes no part of a residual to rounding. A small bound therefore implies small

@@ -1,11 +1,11 @@
 """Scaling of the variables of a QP by √diag P, and its inverse.
 
 With D = diag(P) and y = D¹ᐟ²x, the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ² with unit
-diagonal. This is Jacobi scaling, whose condition number is nearly the smallest among
-all diagonal scalings (van der Sluis, Numer. Math. 14, 1969, 14-23). Bounds of x become
-bounds of y. On a disc, D is the mean of diag(P) over the variables of the disc, so that
-a disc of x becomes a disc of y. The stopping test uses KKT residuals of the original
-QP.
+diagonal. This is Jacobi scaling. If the rows of P have at most k nonzero entries, the
+condition number is at most k times the smallest that a diagonal scaling can reach (van
+der Sluis, Numer. Math. 14, 1969, 14-23). Bounds of x become bounds of y. On a disc, D
+is the mean of diag(P) over the variables of the disc, so that a disc of x becomes a
+disc of y. The stopping test uses KKT residuals of the original QP.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class ScaledSparse(Scaled):
 
     P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
     diagonal: Vector  #: (n,) diagonal of P
-    #: upper bound of the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
+    #: upper bound on the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
     norm: float
     weights: Vector  #: (n,) w > 0; Pw ≥ 0 up to rounding if `has_weights`
     has_weights: bool
@@ -118,7 +118,7 @@ class ScaledSparse(Scaled):
         )
 
     def spectrum(self) -> Spectrum:
-        """Return the bound of the norm by Gershgorin's theorem, without Ritz pairs."""
+        """Return the bound on the norm by Gershgorin's theorem, without Ritz pairs."""
         return Spectrum(self.norm, None)
 
     def factor(self) -> IncompleteFactor:

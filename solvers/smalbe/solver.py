@@ -11,13 +11,13 @@ spectral steps (mprgp.pxi).
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
 4. Run the outer loop (outer.pxi) with MPRGP (mprgp.pxi) as the inner loop. Without
-   equality rows, there is a single run of MPRGP.
+   equality rows, the outer loop consists of a single run of MPRGP.
 
 One part of this implementation is new: the Lanczos process that estimates the norm also
 yields the upper Ritz pairs. These pairs and C define a model of H (model.pxi). The
 model determines the steps that change the face, preconditions CG on the face, and
-permits a large ρ without loss of conditioning. The presets reproduce the methods of
-other codes.
+permits a large ρ without loss of conditioning. The presets `PERMON`, `ESPRESO` and
+`PAPER` use the constants and step rules of PERMON, of ESPRESO and of the textbook.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ class SMALBE(Options):
     forces in three dimensions.
 
     `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
-    problem, and ‖Gx − e‖/‖e‖. The solver claims a solution only if the KKT residuals of
-    the original QP are also at most 5·tol.
+    problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only, the default options test the
+    KKT residuals instead. The solver claims a solution only if the KKT residuals of the
+    original QP are also at most 5·tol.
     """
 
     about: ClassVar[About] = About(

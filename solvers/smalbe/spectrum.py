@@ -16,7 +16,7 @@ class Ritz(NamedTuple):
     """Ritz pairs, in descending order of their values."""
 
     values: Vector  #: (k,)
-    #: (k,) ‖Hv − θv‖, an upper bound of the distance of θ from an eigenvalue
+    #: (k,) ‖Hv − θv‖, an upper bound on the distance of θ from the nearest eigenvalue
     residuals: Vector
     #: (k, n) orthonormal rows; (0, n) if the first pair has not converged
     vectors: NDArray[np.float64]
@@ -40,7 +40,7 @@ def power_method(H: Callable[[Vector], Vector], n: int) -> float:
     """Estimate ‖H‖ to 1e-4 by PERMON's power method, with at most 50 products.
 
     The iteration starts from a vector of ones. The last Rayleigh quotient is a lower
-    bound of ‖H‖ and is used without a safety factor, as in PERMON.
+    bound on ‖H‖ and is used without a safety factor, as in PERMON.
     """
     v = np.full(n, 1 / np.sqrt(n))
     estimate = 0.0

@@ -54,8 +54,8 @@ from mortarbench.problems.contact.space.triangles import FaceTriangles, triangul
 from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
-#: overlaps below this fraction of the area of the slave face are due to rounding of the
-#: projection and are dropped
+#: overlaps whose area is at most this factor times the squared radius of the slave face
+#: count as rounding errors of the projection and are dropped
 MIN_OVERLAP = 1e-12
 #: eigenvalues of M_e below this fraction of the largest count as zero
 SINGULAR = 1e-10

@@ -2,7 +2,7 @@
 
 A force on a cell of side h is distributed as a uniform traction. The relative
 displacement of the surfaces of two half-spaces of the same material, at the centre of a
-cell at distance (x, y), is twice the displacement of one surface. For a unit normal
+cell at the offset (x, y), is twice the displacement of one surface. For a unit normal
 force and unit tangential forces, the relative displacement is (Boussinesq and Cerruti;
 Johnson 1985, "Contact mechanics", Sections 3.2 and 3.6)
 
@@ -18,7 +18,7 @@ tangential displacement, and tangential forces cause no relative normal displace
 The antiderivatives are Y ln(X + r) for I_xx, X ln(Y + r) for I_yy and −r for I_xy (Love
 1929).
 
-An entry depends only on the distance between two cells. Therefore F is a principal
+An entry depends only on the relative position of two cells. Therefore F is a principal
 submatrix of the circulant matrix C of a periodic grid of about twice the size:
 Fx = RᵀCRx, where R extends x by zeros. The FFT diagonalises C. Hence
 λ_min(F) ≥ λ_min(C); see docs/mathematics.md.
@@ -37,7 +37,7 @@ from mortarbench.harness.operators import Arrays, Product, SerialisableOperator
 
 NAME = "half-space"  #: name in `problems.OPERATORS`, stored in files
 #: bound on the error of computed eigenvalues of C, relative to the largest eigenvalue.
-#: Errors of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, which is 4e-15·‖C‖ for
+#: Errors of an FFT of M × M values are below 2⁻⁵³·log₂(M²)·‖C‖, which is 3e-15·‖C‖ for
 #: M = 8192
 EIGENVALUE_ROUNDING = 1e-12
 #: size of a strip of transforms, bytes; small enough for the cache
@@ -47,7 +47,7 @@ Array = NDArray[np.float64]
 
 
 class CellIntegrals(NamedTuple):
-    """Integrals (m0, m1) over a unit cell, indexed by distances along x and along y.
+    """Integrals (m0, m1) over a unit cell, indexed by offsets along x and along y.
 
     I_xy is odd in x and in y; I_xx and I_yy are even.
     """

@@ -41,7 +41,7 @@ def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
 
 @pytest.mark.parametrize(
     ("law", "message"),
-    [(FrictionLaw("oily"), "friction 'oily' is unknown; expected one of none, tresca"),
+    [(FrictionLaw("oily"), "friction 'oily' is unknown; expected 'none' or 'tresca'"),
      (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
      (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
      (FrictionLaw("coulomb", mu=0.3), "expected the argument `reference`")],

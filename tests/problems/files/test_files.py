@@ -318,7 +318,7 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
         (" G  r1", " G  r2", "line 6: row 'r2' is given twice"),
         ("COLUMNS\n", "COLUMNS\n M 'MARKER' 'INTORG'\n", "line 11: integer variables"),
         ("c2        c2 ", "c2 c1 ", "line 32: entry 'c2', 'c1' is given twice"),
-        ("QUADOBJ", "QSECTION r1", "line 29: QSECTION r1 belongs to a constraint"),
+        ("QUADOBJ", "QSECTION r1", "line 29: QSECTION 'r1' belongs to a constraint"),
         ("ENDATA\n", "", "no ENDATA; the file is truncated"),
         (" N  obj\n", " G  obj\n", None),
         ("MI bnd       c4", "LO bnd c4 1e20", "the limits of variable 3 (from 0)"),
