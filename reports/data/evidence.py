@@ -296,7 +296,7 @@ def read_evidence(
 
 
 def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Replace each environment by the first one whose times are comparable with it."""
+    """Replace each environment by the first one with comparable times."""
     representatives: dict[str, Mapping[str, Any]] = {}
     united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
@@ -398,7 +398,7 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
 
 
 def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
-    """Count the cases of each family: "6 cases of beam-ring"."""
+    """Count the cases of one or two families ("6 cases of beam-ring"), or all cases."""
     of = {o.case: o.first.family for o in outcomes}
     families = Counter(of.values())
     if len(families) > 2:
