@@ -245,6 +245,6 @@ def _by_block(o: Outcome) -> dict[tuple[str, int], float]:
 
 
 def _single(a: Outcome, b: Outcome) -> Ratio:
-    """Return the ratio of single runs, with the unbounded interval (0, ∞)."""
+    """Return the ratio of the first runs, with the unbounded interval (0, ∞)."""
     (t, *_), (s, *_) = _by_block(a).values(), _by_block(b).values()
     return Ratio(t / s, 0.0, float("inf"), 1)

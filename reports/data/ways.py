@@ -40,9 +40,7 @@ class Way(NamedTuple):
 class Ways:
     """Comparison of all combinations of form and solver at each accuracy."""
 
-    comparisons: tuple[
-        FastestSolver, ...
-    ] = ()  #: cold solves and tight accuracies first
+    comparisons: tuple[FastestSolver, ...] = ()  #: cold and tight ones first
     uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
 
 

@@ -85,7 +85,7 @@ def plain_value(value: object, limit: int = 96) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Format a number with `digits` significant digits; use an exponent only if needed."""
+    """Format a number with `digits` significant digits, with an exponent if needed."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:

@@ -38,7 +38,7 @@ def csv_tables(
 ) -> dict[str, pd.DataFrame]:
     """Return every nonempty table by the stem of its file.
 
-    The table `measurements` has one row per journal line; `outcomes` has one row per
+    The table `measurements` has one row per measurement; `outcomes` has one row per
     case, tolerance and solver, with medians of times and their intervals; `energies`
     and `scaling` contain the numbers of these sections of the report. For `contests`
     and `means`, see `comparison_tables`.

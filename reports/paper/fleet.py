@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     size: int
     outcome: Outcome
-    dofs: bool  #: True if the size is n (primal), False if the size is m (dual)
+    dofs: bool  #: True if the size is n (dofs), False if it is m (size of the dual)
 
     @property
     def time(self) -> Interval | None:

@@ -398,8 +398,8 @@ def _fleet(evidence: Evidence) -> tuple[Section, ...]:
             "fleet",
             "Beyond the paper: SMALBE and other solvers",
             fleet_figure(evidence),
-            "Time against the size m of the dual at the last load step, tolerance "
-            "1e-6, verified answers only; crosses: unverified answers. Bars: "
+            "Times of verified answers against the size m of the dual at the last "
+            "load step, tolerance 1e-6; crosses: unverified answers. Bars: "
             f"interval of the median. {TIMED}",
             prose=(REPEATED,),
             tables=tuple(fleet_table(evidence, form) for form in DUALS),

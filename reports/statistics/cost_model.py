@@ -113,7 +113,7 @@ class CostModel:
         return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def ranks_at(self, efficiency: float) -> int:
-        """Return the largest N = 2ᵏ up to which all powers of two reach `efficiency`."""
+        """Return the largest N = 2ᵏ such that 2, 4, …, N all reach `efficiency`."""
         N = 2
         while N < MAX_RANKS and self._speed_up(N, self._own)[0] >= efficiency * N:
             N *= 2
