@@ -4,7 +4,7 @@
 depend on the machine, in Markdown. The case is `cube-wall/n=32/feti=4`, with 512
 congruent subdomains and 107 811 dofs in total. Each time is the smallest time of many
 calls, because other programs can only lengthen a call. If there are more ranks than
-CPUs, messages wait for their receivers, and only the times of local products are
+CPUs, messages wait for their receivers, and the times of product and projection are not
 printed.
 """
 

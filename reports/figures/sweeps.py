@@ -162,7 +162,7 @@ def certified_figure(
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the points that `counts` accepts; draw the others as hollow markers."""
+    """Connect the points that `counts` accepts by a line; draw the others hollow."""
     points = [
         (o.seconds("total"), max(e, SMALLEST), o)
         for o in outcomes
