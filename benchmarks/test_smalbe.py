@@ -163,7 +163,7 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
 def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
     race, note, form, Nr, Nh
 ):
-    """Compare the time of a solve with 1.5·T + 100 µs, T being that of its products."""
+    """Compare the time of a solve with 1.5·T + 100 µs; its products take the time T."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
     ready = []

@@ -45,7 +45,7 @@ class KnownSolution(NamedTuple):
     u: np.ndarray  #: (n,) displacement, extended precision
     multipliers: np.ndarray  #: (m,) multipliers of contact and friction rows
     norm: float  #: ‖u‖
-    slack: float  #: bound of ‖error of u‖
+    slack: float  #: bound on ‖error of u‖
     rigid: np.ndarray  #: (n, 3 bodies) rigid motions of single bodies
 
 
@@ -72,7 +72,7 @@ def known_solution(build, ranks):
 
 
 def drifted(s, size, rng, rigid):
-    """Move each body rigidly by up to 10⁶ times its displacement."""
+    """Move each body rigidly, by the order of size·‖x‖ to 10⁶·size·‖x‖."""
     far = 10 ** rng.uniform(0, 6) * size * np.linalg.norm(s.x)
     return replace(s, x=s.x + rigid @ (far * rng.standard_normal(rigid.shape[1])))
 
