@@ -85,7 +85,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection(session: pytest.Session) -> Iterator[None]:
-    """Disable garbage collection during imports, which create no garbage."""
+    """Disable garbage collection during imports, which create little garbage."""
     gc.disable()
     try:
         import_share(session.config)

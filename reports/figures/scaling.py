@@ -208,7 +208,7 @@ def _counted(
 def condition_numbers(
     points: Sequence[tuple[float, Outcome]],
 ) -> dict[str, tuple[float, ...]]:
-    """Return condition numbers present in all answers, without error bounds."""
+    """Return condition numbers present in all answers, without their error bounds."""
     names = [
         name
         for name in (points[0][1].quantities if points else ())

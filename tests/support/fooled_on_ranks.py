@@ -36,7 +36,6 @@ DISCS = {
     "tilted disc": {"tilt": 0.5}, "soft disc": {"E": (70e9, 70e3, 70e9)},
 }  # fmt: skip
 ROUNDED = 1 + 1e-9  #: allowed ratio of error to bound; local solves are rounded
-NOISE = 1e-7  #: smallest relative error for which the ratio bound / error is recorded
 
 
 class KnownSolution(NamedTuple):

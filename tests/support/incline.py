@@ -1,4 +1,4 @@
-"""Block on an inclined plane that only friction keeps from sliding (CGS-4)."""
+"""Block that only friction keeps from sliding on an inclined plane (CGS-4)."""
 
 from __future__ import annotations
 
