@@ -29,7 +29,7 @@ settings.load_profile("untimed")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Use two workers per CPU, up to eight, since tests wait a third of their time."""
+    """Use at most two workers per CPU and eight in all, but at least one per CPU."""
     cpus = len(os.sched_getaffinity(0))
     return max(cpus, min(2 * cpus, 8))
 

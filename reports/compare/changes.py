@@ -22,7 +22,7 @@ from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
-ALIKE = 1.5  #: an interval around 1 within (1/ALIKE, ALIKE): "no change seen"
+ALIKE = 1.5  #: intervals around 1 within (1/ALIKE, ALIKE) mean "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller absolute differences of energies count as rounding
 

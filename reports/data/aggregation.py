@@ -134,7 +134,7 @@ class Ranking:
 
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) True if the row's solver is significantly faster."""
+        """(solvers, solvers) True where row is significantly faster than column."""
         logs, _ = _logs(self.group, USUAL)
         faster = resampling.significantly_faster(logs, self.group.cases)
         if self.group.apart.any():  # different sessions have no common blocks to pair
@@ -189,7 +189,8 @@ class Changed(NamedTuple):
     """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) True if reversed
+    #: (solvers, solvers) True if the order of the row and column solvers is reversed
+    turned: NDArray[np.bool_]
 
 
 class Panel(NamedTuple):

@@ -40,7 +40,8 @@ class Way(NamedTuple):
 class Ways:
     """Comparison of all combinations of form and solver at each accuracy."""
 
-    comparisons: tuple[FastestSolver, ...] = ()  #: cold and tight ones first
+    #: cold solves first, then by mode; tight accuracies first within a mode
+    comparisons: tuple[FastestSolver, ...] = ()
     uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
 
 

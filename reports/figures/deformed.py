@@ -443,7 +443,7 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Return factor and prefix (G, M, k or none) of the largest unit below `value`."""
+    """Return factor and prefix (G, M, k or none) of the largest unit up to `value`."""
     prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 

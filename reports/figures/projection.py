@@ -124,7 +124,7 @@ def crease_edges(
 
     Edges of faces that all point away from the camera are left out.
 
-    least : smallest angle, rad; edges of a single face need no angle
+    least : smallest angle, rad; edges of a single face always count as creases
     """
     normal = face_normals(points, faces)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -36,8 +36,8 @@ def median_interval(samples: Sequence[float]) -> Interval:
     samples lie on one side of it. For every continuous distribution, the coverage is
     therefore 1 − 2·P(X < k) with X ~ Bin(n, ½) [1]_. The largest k with a coverage of
     at least 95 % is used. Fewer than six samples cannot reach 95 %; then k = 1, the
-    interval extends from the smallest to the largest sample, and its coverage is 1 −
-    2¹⁻ⁿ.
+    interval extends from the smallest to the largest sample, and its coverage is
+    1 − 2¹⁻ⁿ.
 
     References
     ----------

@@ -137,7 +137,7 @@ def size(v: Vector) -> int:
 
 
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
-    """Run `steps` Lanczos steps with full reorthogonalisation and one product each.
+    """Run at most `steps` Lanczos steps, fully reorthogonalised, with one product each.
 
     After the three-term recurrence, a single pass over all vectors makes the next
     vector orthogonal to them up to rounding. The residual of the pair (θ, Vᵀs) is
