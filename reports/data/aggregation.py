@@ -26,7 +26,7 @@ class Convention:
 
     shift: float = 1.0  #: shift of times, in units of the shift of the group
     penalty: float = 3.0  #: charge for an unsolved case, in units of `horizon`
-    #: accepted answers: "verified" ones, or all that the solver "claimed" to be solved
+    #: answers that count as solved: "verified", or "claimed" to be solved by the solver
     gate: str = "verified"
     common: bool = False  #: use only cases solved by all solvers, see `common_cases`
 

@@ -165,7 +165,7 @@ class FieldFigure:
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lower left and upper right corners of a box around bodies."""
+    """Return corners (lower left, upper right) of a box with margin around bodies."""
     points = np.vstack(bodies)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (high - low)

@@ -63,7 +63,7 @@ class Witness(Honest):
 
 
 def reply_pipe():
-    """Return the pipes to which this worker may write its replies."""
+    """Yield the descriptors of the pipes to which this worker may write its replies."""
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)
         try:

@@ -194,7 +194,7 @@ def refused(ranks, sign, **keys):
 
 
 def why(certificate):
-    """Return the bound of a certificate, or the reason why there is no certificate."""
+    """Return the bound that a certificate proves, or the reason for its absence."""
     try:
         return f"bound {certificate().bound}"
     except UncertifiableError as e:
