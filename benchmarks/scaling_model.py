@@ -49,7 +49,7 @@ class Row:
     """Measurements for one number of ranks and one cluster size, with predictions."""
 
     ranks: int
-    cluster: int  #: subdomains per side of a cluster
+    cluster: int  #: number of subdomains per side of a cluster
     measured: dict[str, float]  #: measurements by name of the quantity
     machine: dict[str, float]  #: measured speeds by field of `Machine`
 

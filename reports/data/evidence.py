@@ -23,7 +23,7 @@ from mortarbench.harness.verify.kkt import allowed, rejudged
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 FROM_FILE = "file"  #: family of QPs from files, whose case names are paths
-_MARK_DIGITS = 6  #: digits of an environment's digest appended to a solver label
+_MARK_DIGITS = 6  #: number of digits of an environment's digest in a solver label
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"

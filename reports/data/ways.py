@@ -42,7 +42,7 @@ class Ways:
 
     #: cold solves first, then by mode; tight accuracies first within a mode
     comparisons: tuple[FastestSolver, ...] = ()
-    uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
+    uncharged: int = 0  #: number of problems left out for lack of `dualise_seconds`
 
 
 def compare_ways(evidence: Evidence) -> Ways:

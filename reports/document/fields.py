@@ -156,7 +156,7 @@ class FieldFigure:
     """Grid of panels with bodies to scale."""
 
     panels: tuple[FieldPanel, ...]
-    height: float  #: inches
+    height: float  #: height of the figure, inches
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows

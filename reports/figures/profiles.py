@@ -40,7 +40,7 @@ PAIRS = 6  #: largest number of pairwise panels
 BANDED = 20  #: minimum number of cases for bands if three or more solvers are drawn
 _COLUMNS = 3  #: number of columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
-_COARSE = 60  #: points of a grey curve; few, since there may be hundreds of curves
+_COARSE = 60  #: number of points of a grey curve; there may be hundreds of curves
 
 #: ticks by the largest ratio on an axis; longer axes have powers of ten
 _FACTORS = {

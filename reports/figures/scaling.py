@@ -52,7 +52,7 @@ PANELS = (
     ("steps", ("cg", "expansion", "proportioning")),
 )
 KAPPA = "kappa"  #: prefix of the names of condition numbers
-_FITTED = 24  #: points of a fitted curve
+_FITTED = 24  #: number of points of a fitted curve
 _FOOT = 0.04  #: minimum fraction of the axis below and above the guide lines
 
 

@@ -88,8 +88,8 @@ class _Entry(NamedTuple):
 
 
 _ENTRIES: list[_Entry] = []
-EVIDENCE = 10  #: position after the sections with conclusions
-APPENDIX = 90  #: position of conditions and definitions
+EVIDENCE = 10  #: sections at smaller positions contain conclusions
+APPENDIX = 90  #: from this position on: conditions and definitions
 
 
 def section(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, stdtrit
 
-COVERAGE = 0.95  #: nominal; the median of fewer than six samples cannot reach it
+COVERAGE = 0.95  #: nominal coverage; six samples are needed to reach it for a median
 
 
 class Interval(NamedTuple):

@@ -43,7 +43,7 @@ class KnownSolution(NamedTuple):
 
     u: np.ndarray  #: (n,) displacement, extended precision
     multipliers: np.ndarray  #: (m,) multipliers of contact and friction rows
-    norm: float  #: ‖u‖
+    norm: float  #: energy norm ‖u‖
     slack: float  #: bound on ‖error of u‖
     rigid: np.ndarray  #: (n, 3 bodies) rigid motions of single bodies
 

@@ -23,7 +23,7 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 from mortarbench.solvers.reference.solve import reference_solution
 
-WEIGHT = 1e5  #: G, N/m
+WEIGHT = 1e5  #: weight G of the block, N/m
 
 
 def incline(ratio: float, slope: float = 0.1) -> Bodies:

@@ -35,7 +35,7 @@ from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, r
 from mortarbench.problems.feti.subdomains import DecomposedProblem
 from tests.support.decomposed_bodies import decompose_by_labels, parts_by
 
-PRESSURE = 1e7  #: Pa
+PRESSURE = 1e7  #: pressure on the upper plate, Pa
 
 
 def disc_between_plates(

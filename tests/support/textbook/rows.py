@@ -76,7 +76,7 @@ class PenaltyModel:
 
     tau: float
     rows: SparseRows
-    w: float  #: positive
+    w: float  #: positive weight of CᵀC
 
     has_directions = True
 
