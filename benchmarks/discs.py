@@ -91,7 +91,7 @@ def products() -> None:
 
 @contextmanager
 def perturbed_norm(factor: float) -> Iterator[None]:
-    """Multiply the estimates of ‖P‖ in the first step of all methods by `factor`."""
+    """Multiply the first estimates of ‖P‖ by `factor`, in all methods except nsgs."""
 
     def norm(name: str, estimate: Any, *args: Any, **keys: Any) -> Any:
         result = estimate(*args, **keys)

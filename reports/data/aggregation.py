@@ -28,7 +28,7 @@ class Convention:
     penalty: float = 3.0  #: charge for an unsolved case, in units of `horizon`
     #: answers that count as solved: "verified", or "claimed" to be solved by the solver
     gate: str = "verified"
-    common: bool = False  #: use only cases solved by all solvers, see `common_cases`
+    common: bool = False  #: use only the cases of `common_cases`
 
 
 USUAL = Convention()  #: convention used for tiers and ratios

@@ -140,7 +140,7 @@ def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
 def comparison_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Return the tables `contests` and `means` of all groups of cases.
+    """Return the tables `contests` and `means` of all comparable groups of cases.
 
     `contests` has one row per case and solver with the time and its ratio to the best
     time, both infinite for a failure; performance profiles are the distributions of

@@ -392,7 +392,7 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Return the sections on times of all solvers, against m and by form."""
+    """Return the sections on times of the suite's solvers, against m and by form."""
     return (
         _section(
             "fleet",
