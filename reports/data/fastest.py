@@ -91,7 +91,7 @@ class Competitor:
 
 @dataclass(frozen=True, kw_only=True)
 class FastestSolver:
-    """Comparison of the solvers of one form at one accuracy.
+    """Comparison of the solvers of one group, see `GroupKey`.
 
     Competitors are sorted by the geometric mean of their times. The cases are those on
     which all solvers were measured and which at least one solver solved.
