@@ -1,8 +1,8 @@
 """Fixtures for races, in which functions are timed alternately in one process.
 
 Because the functions alternate, a drift of the machine's speed affects all functions
-equally. After the tests, a summary shows medians, quartiles and ratios to the time of
-the first function.
+nearly equally. After the tests, a summary shows medians, quartiles and ratios to the
+time of the first function.
 """
 
 from statistics import median, quantiles

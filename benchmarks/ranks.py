@@ -3,14 +3,15 @@
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/ranks.py [CASE] [REPEATS]
 
 Memory bandwidth, which the CPUs of a machine share, limits the speed of products.
-Therefore even two independent copies of a job on two CPUs do not achieve twice the
+Therefore even two independent copies of a job on two CPUs may not achieve twice the
 throughput of one copy. The script compares the speed-up of a solve on all ranks with
 the joint throughput of copies, one on each rank. The same QP is solved in three ways:
 `alone` on one rank, as independent `copies`, and by all `ranks` together. The rounds of
 these measurements alternate. The script prints medians with minimum and maximum, and
-the times of each rank for the phases of a solve. Measurements during which other
-processes used the CPUs are dropped, and the number of remaining measurements is
-printed. The script requires Linux. It asserts no results, because machines differ.
+the times of each rank for the phases of a solve. Measurements that other processes
+disturbed by more than `MAX_DISTURBANCE` are dropped, and the number of remaining
+measurements is printed. The script requires Linux. It asserts no results, because
+machines differ.
 """
 
 import os

@@ -4,7 +4,7 @@
 depend on the machine, in Markdown. The case is `cube-wall/n=32/feti=4`, with 512
 congruent subdomains and 107 811 dofs in total. Each time is the smallest time of many
 calls, because other programs can only lengthen a call. If there are more ranks than
-CPUs, messages wait for their receivers, and only the times of local products are
+CPUs, messages wait for their receivers, and the times of product and projection are not
 printed.
 """
 
@@ -49,7 +49,7 @@ class Row:
     """Measurements for one number of ranks and one cluster size, with predictions."""
 
     ranks: int
-    cluster: int  #: subdomains per side of a cluster
+    cluster: int  #: number of subdomains per side of a cluster
     measured: dict[str, float]  #: measurements by name of the quantity
     machine: dict[str, float]  #: measured speeds by field of `Machine`
 

@@ -7,7 +7,7 @@
   The time of a solve is compared with the bound 1.5·T + 100 µs. T is the number of
   products times the time of a product in `smalbe` or in `dsymv` of BLAS, whichever is
   smaller.
-* sparse: time of a solve without a preconditioner, divided by its number of products,
+* sparse: time of a solve without incomplete factors, divided by its number of products,
   in units of one product plus five vector operations w += v.
 * incomplete: sparse problems with and without incomplete factors.
 * subdomains: times to prepare and solve duals of bodies in subdomains, relative to the

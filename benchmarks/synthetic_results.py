@@ -5,7 +5,7 @@
 The synthetic journal has 20 solvers and 5 repeats; the report is written in all
 formats. Each measurement runs in a separate process, so that its peak memory is known.
 If chromium and playwright are installed (make browser), the script also measures the
-times until the first paint of the page and until all plots are drawn.
+times until the first paint of the page and until the end of loading.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""Compare SMALBE with PERMON by products with F, and with all solvers by time."""
+"""Compare SMALBE with PERMON by products with F, and with other solvers by time."""
 
 from dataclasses import replace
 from functools import partial
@@ -130,7 +130,7 @@ def test_products_of_a_load_path(note, form, Nr, Nh):
 )
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
-    """Compare the times of all solvers whose answers are verified at 1e-6."""
+    """Compare our solvers with the three fastest others that are verified at 1e-6."""
     qp, tol = dual(Nr, Nh, 10, form), 1e-6
     least = {
         name: min(seconds(solver, qp, tol) for _ in range(3))
@@ -163,7 +163,7 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
 def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
     race, note, form, Nr, Nh
 ):
-    """Compare the time of a solve with 1.5·T + 100 µs, T being that of its products."""
+    """Compare the time of a solve with 1.5·T + 100 µs; its products take the time T."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
     ready = []

@@ -1,4 +1,4 @@
-"""Pure functions from records to text, tables and figures."""
+"""Reports from records: text, tables and figures."""
 
 from mortarbench.reports.compare.report import write_comparison, write_comparisons
 from mortarbench.reports.folder import answer, figures, write_report

@@ -91,9 +91,9 @@ def figures(
 def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
     """Return the opening sentences of the report on a result folder.
 
-    The first sentence names the combination of solver and form that leads fastest from
-    the mesh to a verified answer. The others compare the solvers of each form and name
-    failures.
+    If the forms of the problems can be compared, the first sentences name the
+    combination of solver and form that leads fastest from the mesh to a verified
+    answer. The others compare the solvers of each form and name failures.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 

@@ -29,7 +29,7 @@ settings.load_profile("untimed")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Use two workers per CPU, up to eight, since tests wait a third of their time."""
+    """Use at most two workers per CPU and eight in all, but at least one per CPU."""
     cpus = len(os.sched_getaffinity(0))
     return max(cpus, min(2 * cpus, 8))
 
@@ -85,7 +85,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection(session: pytest.Session) -> Iterator[None]:
-    """Disable garbage collection during imports, which create no garbage."""
+    """Disable garbage collection during imports, which create little garbage."""
     gc.disable()
     try:
         import_share(session.config)

@@ -8,7 +8,7 @@ lists the modules, their tests, the number of mutants per module, and accepted s
 with reasons. The exit code is 1 if a mutant survives that is not accepted.
 
 The selection of mutants depends only on their text, so that a change in one function
-does not affect the selection in other functions. The working tree is not modified.
+hardly affects the selection in other functions. The working tree is not modified.
 
 Usage: python tools/mutants.py [MODULE ...] [--most N]
 """
@@ -86,7 +86,7 @@ FUNCTIONS = {
     "any": "all", "all": "any", "floor": "ceil", "ceil": "floor",
     "argmin": "argmax", "argmax": "argmin",
 }  # fmt: skip
-#: functions whose calls are replaced by the argument
+#: functions whose calls are replaced by their argument
 DROPPED = ("abs", "sqrt", "sorted")
 COUNTS = ("len", "size", "sum", "shape")  #: names whose values are counts
 

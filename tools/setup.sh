@@ -45,7 +45,7 @@ install_packages() {
             die "no terminal to ask for a password; run: sudo ${install[*]}"
     fi
     echo "setup: installing $* by ${as_root[*]} apt-get"
-    "${as_root[@]}" apt-get update -qq || echo "setup: apt-get update failed; going on" >&2
+    "${as_root[@]}" apt-get update -qq || echo "setup: apt-get update failed; continuing" >&2
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq >/dev/null ||
         die "could not install system packages; run: sudo ${install[*]}"
 }
@@ -54,7 +54,7 @@ if command -v dpkg-query >/dev/null; then
     mapfile -t missing < <(missing_packages)
     [ ${#missing[@]} -eq 0 ] || install_packages "${missing[@]}"
 else
-    echo "setup: no dpkg here; needed from this system: SuiteSparse 5.x with headers," \
+    echo "setup: dpkg not found; this system must provide SuiteSparse 5.x with headers," \
         "an optimised BLAS (OpenBLAS), a C and C++ compiler, Python headers;" \
         "for the tests of the page: chromium"
 fi
@@ -64,7 +64,7 @@ has_python 'import sys; assert sys.version_info >= (3, 11)' ||
         "name another one: make PYTHON=python3.12"
 .venv/bin/python -m pip --version >/dev/null 2>&1 ||
     "$python" -m venv --clear .venv ||
-    die "could not make .venv with $python"
+    die "could not create .venv with $python"
 
 # These variables also pin the packages with which wheels are built; recent versions of pip
 # read the second one. Each is a list separated by spaces, so the path is passed as a URI,

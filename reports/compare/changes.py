@@ -22,9 +22,9 @@ from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000  #: number of bootstrap resamples; 50 of them form a tail of 2.5 %
-ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] counts as "no change seen"
+ALIKE = 1.5  #: intervals around 1 within (1/ALIKE, ALIKE) mean "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
-_NEGLIGIBLE = 1e-12  #: smaller differences of energies of order 1 count as rounding
+_NEGLIGIBLE = 1e-12  #: smaller absolute differences of energies count as rounding
 
 #: case (for a QP from a file, its digest), tolerance, and solver with its mode
 Key = tuple[str, float, str]
@@ -51,7 +51,7 @@ class Pair:
 
     @property
     def both_verified(self) -> bool:
-        """True if both answers are verified and of equal size, hence comparable."""
+        """True if both answers are verified and the QPs have equal sizes."""
         return self.before.verified and self.after.verified and self.same_sizes
 
     @cached_property
@@ -95,8 +95,8 @@ class Pair:
     def answers(self) -> tuple[float, float, float] | None:
         """Energy (or the objective) before and after, and their relative difference.
 
-        The difference is relative to the larger value. None if an answer is not
-        verified or has no such value.
+        The difference is relative to the larger absolute value. None if an answer is
+        not verified or has no such value.
         """
         pairs = (
             (self.before.energy, self.after.energy),

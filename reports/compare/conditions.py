@@ -36,7 +36,7 @@ def hardware(evidence: Evidence) -> dict[str, str]:
 
 
 def machines_differ(before: Evidence, after: Evidence) -> bool:
-    """Return whether the measurements of both folders come from different machines."""
+    """Return whether the measurements of the two folders come from several machines."""
     return len({*hardware(before).values(), *hardware(after).values()}) > 1
 
 

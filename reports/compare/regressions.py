@@ -9,13 +9,13 @@ Both intervals are unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases (at least three), with Student's
   interval. The scatter over cases includes the differences between runs on one case.
-- Single cell: its standard error is the larger of Welch's error over the repeats and
-  the scatter of the cells about the medians of their solvers (1.4826 times the median
-  distance, which is the standard deviation of a normal law). At least `CELLS` cells are
-  needed to estimate the scatter.
+- Single cell: Welch's interval over the repeats. The standard error of the relative
+  ratio is the larger of Welch's error and the scatter of the cells about the medians of
+  their solvers (1.4826 times the median distance, which is the standard deviation of a
+  normal law). At least `CELLS` cells are needed to estimate the scatter.
 
-The joint coverage of all intervals is 95 %: half of the error probability of 5 % is
-assigned to the solvers and half to the cells, and each half is divided evenly
+The joint coverage of all intervals is at least 95 %: half of the error probability of
+5 % is assigned to the solvers and half to the cells, and each half is divided evenly
 (Bonferroni) [1]_.
 
 References
@@ -198,7 +198,7 @@ def _of_solver(
 ) -> Slower:
     """Average logarithms of ratios over cases, with Student's interval.
 
-    miss : probability, on each side, that the mean is outside the interval
+    miss : probability that the mean is outside the interval
     """
 
     def student(x: Floats) -> Ratio:

@@ -25,10 +25,10 @@ class Convention:
     """Choices in the averaging of times over cases."""
 
     shift: float = 1.0  #: shift of times, in units of the shift of the group
-    penalty: float = 3.0  #: charge for an unsolved case, in multiples of the time limit
-    #: accepted answers: "verified" ones, or all that the solver "claimed" to be solved
+    penalty: float = 3.0  #: charge for an unsolved case, in units of `horizon`
+    #: answers that count as solved: "verified", or "claimed" to be solved by the solver
     gate: str = "verified"
-    common: bool = False  #: use only cases solved by all solvers, see `common_cases`
+    common: bool = False  #: use only the cases of `common_cases`
 
 
 USUAL = Convention()  #: convention used for tiers and ratios
@@ -56,8 +56,9 @@ def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
     """Return shifted geometric means of times over cases, s, (solvers,).
 
     The mean of times t is exp(mean log(t + shift)) − shift. An unsolved case counts as
-    `penalty` times the limit. With `common`, only cases without failures are averaged,
-    and the entries of excluded solvers are NaN.
+    `penalty` times the `horizon` of the group. With `common`, only the cases of
+    `common_cases` are averaged, and the entries of excluded solvers are NaN; with fewer
+    than `CASES` such cases, all entries are NaN.
     """
     logs, shift = _logs(group, convention)
     if not convention.common:
@@ -133,7 +134,7 @@ class Ranking:
 
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) True if the row solver is significantly faster."""
+        """(solvers, solvers) True where row is significantly faster than column."""
         logs, _ = _logs(self.group, USUAL)
         faster = resampling.significantly_faster(logs, self.group.cases)
         if self.group.apart.any():  # different sessions have no common blocks to pair
@@ -188,7 +189,8 @@ class Changed(NamedTuple):
     """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) True if the order is reversed
+    #: (solvers, solvers) True if the order of the row and column solvers is reversed
+    turned: NDArray[np.bool_]
 
 
 class Panel(NamedTuple):

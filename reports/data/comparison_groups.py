@@ -17,8 +17,8 @@ from mortarbench.harness.running.pairs import ratio_of
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
-#: Minimum number of cases of a comparison. With fewer cases, no difference is
-#: significant at 95 %: five signs agree by chance with probability 2/2⁵.
+#: Minimum number of cases of a comparison. With fewer cases, no sign test is
+#: significant at the 5 % level: five signs agree by chance with probability 2/2⁵.
 CASES = 6
 POOLED = "all forms"  #: name that replaces the form if cases of all forms are pooled
 LARGEST_SHIFT = 10.0  #: s; the customary shift, which is too large for short times
@@ -66,7 +66,7 @@ Answers = Mapping[GroupKey, Mapping[str, Row]]  #: outcomes by group and case
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonGroup:
-    """Cases of one form at one accuracy, and the solvers measured on every case.
+    """Cases that share a group key, and the solvers measured on all these cases.
 
     Copies and null arms (a solver repeated under a second label) are left out. Times
     are medians of prepare + solve over the repeats. If several tolerances were swept,
@@ -79,22 +79,22 @@ class ComparisonGroup:
     times: Times  #: (cases, solvers) s; inf unless every repeat was verified
     claimed: Times  #: (cases, solvers) s; inf unless every repeat claimed success, or
     #: correctly claimed infeasibility
-    stopped: Times  #: (cases, solvers) s, if ended by the time limit; otherwise NaN
-    limit: float  #: time limit per measurement, s; without one, the longest time
+    stopped: Times  #: (cases, solvers) s, if ended by the time limit; else NaN
+    limit: float  #: time limit per measurement, s; if unlimited, the longest time
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
     rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of the cases
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
     incomplete: int = 0  #: number of cases left out because a measurement is missing
     apart: Pairs = field(default_factory=_no_pairs)
-    "(solvers, solvers) True if two solvers have no common block on some case; may be "
-    "empty."
+    "(solvers, solvers) True if two solvers have no common block on some case that "
+    "both solved; may be empty."
     faster: Pairs = field(default_factory=_no_pairs)
-    "(solvers, solvers) True if `apart`, and the row solver is faster than the column "
-    "solver on all cases."
+    "(solvers, solvers) True if `apart`, and the row solver is significantly faster "
+    "than the column solver on every case."
 
     @property
     def title(self) -> str:
-        """Form and accuracy."""
+        """Form, mode (unless it is cold) and accuracy."""
         return self.key.title
 
     @property
@@ -197,7 +197,7 @@ def all_groups(
     Forms are separate, since the primal and the dual QP of one problem are different
     problems for a solver. Cold solves and sequences are also separate.
 
-    pool_forms : put all forms into one group, in which each QP remains a separate case
+    pool_forms : group by mode and accuracy only; each QP remains a separate case
     """
     records = [r for r in evidence.records if not r.role]
     cells = _cells(evidence, pool_forms=pool_forms)
@@ -255,13 +255,13 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def time_of(outcome: Outcome) -> float | None:
-    """Return the median total time of a verified answer, s; None if not verified."""
+    """Return the median total time, s; None if unverified or without a known time."""
     time = outcome.seconds("total") if outcome.verified else None
     return time.value if time is not None and time.value > 0 else None
 
 
 def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
-    """Mark pairs of solvers that lack a common block on at least one case."""
+    """Mark pairs of solvers without a common block on some case that both solved."""
     n = len(group.solvers)
     apart, faster = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):
@@ -297,7 +297,7 @@ def _seconds(outcome: Outcome) -> float:
 def _group(
     key: GroupKey, cells: Cells, solvers: Sequence[str], limit: float
 ) -> ComparisonGroup:
-    """Form a group of the solvers that were measured on at least half of the cases."""
+    """Form a group without the solvers that are `refused` or `rare`."""
     present = np.array([*cells], dtype=object)
     measured = {solver for row in cells.values() for solver in row}
     labels = np.array([s for s in solvers if s in measured], dtype=object)

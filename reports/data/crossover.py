@@ -3,7 +3,7 @@
 A *route* is a form of the QP with its decomposition and number of ranks, solved by the
 fastest of the measured solvers. The primal form with multigrid is a separate route.
 Cases of a growing series are built anew for each repeat; hence the time includes all
-work between the mesh and the recovered displacements:
+work from the mesh to the recovered displacements:
 
     build (mesh, assembly, contact rows, dualisation) + prepare + solve + recovery.
 """
@@ -30,7 +30,7 @@ PRIMAL = KINDS[:2]
 
 
 class Route(NamedTuple):
-    """Form, decomposition and number of ranks, independent of the solver."""
+    """Form, decomposition and number of ranks; only `MULTIGRID` has its own kind."""
 
     kind: str  #: one of `KINDS`
     layout: str  #: keys of the decomposition, "feti=16"; empty without decomposition
@@ -44,16 +44,17 @@ class Route(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """First size of a route without a verified answer, and its verdicts."""
+    """First size above the largest verified size of a route, and its verdicts."""
 
-    dofs: int | None  #: None if every size was verified
-    verdict: Verdict | None  #: mildest verdict among the solvers; None: not measured
+    dofs: int | None  #: None if the largest size was verified
+    #: mildest verdict among the solvers, DECLINED only if all declined; None if not run
+    verdict: Verdict | None
     outcomes: tuple[Outcome, ...]  #: answers of all solvers at that size
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Map:
-    """Verified answers and ends of all routes on one series of meshes."""
+    """Verified answers of the routes on one series of meshes, and their stops."""
 
     title: str
     sizes: tuple[int, ...]  #: dofs, ascending
@@ -63,7 +64,7 @@ class Map:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Kinds of routes without measurements."""
+        """Kinds that no route of the map has."""
         present = {route.kind for route in self.routes}
         return tuple(kind for kind in KINDS if kind not in present)
 
@@ -227,7 +228,7 @@ def _mesh(o: Outcome) -> tuple[Any, ...]:
 
 
 def _dofs(answers: Iterable[Outcome]) -> dict[tuple[Any, ...], int]:
-    """Return the number of dofs of every mesh, from any answer or the primal QP."""
+    """Return the number of dofs of each mesh, from an answer or from the primal QP."""
     dofs: dict[tuple[Any, ...], int] = {}
     for o in answers:
         n = o.size("dofs")
@@ -244,6 +245,6 @@ def _by_block(o: Outcome) -> dict[tuple[str, int], float]:
 
 
 def _single(a: Outcome, b: Outcome) -> Ratio:
-    """Return the ratio of single runs, with the unbounded interval (0, ∞)."""
+    """Return the ratio of the first runs, with the unbounded interval (0, ∞)."""
     (t, *_), (s, *_) = _by_block(a).values(), _by_block(b).values()
     return Ratio(t / s, 0.0, float("inf"), 1)

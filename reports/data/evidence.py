@@ -23,7 +23,7 @@ from mortarbench.harness.verify.kkt import allowed, rejudged
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 FROM_FILE = "file"  #: family of QPs from files, whose case names are paths
-_MARK_DIGITS = 6  #: digits of an environment's digest appended to a solver label
+_MARK_DIGITS = 6  #: number of digits of an environment's digest in a solver label
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
@@ -296,7 +296,7 @@ def read_evidence(
 
 
 def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Replace each environment by the first one whose times are comparable with it."""
+    """Replace each environment by the first one with comparable times."""
     representatives: dict[str, Mapping[str, Any]] = {}
     united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
@@ -398,7 +398,7 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
 
 
 def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
-    """Count the cases of each family: "6 cases of beam-ring"."""
+    """Count the cases of one or two families ("6 cases of beam-ring"), or all cases."""
     of = {o.case: o.first.family for o in outcomes}
     families = Counter(of.values())
     if len(families) > 2:

@@ -4,9 +4,9 @@ A solver competes if it was verified on every case of the group that at least on
 solved. The first competitor is the one with the smallest geometric mean of times. It is
 called the fastest only if every other competitor is significantly slower:
 
-- with at least `CASES` cases, if the interval of the ratio over the cases excludes 1;
+- with at least `CASES` cases, if the interval of the ratio over the cases is above 1;
 - with fewer cases, if the interval of the ratio within blocks (repeats of one session)
-  excludes 1 on each case.
+  is above 1 on each case.
 
 Each interval by itself has 95 % coverage. The first solver is wrongly called the
 fastest only if the interval of a competitor that is not slower misses its true ratio;
@@ -91,7 +91,7 @@ class Competitor:
 
 @dataclass(frozen=True, kw_only=True)
 class FastestSolver:
-    """Comparison of the solvers of one form at one accuracy.
+    """Comparison of the solvers of one group, see `GroupKey`.
 
     Competitors are sorted by the geometric mean of their times. The cases are those on
     which all solvers were measured and which at least one solver solved.
@@ -122,7 +122,7 @@ class FastestSolver:
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return, by case, the fastest solver and all solvers tied with it."""
+        """Return, by case, the fastest competitor and all competitors tied with it."""
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]

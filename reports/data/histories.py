@@ -48,7 +48,7 @@ class SolverRun:
 
     @cached_property
     def products(self) -> Vector | None:
-        """(rows,) cumulative products with P; None unless all are known."""
+        """(rows,) cumulative number of products with P; None unless all are known."""
         values = self.numbers("products")
         return values if values is not None and np.isfinite(values).all() else None
 

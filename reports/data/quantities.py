@@ -41,7 +41,7 @@ class Leaf(NamedTuple):
     """One scalar of the quantities."""
 
     value: Any
-    scale: float  #: absolute value; for a component, the largest one of its vector
+    scale: float  #: absolute value; for components, the largest in the vector
 
 
 Leaves = dict[tuple[str, ...], Leaf]  #: scalars by path
@@ -138,7 +138,7 @@ def quantity(
 
 
 def _rounded(leaf: Leaf, digits: int) -> str:
-    """Format a number with the decimals of the largest component of its vector."""
+    """Round a number to the last decimal place of its vector's largest component."""
     if not leaf.value or not math.isfinite(leaf.value):
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))

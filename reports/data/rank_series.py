@@ -1,10 +1,10 @@
 """Measured strong and weak scaling of one solve over the number of ranks.
 
 Strong scaling solves one case on an increasing number of ranks. Weak scaling enlarges
-the case with the number of ranks, which keeps the work per rank constant. Both are
-reported separately for preparation and solve. They are compared with copies, that is,
-simultaneous independent solves, one per rank, which share the machine's memory as ranks
-do.
+the case in proportion to the number of ranks, so that the number of dofs per rank is
+constant up to the factor 1 ± `ALIKE`. Both are reported separately for preparation and
+solve. They are compared with copies, that is, simultaneous independent solves, one per
+rank, which share the machine's memory as ranks do.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class _Scaling:
     cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Return whether ranks outnumber CPUs; the model ignores such times."""
+        """Return whether ranks outnumber CPUs; the cost model ignores such times."""
         return self.cpus is not None and ranks > self.cpus
 
 
@@ -60,7 +60,7 @@ class StrongSeries(_Scaling):
 
     case: str
     tol: float
-    #: answers by ranks, ascending; the first is on one rank
+    #: answers by number of ranks, ascending; the first is on one rank
     answers: Mapping[int, Outcome]
 
     @property
@@ -131,13 +131,13 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WeakSeries(_Scaling):
-    """Verified answers of one solver to cases with equally many dofs per rank.
+    """Verified answers of one solver to cases with about equally many dofs per rank.
 
     The copies are simultaneous solves of the first case.
     """
 
     title: str  #: family, fixed parameters, solver, tolerance
-    #: members by ranks, ascending; the first is on one rank
+    #: members by number of ranks, ascending; the first is on one rank
     members: tuple[Member, ...]
 
     def efficiency(self, member: Member, phase: str) -> Interval | None:
@@ -150,7 +150,7 @@ class WeakSeries(_Scaling):
 
 
 def strong_series(evidence: Evidence) -> list[StrongSeries]:
-    """Return the cases on which a solver was verified on one rank and on several."""
+    """Return a series for each case that a solver solved on one rank and on several."""
     series = []
     for (case, tol), row in evidence.outcomes.items():
         by_role: dict[str, dict[str, dict[int, Outcome]]] = {"": {}, COPIES: {}}

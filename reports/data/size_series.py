@@ -168,7 +168,7 @@ class Sweep:
 
 
 def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
-    """Return the sweeps in which parameter `key` has at least three positive values."""
+    """Return the sweeps of parameter `key` over at least three positive integers."""
     groups: dict[tuple[Any, ...], dict[int, Outcome]] = {}
     for o in evidence.flat:
         params = dict(o.first.params)

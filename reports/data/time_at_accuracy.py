@@ -31,7 +31,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import limits
 
 RESAMPLES = 400  #: number of bootstrap resamples; 10 of them form a tail of 2.5 %
-SMALLEST = 1e-17  #: lower bound of errors, so that zero has a logarithm
+SMALLEST = 1e-17  #: smaller errors are raised to this value, since log 0 = −∞
 
 Floats = NDArray[np.float64]
 

@@ -40,8 +40,9 @@ class Way(NamedTuple):
 class Ways:
     """Comparison of all combinations of form and solver at each accuracy."""
 
-    comparisons: tuple[FastestSolver, ...] = ()  #: cold solves, tight accuracies first
-    uncharged: int = 0  #: problems left out because `dualise_seconds` is missing
+    #: cold solves first, then by mode; tight accuracies first within a mode
+    comparisons: tuple[FastestSolver, ...] = ()
+    uncharged: int = 0  #: number of problems left out for lack of `dualise_seconds`
 
 
 def compare_ways(evidence: Evidence) -> Ways:

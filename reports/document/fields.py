@@ -156,7 +156,7 @@ class FieldFigure:
     """Grid of panels with bodies to scale."""
 
     panels: tuple[FieldPanel, ...]
-    height: float  #: inches
+    height: float  #: height of the figure, inches
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows
@@ -165,7 +165,7 @@ class FieldFigure:
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return lower left and upper right corners of a box around bodies with margin."""
+    """Return corners (lower left, upper right) of a box with margin around bodies."""
     points = np.vstack(bodies)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (high - low)

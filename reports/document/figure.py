@@ -224,7 +224,7 @@ class Figure:
     """A figure of curves, with the measurements behind its points."""
 
     rows: tuple[Row, ...]
-    height: float  #: inches
+    height: float  #: height of the figure, inches
     width: float = WIDTH
     legend: Legend | None = None
     title: str = ""  #: form, tolerance and cases, if no panel names them

@@ -60,9 +60,9 @@ def clean(text: str, limit: int = 96) -> str:
     """Sanitise untrusted text for a table: one line of at most `limit` characters.
 
     Control characters are replaced. Long texts are abbreviated in the middle, since
-    names differ at their ends. A letter keeps at most two accents; an accent without a
-    letter is set on a circle. Text that a spreadsheet would evaluate as a formula is
-    prefixed with an apostrophe.
+    names differ at their ends. A letter keeps at most two accents; an accent at the
+    start of the text is set on a circle. Text that a spreadsheet would evaluate as a
+    formula is prefixed with an apostrophe.
     """
     line = inert(" ".join(text.split()))
     if not line.isascii() or not line.isprintable():
@@ -85,7 +85,7 @@ def plain_value(value: object, limit: int = 96) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Format with `digits` significant digits, and with an exponent only if needed."""
+    """Format a number with `digits` significant digits, with an exponent if needed."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:

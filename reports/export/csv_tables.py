@@ -38,7 +38,7 @@ def csv_tables(
 ) -> dict[str, pd.DataFrame]:
     """Return every nonempty table by the stem of its file.
 
-    The table `measurements` has one row per journal line; `outcomes` has one row per
+    The table `measurements` has one row per measurement; `outcomes` has one row per
     case, tolerance and solver, with medians of times and their intervals; `energies`
     and `scaling` contain the numbers of these sections of the report. For `contests`
     and `means`, see `comparison_tables`.
@@ -140,7 +140,7 @@ def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
 def comparison_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Return the tables `contests` and `means` of all groups of cases.
+    """Return the tables `contests` and `means` of all comparable groups of cases.
 
     `contests` has one row per case and solver with the time and its ratio to the best
     time, both infinite for a failure; performance profiles are the distributions of

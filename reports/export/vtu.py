@@ -34,8 +34,8 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
 
     The point data are displacement (m), contact_force (force of the contact on a slave
     node, N/m in 2D, N in 3D), in_contact (0 or 1), pressure (Pa), gap (m) and
-    the nodal fields. Forces and pressures are zero except on slave nodes. The gap is
-    NaN, which ParaView leaves out, except on slave nodes that face a master. The cell
+    the nodal fields. Forces and pressures are zero except on slave nodes. Except on
+    slave nodes that face a master, the gap is NaN, which ParaView leaves out. The cell
     data are the body and, for decomposed bodies, the subdomain; triangles come before
     quadrilaterals. Plane vectors get a zero third component, because *Warp By Vector*
     in ParaView needs three components.

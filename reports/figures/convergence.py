@@ -84,7 +84,7 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
 def active_set_figure(c: CaseHistories) -> Figure | None:
     """Plot the number of active bounds against work; None if it is not recorded.
 
-    A second panel shows active components with two bounds, if any are recorded.
+    A second panel shows the number of active components with two bounds, if recorded.
     """
     if all(run.numbers("active") is None for run in c.runs):
         return None

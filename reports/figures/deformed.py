@@ -38,11 +38,11 @@ from mortarbench.reports.figures.projection import (
 )
 
 #: Percentile of the nodal stresses at which the colour scale ends. The maximum is not
-#: used, because stresses are singular at corners.
+#: used, because stresses may be singular at corners.
 PERCENTILE = 99.5
 SCALE = 1.0  #: factor of the displacement in figures drawn to scale
-#: Displacements below `SEEN` times the size of the bodies are not visible. They are
-#: magnified such that the largest is about `SHOWN` times that size.
+#: Displacements below `SEEN` times the size of the bodies count as invisible. They are
+#: magnified such that the largest is at most `SHOWN` times that size.
 SEEN, SHOWN = 0.01, 0.05
 #: largest number of cells for which mesh lines are drawn; more would hide the colours
 _MESH_SHOWN = 6000
@@ -443,7 +443,7 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Return factor and prefix of the unit in which `value` is between 1 and 1000."""
+    """Return factor and prefix (G, M, k or none) of the largest unit up to `value`."""
     prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
     return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 
@@ -554,7 +554,7 @@ def _loaded(fields: Fields) -> list[_Loaded]:
 
 
 def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
-    """Draw lines along nodes that slide without contact: their arrows are short."""
+    """Draw lines along nodes that slide without contact, whose arrows are short."""
     if not len(contact.sliding):
         return []
     at, beside = points[contact.sliding[:, 0]], points[contact.sliding[:, 1]]

@@ -35,14 +35,12 @@ from mortarbench.reports.figures.style import (
 from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
 ROW = 4  #: largest number of solvers in colour in one panel
-ROWS = 4  #: largest number of rows; further solvers are grey in every row
+ROWS = 4  #: `ROW`·`ROWS` solvers are coloured; the others are grey in every row
 PAIRS = 6  #: largest number of pairwise panels
-BANDED = (
-    20  #: minimum number of cases for bands of three or more solvers, which overlap
-)
+BANDED = 20  #: minimum number of cases for bands if three or more solvers are drawn
 _COLUMNS = 3  #: number of columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
-_COARSE = 60  #: points of a grey curve; few, since there may be hundreds of curves
+_COARSE = 60  #: number of points of a grey curve; there may be hundreds of curves
 
 #: ticks by the largest ratio on an axis; longer axes have powers of ten
 _FACTORS = {

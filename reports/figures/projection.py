@@ -15,7 +15,8 @@ Integers = NDArray[np.int64]
 
 #: direction of a camera that sees three sides of a box at different angles
 _STANDARD = np.array([0.62, -0.64, 0.45])
-#: number of tiles on the visible surface; with fewer tiles, colours change in steps
+#: approximate number of tiles on the visible surface; with fewer tiles, steps between
+#: colours would be visible
 _TILES = 12_000
 _MAX_TILES = 20  #: largest number of tiles along an edge of a face
 
@@ -123,7 +124,7 @@ def crease_edges(
 
     Edges of faces that all point away from the camera are left out.
 
-    least : smallest angle, rad; edges of a single face are always included
+    least : smallest angle, rad; edges of a single face always count as creases
     """
     normal = face_normals(points, faces)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -151,7 +151,7 @@ def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Fig
     keys = (
         Key(label="measured", look=_line(look(0))),
         Key(label="model, not measured", look=_MODEL),
-        Key(label="uncertainty of the fit", look=_bar(_PALE)),
+        Key(label="scatter of the repeats", look=_bar(_PALE)),
         Key(label="ideal speed-up", look=GUIDE),
     )
     return _figure(panels, keys, 4)

@@ -52,7 +52,7 @@ PANELS = (
     ("steps", ("cg", "expansion", "proportioning")),
 )
 KAPPA = "kappa"  #: prefix of the names of condition numbers
-_FITTED = 24  #: points of a fitted curve
+_FITTED = 24  #: number of points of a fitted curve
 _FOOT = 0.04  #: minimum fraction of the axis below and above the guide lines
 
 
@@ -208,7 +208,7 @@ def _counted(
 def condition_numbers(
     points: Sequence[tuple[float, Outcome]],
 ) -> dict[str, tuple[float, ...]]:
-    """Return condition numbers present in all answers, without error bounds."""
+    """Return condition numbers present in all answers, without their error bounds."""
     names = [
         name
         for name in (points[0][1].quantities if points else ())

@@ -36,8 +36,8 @@ from mortarbench.reports.figures.style import (
 )
 
 SHARE = 0.1  #: largest sufficient solver error, relative to the discretisation error
-CROWDED = 1000  #: number of markers above which they are smaller and more transparent
-_COLUMNS = 4  #: columns of the legend
+CROWDED = 1000  #: number of markers above which markers are smaller and paler
+_COLUMNS = 4  #: number of columns of the legend
 _LEAST = 1e-17  #: smaller residuals, including zero, are drawn at this value
 _LEAST_RATIO = 1e-10  #: smaller ratios of residual to tolerance are drawn at this value
 _MESH = Look(colour=INK, width=0.8, dash=DASHED)
@@ -162,7 +162,7 @@ def certified_figure(
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the points that `counts` accepts; draw the others as hollow markers."""
+    """Connect the points that `counts` accepts by a line; draw the others hollow."""
     points = [
         (o.seconds("total"), max(e, SMALLEST), o)
         for o in outcomes

@@ -40,7 +40,7 @@ from mortarbench.reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")
 TARGETS = (1e-2, 1e-4, 1e-6)  #: certified relative errors in the energy norm
-COLUMNS = 5  #: columns of a legend
+COLUMNS = 5  #: number of columns of a legend
 _FAILED = Look(colour=INK, marker="x", dash=None)
 
 
@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
     size: int
     outcome: Outcome
-    dofs: bool  #: True if the size is n (primal), False if the size is m (dual)
+    dofs: bool  #: True if the size is n (dofs), False if it is m (size of the dual)
 
     @property
     def time(self) -> Interval | None:

@@ -41,7 +41,7 @@ QUANTITIES = {  #: name in the figure → columns of its components
     "contact force": ("force_x", "force_y"),
 }
 SINCE = 5  #: minimum number of steps in fits; coarser stepping is pre-asymptotic
-PAPER = 10  #: load steps of the paper, with one linearisation each
+PAPER = 10  #: number of load steps in the paper, with one linearisation each
 _PRESSURE = "contact pressure in GPa"
 #: colours and markers of node-to-segment and mortar
 _LOOKS = {"nts": look(0), "mortar": replace(look(1), fill="none")}

@@ -45,8 +45,8 @@ ERRATA = (
     "not the Moore-Penrose inverse of pinv. On the feasible set both give the same "
     "dual problem, but the matrices of the two multiplications differ.",
     "The text refers to Figure 6 as “Figure 7” and to Figure 5 as “Figure ??”.",
-    "The paper does not state tolerances, penalty, contact rows and active rows, and "
-    "it does not state whether the 0.078 s of the Cholesky factorisation refer to both "
+    "The paper does not state tolerances, the penalty, the numbers of contact rows and "
+    "active rows, or whether the 0.078 s of the Cholesky factorisation refer to both "
     "bodies. Here, SMALBE solves each dual QP to 1e-8; for the paper's method, it uses "
     "the parameters of the paper's reference [3].",
     "89 % of the published 29.99 s are spent on dualisation and 3.6 % on the QPs: the "

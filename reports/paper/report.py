@@ -392,14 +392,14 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Return the sections on times of all solvers, against m and by form."""
+    """Return the sections on times of the suite's solvers, against m and by form."""
     return (
         _section(
             "fleet",
             "Beyond the paper: SMALBE and other solvers",
             fleet_figure(evidence),
-            "Time against the size m of the dual at the last load step, tolerance "
-            "1e-6, verified answers only; crosses: unverified answers. Bars: "
+            "Times of verified answers against the size m of the dual at the last "
+            "load step, tolerance 1e-6; crosses: unverified answers. Bars: "
             f"interval of the median. {TIMED}",
             prose=(REPEATED,),
             tables=tuple(fleet_table(evidence, form) for form in DUALS),

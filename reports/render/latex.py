@@ -62,8 +62,8 @@ def latex(
     r"""Render statements as a list, then tables; the first line names the packages.
 
     All tables need booktabs; tables of more than `ROWS` rows also need longtable. Times
-    are printed with unit and interval; all other numbers are plain (1.2e-09), in a
-    format that siunitx can read.
+    are printed with unit and interval; numbers without interval are plain (1.2e-9), in
+    a format that siunitx can read.
 
     name : name of the section; the k-th table has the label tab:NAME-k, a single table
         has tab:NAME
@@ -149,9 +149,9 @@ def _cell(cell: Cell) -> str:
 def escaped(text: str) -> str:
     """Escape for text mode; characters missing in OT1 become their code points.
 
-    A leading bracket is braced, because TeX would read it as an optional argument
-    after the end of a row. Consecutive hyphens are separated, because TeX would combine
-    them to dashes.
+    A leading bracket or asterisk is preceded by an empty group, because TeX would read
+    it as an argument after the end of a row. Consecutive hyphens are separated, because
+    TeX would combine them into dashes.
     """
     if _PLAIN.fullmatch(text):  # most cells of a large report
         return text

@@ -32,7 +32,8 @@ from mortarbench.reports.document.figure import (
 
 Data = dict[str, Any]
 
-#: maximum number of points of a line; longer lines keep only local extremes
+#: maximum number of points of a line without run_ids of its points; longer lines keep
+#: only local extremes
 MOST = 4000
 _NAMED = {
     "lambda": "λ",
@@ -223,7 +224,7 @@ def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
 
 
 def look_of(look: Look) -> Data:
-    """Return the style of a line and its marks; lengths are in px or points."""
+    """Return the style of a line and its marks; the page scales lengths to pixels."""
     dash = look.dash
     return {
         "colour": colour(look.colour),

@@ -64,12 +64,12 @@ class Analysis:
 
     @cached_property
     def answers(self) -> Answers:
-        """Answer of every solver to every case, grouped by form."""
+        """Answer of every solver to every case, by form, mode and accuracy."""
         return answers_of(self.evidence)
 
     @cached_property
     def fastest(self) -> tuple[FastestSolver, ...]:
-        """Comparison of solvers, separate for each form."""
+        """Comparisons of solvers, one for each form, mode and accuracy."""
         return fastest_solvers(self.answers, self.forms)
 
     @cached_property
@@ -88,8 +88,8 @@ class _Entry(NamedTuple):
 
 
 _ENTRIES: list[_Entry] = []
-EVIDENCE = 10  #: position after the sections with conclusions
-APPENDIX = 90  #: position of conditions and definitions
+EVIDENCE = 10  #: sections at smaller positions contain conclusions
+APPENDIX = 90  #: from this position on: conditions and definitions
 
 
 def section(
@@ -115,7 +115,7 @@ def section(
 
 
 def sections(analysis: Analysis) -> Iterator[Section]:
-    """Compose all sections; list those without measurements before the appendix."""
+    """Compose all sections; list the omitted ones before the appendix."""
     missing: list[str] = []
     for entry in _entries():
         if entry.place >= APPENDIX and missing:

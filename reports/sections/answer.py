@@ -43,12 +43,10 @@ from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps
 from mortarbench.reports.statistics.growth import Trend
 
 ACCURACIES = (
-    3  #: maximum number of accuracies per form: the tightest, a middle and the loosest
+    3  #: maximum number of accuracies per form: the tightest, a middle one, the loosest
 )
 FAILURES = 3  #: largest number of failures per form that are described individually
-FIRST_ROWS = (
-    8  #: maximum number of rows for which the first figure fits on a phone screen
-)
+FIRST_ROWS = 8  #: maximum number of rows of the first figure, to fit on a phone screen
 REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
 MOST_SERIES = 4  #: largest number of size series that are described by a sentence each
 _FROM_MESH = "From the mesh to a verified answer, including dualisation: "
@@ -140,7 +138,7 @@ def _by_subject(found: Sequence[FastestSolver]) -> dict[str, list[FastestSolver]
 
 
 def _selected(found: list[FastestSolver]) -> list[FastestSolver]:
-    """Select the tightest, a middle and the loosest of many accuracies."""
+    """Select the tightest, a middle one and the loosest of many accuracies."""
     if len(found) <= ACCURACIES:
         return found
     return [found[0], found[len(found) // 2], found[-1]]
@@ -280,7 +278,7 @@ def _roughly(f: FastestSolver) -> str:
 
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
-    """Name solvers that are faster than the first but not verified on every case."""
+    """Name significantly faster solvers that were not verified on every case."""
     faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 

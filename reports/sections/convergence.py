@@ -22,8 +22,8 @@ TEXT = Sentences(__name__, FLOOR=FLOOR, RULE=RULE)
     54,
     "convergence",
     "Convergence",
-    "Convergence: no solver stored a history of its iterations. Solvers with an "
-    "option history store one if the suite sets it to true.",
+    "Convergence: no solver stored a history of its iterations. Solvers with the "
+    "option “history” store one if the suite sets history = true.",
 )
 def convergence(a: Analysis) -> Iterator[Part]:
     """Draw the cases that `RULE` selects; yield nothing if no history is stored."""

@@ -82,8 +82,8 @@ def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
 def _answer(one: Map) -> list[tuple[str, int | None, str]]:
     """Return each primal route with the size (dofs) from which on a dual route pays.
 
-    Only dual routes that reach all sizes of the primal route are considered. The size
-    is None if no such dual route pays.
+    Only dual routes that reach the largest size of the primal route are considered. The
+    size is None if no such dual route pays.
     """
     best = dict[str, tuple[str, int | None, str]]()
     for dual, primal, at in _comparisons(one):

@@ -102,7 +102,7 @@ def _means_table(ranking: Ranking) -> Table:
     def common_ratio(i: int) -> Cell:
         value = float(common[i] / common[leader])
         if np.isnan(value):
-            return Cell(title="too few cases solved by all")
+            return Cell(title="solved too few cases, or too few common cases")
         return Cell.number(value, significant)
 
     def restricted(i: int) -> Cell:

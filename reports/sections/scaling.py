@@ -29,7 +29,7 @@ from mortarbench.reports.statistics.growth import (
 )
 from mortarbench.reports.statistics.intervals import PowerLaw
 
-MOST_DRAWN = 8  #: largest number of figures of counts; all counts are tabulated
+MOST_DRAWN = 8  #: largest number of figures of counts; all series are tabulated
 #: counts that tables list first, before the other counts in the solver's order
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
@@ -242,7 +242,7 @@ def _step_table(series: SizeSeries, solver: str) -> Table:
 
 
 def _subdomain_table(sweep: Sweep) -> Table:
-    """Tabulate the counts of one solver against H/h."""
+    """Tabulate those counts of one solver that are in `FIRST` against H/h."""
     named = [n for n in FIRST if sweep.answers[0][1].counted(n) is not None]
     return Table.of(
         TEXT("counts_caption", "H/h", sweep.solver, sweep.title),

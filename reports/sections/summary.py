@@ -110,7 +110,7 @@ def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
 
 
 def _cells(evidence: Evidence) -> int:
-    """Count the planned pairs of case and solver.
+    """Count the planned combinations of case, tolerance and solver.
 
     Every solver is planned on the cases of its mode (cold or a sequence) and
     environment.

@@ -39,7 +39,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
 
 TEXT = Sentences(__name__, LEAST=COVERAGE, BY_OPTIMUM=BY_OPTIMUM)
-_PARTS = 3  #: canary drift is measured from the first to the last of this many parts
+_PARTS = 3  #: number of parts; the canary's drift is measured from first to last
 
 
 @section(20, "times", "Times")

@@ -44,8 +44,8 @@ from numpy.typing import ArrayLike, NDArray
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import DRAWS, limits
 
-NEIGHBOURS = 6  #: upper bound of the average degree of a planar graph (Euler)
-MAX_RANKS = 2**20  #: largest number of ranks that `CostModel.ranks_at` tries
+NEIGHBOURS = 6  #: upper bound on the average degree of a planar graph (Euler)
+MAX_RANKS = 2**20  #: `CostModel.ranks_at` tries numbers of ranks below this value
 
 Array = NDArray[np.float64]
 
@@ -96,8 +96,8 @@ class CostModel:
     communication: tuple[float, float, float]
     measured: tuple[int, ...]  #: measured numbers of ranks, ascending
     misfit: float  #: largest |t/t_measured − 1| of the modelled times t
-    #: (draws, 6) W, C, slowdown and communication of every draw; empty if some number
-    #: of ranks was measured only once
+    #: (draws, 6) W, C, slowdown and communication of every draw; empty if the job on
+    #: some number of ranks, or some number of copies, was measured only once
     draws: Array
     samples: int  #: smallest number of repeats
 
@@ -113,7 +113,7 @@ class CostModel:
         return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def ranks_at(self, efficiency: float) -> int:
-        """Return the largest power of two N with a speed-up of efficiency·N or more."""
+        """Return the largest N = 2ᵏ such that 2, 4, …, N all reach `efficiency`."""
         N = 2
         while N < MAX_RANKS and self._speed_up(N, self._own)[0] >= efficiency * N:
             N *= 2
@@ -149,7 +149,7 @@ def cost_model(
     ----------
     seconds : times of all repeats by number of ranks; must contain one rank
     copies : times of simultaneous copies of the single-rank job, by number of copies;
-        they give an upper bound of s; without copies, s = 1
+        they give an upper bound on s; without copies, s = 1
     communication : one item per repeat on the largest number of ranks
 
     Raises

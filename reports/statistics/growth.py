@@ -44,7 +44,7 @@ class Trend(Enum):
 class Growth:
     """The fit v = c·nᵖ of positive values by least squares on logarithms."""
 
-    exponent: float  #: p
+    exponent: float  #: exponent p
     low: float  #: lower end of the 95 % interval of p
     high: float  #: upper end of the 95 % interval of p
     log_factor: float  #: log c

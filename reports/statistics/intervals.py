@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, stdtrit
 
-COVERAGE = 0.95  #: nominal; the median of fewer than six samples cannot reach it
+COVERAGE = 0.95  #: nominal coverage; six samples are needed to reach it for a median
 
 
 class Interval(NamedTuple):
@@ -33,10 +33,11 @@ def median_interval(samples: Sequence[float]) -> Interval:
     """Return the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
 
     The interval misses the true median only if fewer than k of the n independent
-    samples lie on one side of it. For every distribution, the coverage is therefore
-    1 − 2·P(X < k) with X ~ Bin(n, ½) [1]_. The largest k with a coverage of at least
-    95 % is used. Fewer than six samples cannot reach 95 %; then k = 1, the interval
-    extends from the smallest to the largest sample, and its coverage is 1 − 2¹⁻ⁿ.
+    samples lie on one side of it. For every continuous distribution, the coverage is
+    therefore 1 − 2·P(X < k) with X ~ Bin(n, ½) [1]_. The largest k with a coverage of
+    at least 95 % is used. Fewer than six samples cannot reach 95 %; then k = 1, the
+    interval extends from the smallest to the largest sample, and its coverage is
+    1 − 2¹⁻ⁿ.
 
     References
     ----------
@@ -66,7 +67,7 @@ class PowerLaw(NamedTuple):
     exponent: float
     low: float
     high: float
-    log_factor: float  #: log c; c itself overflows if the sizes differ little
+    log_factor: float  #: log c; c itself may overflow if the sizes differ little
     points: int
 
     @property

@@ -70,17 +70,18 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
     to Student's t, and the same expression for the signed ranks of d, which a few
     failures with a large penalty do not distort. A statistic is used only if it has the
     sign of the mean. The more significant of the two statistics is used, for the data
-    and for every flip. Therefore, for any number of equal solvers, at most one set of
-    cases in twenty yields a significant pair. With fewer than six cases no pair is
+    and for every flip. Therefore, for any number of equal solvers, the probability that
+    some pair is significant is at most 5 %. With fewer than six cases no pair is
     significant, because five signs agree by chance in 2 of 2⁵ flips.
 
     Parameters
     ----------
-    logs : (cases, solvers) logarithms of the averaged times
+    logs : (cases, solvers) logarithms of the shifted times
 
     Returns
     -------
-    (solvers, solvers) True where the row solver is significantly faster
+    (solvers, solvers) True where the row's solver is significantly faster than the
+    column's
 
     """
     i, j = np.triu_indices(logs.shape[1], 1)
@@ -103,10 +104,10 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
 def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, float]:
     """Return the 95 % interval of a mean by inversion of the sign-flip test.
 
-    The means of all subsets of the values divide the line into intervals that contain
-    the centre of a symmetric distribution with equal probability [4]_. If there are too
-    many subsets (see `_signs`), a random selection is used. For six values the interval
-    is their range.
+    The means of all subsets of the values divide the line into intervals that each
+    contain the centre of a symmetric distribution with the same probability [4]_. If
+    there are too many subsets (see `_signs`), a random selection is used. For six
+    values the interval is their range.
 
     values : (cases,) at least six, since fewer have no 95 % interval
     """

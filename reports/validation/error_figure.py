@@ -23,7 +23,7 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import tolerance
 from mortarbench.reports.figures.style import COLOURS, below, legible
 
-_SPREAD = 0.3  #: vertical offset of marks within a row, so that none hides another
+_SPREAD = 0.3  #: largest vertical offset of marks in a row, so that none is hidden
 _FLOOR = 1e-17  #: value at which errors of zero are drawn
 _LIMIT = Look(colour=INK, width=0.6, dash=(4, 2))
 

@@ -165,8 +165,8 @@ def _disagreements(data: Data) -> Iterator[Part]:
         )
     if broken := data["contradictions"]:
         yield Table.of(
-            "Certificates contradicted by the reference, which is an error of this "
-            "program.",
+            "Certificates contradicted by the reference; every contradiction is an "
+            "error of this program.",
             broken,
             (*_CASE, ("contradiction", lambda d: Cell.words(clean(d["text"], 240)))),
             text_columns=2,

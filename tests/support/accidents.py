@@ -1,7 +1,7 @@
 """Plug-in with solvers that disturb a run, and one that detects disturbances.
 
 The solvers solve `tiny` of adversaries.py correctly, but have side effects. `witness`
-fails if a process of another solver runs during its solve.
+fails if a process of another solver is not stopped during its solve.
 
 If the module is run as a program with the name of a solver and two file descriptors, it
 acts as a worker.
@@ -44,8 +44,8 @@ def processes(of_run):
 
 
 class Witness(Honest):
-    """Solver that fails if a process of the run, other than a sub-reaper,
-    is runnable.
+    """Solver that fails if another process of the run, except a sub-reaper,
+    is not stopped.
     """
 
     def act(self, qp):
@@ -63,7 +63,7 @@ class Witness(Honest):
 
 
 def reply_pipe():
-    """Return the pipes to which this worker may write its replies."""
+    """Yield the descriptors of the pipes to which this worker may write its replies."""
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)
         try:

@@ -110,7 +110,7 @@ def at_the_row(qp):
 
 @dataclass(frozen=True)
 class Honest:
-    """Correct solver of the tiny QPs with h ≤ 2; subclasses misbehave on
+    """Correct solver of the tiny QPs with h ≤ 2; most subclasses misbehave on
     these QPs only.
     """
 

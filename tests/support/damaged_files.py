@@ -56,7 +56,7 @@ ENDATA
 
 
 def tiny_qp(dense=False):
-    """Return a QP with every kind of constraint."""
+    """Return a QP with equality rows, inequality rows and bounds."""
     rng = np.random.default_rng(7)
     P = random_array((6, 6), density=0.4, rng=rng)
     P = csc_array(P @ P.T + 2 * np.eye(6))
@@ -107,7 +107,7 @@ def seeds(folder):
 
 
 def repacked(path, compression):
-    """Return a Parquet file with another compression."""
+    """Rewrite a Parquet file with another compression."""
     pq.write_table(pq.ParquetFile(path).read(), path, compression=compression)
 
 
@@ -218,7 +218,7 @@ def truncated(rng, data, at, others):
 
 
 def spliced(rng, data, at, others):
-    """Insert a piece of another file."""
+    """Overwrite bytes with a piece of another file."""
     other = others[rng.integers(0, len(others))]
     start = int(rng.integers(0, len(other)))
     return over(data, at, other[start : start + int(rng.integers(1, 200))])
@@ -244,7 +244,7 @@ def refielded(rng, data, at, others):
 
 
 def doubled(rng, data, at, others):
-    """Repeat forty bytes."""
+    """Repeat up to forty bytes."""
     return data[:at] + data[max(at - 40, 0) :]
 
 
@@ -273,7 +273,7 @@ def damaged(rng, data, others):
 
 
 def read(path):
-    """Read a file as commands do; return True if it contains a valid QP."""
+    """Read a file as commands do; return True if it contains a valid QP or mesh."""
     try:
         if path.suffix in (".msh", ".inp", ".med"):
             mesh = read_msh(path)

@@ -20,7 +20,7 @@ VALUES = (
 
 
 def damaged(text, random):
-    """Return a text after a few random deletions, repetitions, swaps or insertions."""
+    """Return a text after random deletions, repetitions, replacements or insertions."""
     for _ in range(random.choice((1, 1, 1, 2, 4))):
         i, j = sorted(random.randrange(len(text) + 1) for _ in range(2))
         j = min(j, i + random.choice((1, 3, 30)))
@@ -39,7 +39,7 @@ def damaged(text, random):
 
 
 def distorted(data, random):
-    """Return a copy of nested plain data with one value replaced."""
+    """Return a copy of nested plain data with one to five values replaced."""
     data = json.loads(json.dumps(data))
     for _ in range(random.choice((1, 1, 2, 5))):
         at = data

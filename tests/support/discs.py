@@ -20,7 +20,7 @@ def mindlin(discs, nu, Q):
 
 
 def natural_map(qp, s):
-    """Return ‖x − Π(x − g/L)‖·L/‖q‖, L = ‖P‖."""
+    """Return ‖x − Π(x − g/L)‖·L/‖q‖, where L estimates ‖P‖."""
     v = np.ones(qp.q.size)
     for _ in range(50):
         v = qp.P @ (v / np.linalg.norm(v))
@@ -35,7 +35,7 @@ def qp_on_discs(seed, *, rows=0, dim=2, spread=0.0, touching=False):
     """Return a QP with discs and bounds, and its solution.
 
     rows : number of equality rows
-    spread : radii differ by up to 10**spread
+    spread : radii are between 1 and 10**spread, or zero
     touching : include discs with x on the boundary and a zero multiplier
     """
     rng = np.random.default_rng(seed)

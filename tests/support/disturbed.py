@@ -20,7 +20,7 @@ def scaled(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def wrong_rows(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move forces from rows in contact to other rows."""
+    """Replace the forces of random rows by forces of other rows."""
     z, swapped = s.z.copy(), rng.random(s.z.size) < max(size, 1.5 / max(s.z.size, 1))
     z[swapped] = rng.permutation(z)[swapped]
     return replace(s, z=z)
@@ -50,7 +50,7 @@ def relative_noise(s: Solution, size: float, rng: np.random.Generator) -> Soluti
 def moved_apart(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Move each body rigidly by up to 10⁴ times its displacement."""
+    """Move each body rigidly, by the order of size·‖x‖ to 10⁴·size·‖x‖."""
     far = 10 ** rng.uniform(0, 4) * size * np.linalg.norm(s.x)
     R = mechanics.rigid
     return replace(s, x=s.x + R @ (far * rng.standard_normal(R.shape[1])))
@@ -59,7 +59,7 @@ def moved_apart(
 def bent(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Add the deformation mode of least energy to the displacements."""
+    """Add approximately the deformation mode of least energy."""
     whole, x = mechanics.whole, s.x.astype(Real)
     v = whole.apply_inverse(
         whole.apply_inverse(rng.standard_normal(x.size).astype(Real))

@@ -1,12 +1,12 @@
 """Ranks that end in a known order, to test which rank `launch` reports as the first.
 
-``dying_ranks.py COUNT TRIALS SEED SECONDS`` launches COUNT ranks in each trial. One of
+``dying_ranks.py COUNT TRIALS SEED`` launches COUNT ranks in each trial. One of
 them is killed, exits, or is killed after printing a line that resembles our messages.
 The other ranks either exit as soon as they notice this, or continue. In some trials,
 the parent process of the first rank is also killed. The program prints, as JSON, the
 trials in which `launch` named a wrong rank.
 
-The module has no imports at the top, so that a rank starts within milliseconds.
+The module imports only os and sys at the top, so that ranks start in milliseconds.
 """
 
 import os

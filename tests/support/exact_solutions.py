@@ -1,10 +1,11 @@
 """Solutions of stored contact problems in integers, and errors in the energy norm.
 
-A number is an integer times 2^−BITS, so that data, sums and products are exact. The KKT
-equations for a guessed set of closed rows are solved by elimination in extended
-precision. Exact residuals refine the solution until it changes by less than 2^−FINE.
-Then the signs of all multipliers, gaps and slips are checked. Only the guess of the
-closed rows uses the code under test, and the check detects a wrong guess.
+A number is an integer times 2^−BITS, so that data and sums are exact, and products are
+truncated at 2^−BITS. The KKT equations for a guessed set of closed rows are solved by
+elimination in extended precision. Exact residuals refine the solution until it changes
+by less than 2^−FINE. Then the signs of all multipliers, gaps and slips are checked.
+Only the guess of the closed rows uses the code under test, and the check detects a
+wrong guess.
 """
 
 from __future__ import annotations
@@ -153,8 +154,8 @@ def exact_solution(mechanics: Mechanics) -> ExactSolution:
     Raises
     ------
     UnsettledError
-        If some number of exchanges does not yield closed rows that satisfy all
-        conditions.
+        If twelve exchanges do not yield closed rows that satisfy all conditions, or the
+        refinement does not converge.
 
     """
     mechanics = mechanics.whole
@@ -201,7 +202,7 @@ def _exchanged(
 ) -> States:
     """Return the states after an exchange of the rows that violate a condition.
 
-    Values below about 2^−FINE times the largest number count as zero.
+    Values below about 2^(60 − FINE) times the largest number count as zero.
     """
     exact = mechanics.exact
     v = Rows(mechanics.rows) @ u - integers(exact.c)

@@ -1,4 +1,4 @@
-"""Plug-in with solvers that make false claims; two are real solvers, used wrongly.
+"""Plug-in with an exact solver, and solvers with false claims, two of them real.
 
 The plug-in contains two families without mechanics: a membrane, and
 min ½(x + 1)², x ≤ 0.
@@ -56,7 +56,7 @@ class Exact(Any):
 
 @dataclass(frozen=True)
 class Stale(Any):
-    """Solver that returns the answer to the previous QP of the same shape."""
+    """Solver that returns the answer to the previous QP of the same size."""
 
     def prepare(self, qp, tol):
         def solve():

@@ -36,7 +36,6 @@ DISCS = {
     "tilted disc": {"tilt": 0.5}, "soft disc": {"E": (70e9, 70e3, 70e9)},
 }  # fmt: skip
 ROUNDED = 1 + 1e-9  #: allowed ratio of error to bound; local solves are rounded
-NOISE = 1e-7  #: smallest relative error for which the ratio bound / error is recorded
 
 
 class KnownSolution(NamedTuple):
@@ -44,8 +43,8 @@ class KnownSolution(NamedTuple):
 
     u: np.ndarray  #: (n,) displacement, extended precision
     multipliers: np.ndarray  #: (m,) multipliers of contact and friction rows
-    norm: float  #: ‖u‖
-    slack: float  #: bound of ‖error of u‖
+    norm: float  #: energy norm ‖u‖
+    slack: float  #: bound on ‖error of u‖
     rigid: np.ndarray  #: (n, 3 bodies) rigid motions of single bodies
 
 
@@ -72,7 +71,7 @@ def known_solution(build, ranks):
 
 
 def drifted(s, size, rng, rigid):
-    """Move each body rigidly by up to 10⁶ times its displacement."""
+    """Move each body rigidly, by the order of size·‖x‖ to 10⁶·size·‖x‖."""
     far = 10 ** rng.uniform(0, 6) * size * np.linalg.norm(s.x)
     return replace(s, x=s.x + rigid @ (far * rng.standard_normal(rigid.shape[1])))
 
@@ -195,7 +194,7 @@ def refused(ranks, sign, **keys):
 
 
 def why(certificate):
-    """Return the bound of a certificate, or the reason why there is no certificate."""
+    """Return the bound that a certificate proves, or the reason for its absence."""
     try:
         return f"bound {certificate().bound}"
     except UncertifiableError as e:

@@ -1,10 +1,10 @@
 """Random contact problems, determined by a seed.
 
 The bodies are towers of blocks on a base, beams on pillars, or discs between plates.
-There are one to five contacts with gaps, and some bodies are supported only by contact.
-Moduli differ by up to six orders of magnitude. The contact rows are node-to-segment or
-mortar with either basis, and either side is the slave. The loads press the bodies
-together, so that every problem has a solution.
+There are one to four contacts, some with gaps, and some bodies are supported only by
+contact. Moduli differ by up to six orders of magnitude. The contact rows are
+node-to-segment or mortar with either basis, and either side is the slave. The loads
+press the bodies together, so that every problem has a solution.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _case(
     """Build the case of parts under pressure on the top; draw which sides are slaves.
 
     held : part, side, and the components of the displacement that are zero there
-    tilt : bound of the relative deviation of the pressure from its mean
+    tilt : bound on the relative deviation of the pressure from its mean
     """
     mesh, body = join(tuple(prefixed(m, f"{k}_") for k, m in enumerate(parts)))
 

@@ -34,7 +34,7 @@ class _Draft:
     x: Vector
     y: Vector
     z: Vector
-    slack: Vector  #: (p,) of G x ≤ h
+    slack: Vector  #: (p,) slack of G x ≤ h
     z_box: Vector
     lb: Vector
     ub: Vector
@@ -83,13 +83,13 @@ def _tiny_curvature(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _singular(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Halve the rank of P."""
+    """Reduce the rank of P to at most half of its order."""
     M = rng.integers(-3, 4, (d.x.size, max(1, d.x.size // 2))).astype(float)
     return replace(d, P=M @ M.T)
 
 
 def _parallel(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Add a tight row that differs from another one by 2^-20."""
+    """Add a tight row that differs from another one by multiples of 2^-20."""
     old = d.G[0] if d.G.shape[0] else rng.integers(-3, 4, d.x.size)
     near = np.asarray(old + 2.0**-20 * rng.integers(-3, 4, d.x.size))
     return d.inequalities(near[None], rng.integers(0, 5, 1) / 4.0, np.zeros(1))
@@ -123,7 +123,7 @@ def _free_direction(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _redundant(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Add rows that do not bind, with entries from 1e-12 to 1e12."""
+    """Add rows that do not bind, scaled by factors from 1e-12 to 1e12."""
     size = 2.0 ** rng.integers(-40, 41, 2)
     rows = np.asarray(rng.integers(-3, 4, (2, d.x.size)) * size[:, None], dtype=float)
     return d.inequalities(rows, np.zeros(2), np.abs(rows @ d.x) + np.maximum(1.0, size))

@@ -10,7 +10,7 @@ from mortarbench.harness import Solution, Status
 
 @dataclass(frozen=True)
 class Descent:
-    """Solver with the slow iteration x ← clip(x − g/‖P‖), for bounds only."""
+    """Solver with the slow iteration x ← clip(x − g/‖P‖), for QPs with bounds only."""
 
     history: bool = False  #: True to store a row per step
     max_iter: int = 50_000

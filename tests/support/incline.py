@@ -1,4 +1,4 @@
-"""Block on an inclined plane that only friction keeps from sliding (CGS-4)."""
+"""Block that only friction keeps from sliding on an inclined plane (CGS-4)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 from mortarbench.solvers.reference.solve import reference_solution
 
-WEIGHT = 1e5  #: G, N/m
+WEIGHT = 1e5  #: weight G of the block, N/m
 
 
 def incline(ratio: float, slope: float = 0.1) -> Bodies:

@@ -138,7 +138,7 @@ def factors(ranks):
 
 
 def projected(qp, most):
-    """Project and solve in a face; ranks may share at most `most` rows."""
+    """Project and solve in a face, with `factor.MAX_FILL` = `most`."""
     kept, factor.MAX_FILL = factor.MAX_FILL, most
     problem = projected_problem(qp, partial(by_lanczos, steps=3))
     factor.MAX_FILL = kept

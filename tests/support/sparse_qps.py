@@ -41,8 +41,8 @@ def laplacian(kind: str, n: int, rng: np.random.Generator) -> csr_array:
 def sparse_matrix(n: int, rng: np.random.Generator) -> csr_array:
     """Draw P: a Laplacian, AᵀA, the square of a second difference, or a diagonal.
 
-    Of these matrices, 40 % are scaled symmetrically by up to four orders of magnitude,
-    and 30 % are permuted.
+    Of these matrices, 40 % are scaled symmetrically by factors from 1e-4 to 1e4, and
+    30 % are permuted.
     """
     kind = rng.choice(["grid", "line", "graph", "gram", "square", "diagonal"])
     if kind == "gram":

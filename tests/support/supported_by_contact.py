@@ -1,4 +1,4 @@
-"""Bodies supported only by contact, and solutions with twice the digits of doubles.
+"""Bodies supported only by contact, and their solutions in extended precision.
 
 The solutions satisfy the KKT equations of the stored data for given closed rows. They
 are computed by Gaussian elimination in extended precision and refined with residuals
@@ -35,7 +35,7 @@ from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, r
 from mortarbench.problems.feti.subdomains import DecomposedProblem
 from tests.support.decomposed_bodies import decompose_by_labels, parts_by
 
-PRESSURE = 1e7  #: Pa
+PRESSURE = 1e7  #: pressure on the upper plate, Pa
 
 
 def disc_between_plates(
@@ -202,7 +202,7 @@ def stored_solution(
 
 
 def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the motions in the range of R that lie in the kernel of the rows."""
+    """Return the rigid motions (range of R) that lie in the kernel of the rows."""
     _, sizes, turn = np.linalg.svd(rows @ R)
     count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
     return np.asarray(R @ turn[count:].T)

@@ -3,7 +3,7 @@
     python tests/support/synthetic_results.py DIR [SOLVERS CASES REPEATS]
 
 Times follow power laws with lognormal scatter, most answers are verified, and every
-verdict occurs. Equal arguments yield identical folders.
+verdict except `declined` may occur. Equal arguments yield identical folders.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Plug-in with parabolas over half lines, and with solvers, some of which misbehave.
+"""Plug-in with quadratics over x ≥ 0, and with solvers, some of which misbehave.
 
 If the module is run as a program, it acts as a worker whose registries contain only
 this family and these solvers.
@@ -27,7 +27,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Well:
-    """A parabola over a half line."""
+    """Separable quadratics over x ≥ 0."""
 
     name: str = "well"
     defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})
@@ -70,7 +70,7 @@ class Well:
 
 @dataclass(frozen=True)
 class Exact:
-    """Solver for a diagonal P. Only for toy problems."""
+    """Solver for P = I and inactive bounds, only for toy problems."""
 
     factor: float = 1.0
     reason: str | None = None
@@ -143,7 +143,7 @@ class Murders(Exact):
 
 @dataclass(frozen=True)
 class Lax(Exact):
-    """Solver whose errors equal the tolerance."""
+    """Solver whose relative errors equal the tolerance."""
 
     def prepare(self, qp, tol):
         return Exact(factor=1 + tol).prepare(qp, tol)

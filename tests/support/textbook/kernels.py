@@ -1,6 +1,6 @@
 """The vector operations of an MPRGP step.
 
-Few components of a dual have bounds; bounds are evaluated for these components only.
+Step lengths are evaluated only for components with finite bounds, few in many duals.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ from tests.support.textbook.outer_loop import (
 )
 from tests.support.textbook.projected import Projected
 
-KEPT = 200  #: directions of CG on a face
-ALTERNATIONS = 4  #: pairs of projections onto Cν = 0 and onto the face
+KEPT = 200  #: maximum number of CG directions kept on a face
+ALTERNATIONS = 4  #: number of pairs of projections, onto Cν = 0 and onto the face
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class TextbookLoop:
 def outer_loop(
     problem: Any, qp: QP, options: Options, history: History | None = None
 ) -> TextbookLoop:
-    """Run the textbook version of `solvers.smalbe.driver.outer_loop`."""
+    """Return the textbook version of `solvers.smalbe.driver.outer_loop`."""
     fields = vars(problem)
     problem = Projected(**fields)
     kept = KEPT if options.recycle and not issparse(qp.P) else 0

@@ -1,4 +1,4 @@
-"""A quadratic model of the operator, minimised over a box without products with it.
+"""A quadratic model of the operator, minimised over a box without its products.
 
     B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
 
@@ -64,7 +64,7 @@ class Model:
 
     @property
     def has_directions(self) -> bool:
-        """Return True if the model contains directions in addition to the norm of H."""
+        """True if the model contains directions in addition to the norm of H."""
         return bool(len(self.U))
 
     def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
@@ -139,7 +139,7 @@ def minimised(
     newton: Callable[[Vector, Mask], Vector],
     k: int,
 ) -> tuple[Vector, Tilted] | None:
-    """Maximise the dual function of k multipliers y; return None without a maximiser.
+    """Maximise the dual function of k multipliers y; return None if this fails.
 
     at : function that returns s(y), at least on the components with bounds
     newton : function that returns the step dy for a slope and the free components
@@ -166,7 +166,7 @@ def _searched(
     there: Tilted,
     slopes: tuple[float, float],
 ) -> tuple[float, Tilted]:
-    """Return y + t dy, t ≤ 1, at which the slope is at most a tenth of that at t = 0.
+    """Return t ≤ 1 and s(y + t dy), with at most a tenth of the slope at t = 0.
 
     there : s(y + dy)
     slopes : slopes at t = 0 and at t = 1

@@ -24,7 +24,8 @@ previous ones.
 Every step except projcg reduces the cost; with the model τI, the reduction is
 sufficient for the convergence rate of the book. Expansion never frees a component that
 the half step left at a bound, except in the first expansion by a model with directions.
-Between two proportioning steps, the active set only grows. See docs/smalbe-theory.md.
+Apart from this exception, the active set only grows between two proportioning steps.
+See docs/smalbe-theory.md.
 """
 
 from __future__ import annotations
@@ -185,7 +186,7 @@ class Minimum(NamedTuple):
     x: Vector
     g: Vector  #: Hx − b
     face: Face
-    stopped: bool  #: True if `stop` ended the run, False for a step limit or stagnation
+    stopped: bool  #: True if the criterion `stop` ended the run
     trace: str  #: one letter per step: c, b, e, f, p
     directions: Directions  #: directions on the last face
 
@@ -193,7 +194,7 @@ class Minimum(NamedTuple):
 #: observer called after each step within the box: letter, new point and its face
 Watch = Callable[[str, Point, Face], None]
 #: letters (the last is that of the step itself), new point and model; None if the cost
-#: is unbounded below
+#: is unbounded below or cannot decrease within rounding
 Step = tuple[str, Point, BoxModel] | None
 
 
@@ -360,7 +361,7 @@ def _minimise_or_expand(
     task: _Task, at: Point, face: Face, p: Vector, Hp: Vector, B: BoxModel,
     *, stay: _Stay, first: bool, uphill: bool,
 ) -> Step:  # fmt: skip
-    """Take the CG step if it is feasible and reduces the cost; else expand."""
+    """Take the CG step if it is feasible (of length 0 if it is uphill); else expand."""
     H, b, bounds, rules = task
     cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
     if math.isinf(min(cg, feasible)):

@@ -50,7 +50,7 @@ from tests.support.textbook.projected import Projected
 from tests.support.textbook.rows import met as are_met
 from tests.support.textbook.rows import violation
 
-FOR_ENERGY = 1.25  #: largest factor of products for the accuracy of the energy
+FOR_ENERGY = 1.25  #: largest factor on the number of products for an accurate energy
 MOST_RHO = 1e10  #: largest ρ; for larger values, rounding in ρQν dominates
 
 
@@ -63,7 +63,7 @@ class Constants:
     eta: float
     rho_growth: float
     max_steps: int
-    energy: float = 0.0  #: required estimate of energy error/tol; 0 for no requirement
+    energy: float = 0.0  #: largest estimate of energy error/tol; 0: no requirement
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ def smalbe(
 def _accuracy(
     problem: Projected, tol: float, b_size: float, energy: float
 ) -> Callable[[Point, Face], bool]:
-    """Return the stopping test of the outer loop."""
+    """Return the stopping criterion of the outer loop."""
     most = 0  # limit of products, set when all criteria except the energy are met
 
     def reached(here: Point, face: Face) -> bool:

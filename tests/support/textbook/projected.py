@@ -60,7 +60,7 @@ class Projected(projected.Projected):
     def model(self, rho: float) -> BoxModel:
         """Model H by the Ritz pairs and the rows C.
 
-        The last but one Ritz value plus its residual estimates the norm of 𝒫F𝒫 on the
+        The penultimate Ritz value plus its residual estimates the norm of 𝒫F𝒫 on the
         complement of the preceding Ritz vectors. (The last Ritz value is used if the
         process terminated, and the first one whose residual exceeds its value.) ρQ is
         used exactly. If the estimate is too small, MPRGP raises τ according to its
@@ -100,7 +100,7 @@ def projected_problem(
 ) -> Projected:
     """Homogenise, project and normalise the QP.
 
-    This needs one product with F, and the products of `find`.
+    This needs at most one product with F, and the products of `find`.
     """
     F = Product(qp.P, qp.q.size)
     if is_sparse(qp.A):
@@ -124,7 +124,7 @@ def projected_problem(
 def by_lanczos(
     PFP: Callable[[Vector], Vector], rows: given.Rows, *, steps: int
 ) -> Spectrum:
-    """Find the norm and the upper Ritz pairs with `steps` products."""
+    """Find the norm and the upper Ritz pairs with at most `steps` products."""
     start = rows.project(random_start(rows.x_tilde.size))
     steps = min(steps, size(start) - len(rows.C))  # the dimension of the range of 𝒫
     ritz = lanczos(PFP, start, steps)
@@ -137,7 +137,7 @@ def size(v: Vector) -> int:
 
 
 def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
-    """Run `steps` Lanczos steps with full reorthogonalisation and one product each.
+    """Run at most `steps` Lanczos steps, fully reorthogonalised, with one product each.
 
     After the three-term recurrence, a single pass over all vectors makes the next
     vector orthogonal to them up to rounding. The residual of the pair (θ, Vᵀs) is

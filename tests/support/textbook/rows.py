@@ -59,7 +59,7 @@ def violation(rows: Rows, nu: Vector) -> float:
 def model_of(
     rows: Rows, tau: float, above: Vector, U: NDArray[np.float64], rho: float
 ) -> BoxModel:
-    """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC without terms of negative factor."""
+    """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC; drop terms with negative factors."""
     if isinstance(rows, DenseRows):
         w = np.append(above, np.full(len(rows.C), rho))
         return Model(0.0, np.vstack([U, rows.C]), w).with_tail(tau)
@@ -76,7 +76,7 @@ class PenaltyModel:
 
     tau: float
     rows: SparseRows
-    w: float  #: positive
+    w: float  #: positive weight of CᵀC
 
     has_directions = True
 
