@@ -111,7 +111,13 @@ def test_bounds_alone_contradict_nothing():
     assert margin(qp_of(n=2, lb=0, ub=0)) is None
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape",
+    [
+        pytest.param(shape, marks=[pytest.mark.slow] * (shape in ("singular", "fixed")))
+        for shape in SHAPES
+    ],
+)
 def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
     assert margin(manufactured(shape)[0]) is None
 
