@@ -482,7 +482,9 @@ def test_files_refuse_sets_that_they_cannot_store(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 4))]
+)
 def test_clarabel_solves_planted_discs(seed, tmp_path):
     qp, s = with_solution(seed)
     balls = qp.sets[1]

@@ -4,8 +4,8 @@ Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. Error
 relative to the reference point of the undivided problem, which the first rank builds.
 Every second trial disturbs the answer with the largest ratio of error to bound so far.
 
-Without cases, the program prints the reasons for which ranks and one process refuse
-loads without equilibrium.
+The program also prints the reasons for which ranks and one process refuse loads without
+equilibrium.
 """
 
 import json
@@ -203,10 +203,10 @@ def why(certificate):
 
 def main():
     ranks, count = Ranks(MPI.COMM_WORLD), int(sys.argv[1])
-    if not sys.argv[2:]:
-        found = [refused(ranks, 1, push=0.1), refused(ranks, -1)]
-    else:
-        found = {name: BoundSearch(name, ranks).result(count) for name in sys.argv[2:]}
+    found = {
+        "searches": {n: BoundSearch(n, ranks).result(count) for n in sys.argv[2:]},
+        "refusals": [refused(ranks, 1, push=0.1), refused(ranks, -1)],
+    }
     if ranks.rank == 0:
         print(json.dumps(found))
 

@@ -114,18 +114,28 @@ def columns(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"P": [1.0, 2.0], "q": [1.0, 1.0]}, r"QP.P has shape \(1, 2\), expected \(2,"),
+        pytest.param(
+            {"P": [1.0, 2.0], "q": [1.0, 1.0]},
+            r"QP.P has shape \(1, 2\), expected \(2,",
+            marks=pytest.mark.slow,
+        ),
         (
             {"P": [1.0] * 3, "q": [1.0, 1.0]},
             "P has 3 entries; expected rows of 2 entries",
         ),
-        ({"P": [np.nan]}, "P contains NaN or inf"),
+        pytest.param({"P": [np.nan]}, "P contains NaN or inf", marks=pytest.mark.slow),
         ({"P": ["one"]}, "P is not a list of numbers"),
         ({"q": None}, "P or q is null"),
-        ({"b": [3.0]}, r"QP.A has shape \(0, 1\), expected \(1, 1\)"),
-        ({"lb": [2.0], "ub": [1.0]}, "bounds cross"),
+        pytest.param(
+            {"b": [3.0]},
+            r"QP.A has shape \(0, 1\), expected \(1, 1\)",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"lb": [2.0], "ub": [1.0]}, "bounds cross", marks=pytest.mark.slow
+        ),
         ({"ub": "left out"}, "no column ub"),
-        ({"P": 3.0}, "P is not a list of numbers"),
+        pytest.param({"P": 3.0}, "P is not a list of numbers", marks=pytest.mark.slow),
     ],
 )
 def test_a_file_without_a_problem_is_refused_in_one_line(path, changes, message):

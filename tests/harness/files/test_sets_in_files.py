@@ -42,10 +42,18 @@ def arrays_of(qp):
     ]
 
 
-@pytest.mark.parametrize("sets", SETS.values(), ids=SETS)
-@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
-def test_a_qp_over_sets_is_the_same_after_writing(tmp_path, suffix, sets):
-    qp = qp_over(*sets)
+@pytest.mark.parametrize(
+    ("suffix", "name"),
+    [
+        pytest.param(
+            s, n, marks=[pytest.mark.slow] * (s == "parquet" and n != "discs and cones")
+        )
+        for s in ("npz", "mat", "parquet")
+        for n in SETS
+    ],
+)
+def test_a_qp_over_sets_is_the_same_after_writing(tmp_path, suffix, name):
+    qp = qp_over(*SETS[name])
     path = mb.export(qp, tmp_path / f"qp.{suffix}")
     back = mb.build(f"file:{path}").qp
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
+pytestmark = pytest.mark.together
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
     "beam-ring/Nr=3/Nh=2/step=2/contact=mortar",
@@ -41,6 +43,8 @@ CASES = (
     "cube-wall/n=2",
     "hertz-sphere/n=1",
 )
+#: cases with few contact rows
+QUICK = (CASES[0], *CASES[2:4], *CASES[6:9])
 PERTURBATIONS = 10_000
 ROUNDED = 1 + 1e-12  #: the bound often equals the error up to rounding
 
@@ -127,6 +131,14 @@ def _infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
     return replace(s, x=x, z=s.z - size * s.z.max() * rng.random(s.z.size))
 
 
+def marked(*quick: str) -> list[Any]:
+    """Return all cases; those that are not quick are marked as slow."""
+    return [
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in quick))
+        for name in CASES
+    ]
+
+
 KINDS: tuple[Callable[[Solution, float, np.random.Generator], Solution], ...] = (
     _noise, _wrong_active_set, _scaled, _truncated, _infeasible,
 )  # fmt: skip
@@ -149,7 +161,7 @@ def violations(name: str, count: int) -> list[str]:
     return told
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", marked(*QUICK))
 def test_no_disturbed_solution_exceeds_its_bound(name):
     assert violations(name, 20) == []
 
@@ -160,7 +172,7 @@ def test_none_of_ten_thousand_errors_exceeds_its_bound(name):
     assert violations(name, PERTURBATIONS // len(CASES)) == []
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", marked(*QUICK))
 def test_the_bound_of_the_solution_is_that_of_rounding(name):
     problem = known(name)
     assert problem.exact.bound < 1e-8
@@ -198,8 +210,15 @@ def forms_of(names: Sequence[str]) -> list[tuple[str, str]]:
     return [(n, form) for n in names for form in PROBLEMS[n.partition("/")[0]].forms]
 
 
-def test_bounds_of_solver_answers_are_sharp():
-    cases = forms_of((CASES[0], CASES[3], CASES[7]))
+@pytest.mark.parametrize(
+    "names",
+    [
+        (CASES[0], CASES[7]),
+        pytest.param((CASES[0], CASES[3], CASES[7]), marks=pytest.mark.slow),
+    ],
+)
+def test_bounds_of_solver_answers_are_sharp(names):
+    cases = forms_of(names)
     labels = ("smalbe", "clarabel", "piqp")
     found = [e for case in cases for e in effectivities(*case, labels)]
     assert len(found) > 70
@@ -207,9 +226,16 @@ def test_bounds_of_solver_answers_are_sharp():
     assert min(found) >= 1 / ROUNDED
 
 
-def test_bounds_in_space_are_sharp():
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("cube-wall/n=2",),
+        pytest.param(("cube-wall/n=3", "hertz-sphere/n=1"), marks=pytest.mark.slow),
+    ],
+)
+def test_bounds_in_space_are_sharp(names):
     labels = ("smalbe", "clarabel", "piqp", "osqp")
-    cases = forms_of(("cube-wall/n=3", "hertz-sphere/n=1"))
+    cases = forms_of(names)
     found = [e for case in cases for e in effectivities(*case, labels)]
     assert len(found) > 50
     assert np.median(found) <= 2
@@ -240,7 +266,7 @@ def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
     assert certify(case.mechanics, case.mechanics.to_primal(s)).bound <= 1e-6
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", marked("contact-patch", "obstacle/n=8"))
 @pytest.mark.parametrize("size", [1e160, 1e300])
 def test_answers_that_overflow_have_no_certificate_or_a_valid_one(name, size):
     problem = known(name)
@@ -254,7 +280,7 @@ def test_answers_that_overflow_have_no_certificate_or_a_valid_one(name, size):
         assert np.isfinite(found.error)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", marked(*QUICK))
 def test_a_huge_error_is_not_measured_relative_to_itself(name):
     """An error of ten times the solution is relative to the solution, not
     the answer.

@@ -33,6 +33,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import block_on_incline
 
+pytestmark = pytest.mark.together
 INCLINE = "a block that friction alone holds"
 #: problems with friction, each with the same problem without friction
 CASES = {
@@ -212,15 +213,25 @@ def sharp(cases: Sequence[str], count: int) -> None:
     assert np.median(rough) <= 1.5 * np.median(smooth)
 
 
-def test_no_disturbed_solution_with_friction_exceeds_its_bound():
-    sharp(list(CASES), 10)
+@pytest.mark.parametrize(
+    "names",
+    [
+        [name for name in CASES if name.startswith("contact-patch")],
+        pytest.param(list(CASES), marks=pytest.mark.slow),
+    ],
+)
+def test_no_disturbed_solution_with_friction_exceeds_its_bound(names):
+    sharp(names, 10)
 
 
 def test_no_disturbed_solution_of_a_body_held_by_friction_exceeds_its_bound():
     assert attacked(INCLINE, 20)[0] == []
 
 
-@pytest.mark.parametrize("name", [IN_SPACE[0], IN_SPACE[4], IN_SPACE[5]])
+@pytest.mark.parametrize(
+    "name",
+    [IN_SPACE[0], IN_SPACE[5], pytest.param(IN_SPACE[4], marks=pytest.mark.slow)],
+)
 def test_no_disturbed_solution_in_space_exceeds_its_bound(name):
     faults, effectivities = attacked(name, 15)
 
@@ -240,9 +251,10 @@ def test_none_of_ten_thousand_errors_in_space_exceeds_its_bound():
     assert np.median(sharp) <= 2
 
 
-def test_vectors_in_space_stick_and_slip_obliquely():
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
+def test_vectors_in_space_stick_and_slip_obliquely(count):
     found = set()
-    for name in IN_SPACE[:4]:
+    for name in IN_SPACE[:count]:
         exact = known(name).exact
         forces = known(name).mechanics.exact.forces
         closed = exact.states[forces.discs.index] == CLOSED
@@ -289,7 +301,13 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
     assert work.sum() >= 0
 
 
-@pytest.mark.parametrize("name", list(CASES)[:3])
+@pytest.mark.parametrize(
+    "name",
+    [
+        next(iter(CASES)),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in list(CASES)[1:3]),
+    ],
+)
 def test_errors_of_solver_answers_are_bounded_in_every_form(name):
     problem, found = known(name), []
     for form in ("primal", "dual", "dual-bounds"):

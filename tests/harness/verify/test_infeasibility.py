@@ -84,9 +84,10 @@ FEASIBLE = {
 
 
 @pytest.mark.parametrize("qp", FEASIBLE.values(), ids=FEASIBLE.keys())
-def test_a_feasible_qp_is_never_proven_to_be_infeasible(qp):
+@pytest.mark.parametrize("count", [4, pytest.param(20, marks=pytest.mark.slow)])
+def test_a_feasible_qp_is_never_proven_to_be_infeasible(qp, count):
     assert is_feasible(qp)
-    rays = np.random.default_rng(1).exponential(size=(20, qp.b.size + qp.h.size))
+    rays = np.random.default_rng(1).exponential(size=(count, qp.b.size + qp.h.size))
     cancelling = np.linalg.svd(np.vstack([*map(np.asarray, _dense(qp))]).T)[2][-1:]
     for w in (*rays, *cancelling, *-cancelling):
         assert margin(qp, *np.split(w, [qp.b.size])) is None
@@ -110,7 +111,13 @@ def test_bounds_alone_contradict_nothing():
     assert margin(qp_of(n=2, lb=0, ub=0)) is None
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape",
+    [
+        pytest.param(shape, marks=[pytest.mark.slow] * (shape in ("singular", "fixed")))
+        for shape in SHAPES
+    ],
+)
 def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
     assert margin(manufactured(shape)[0]) is None
 
@@ -141,7 +148,7 @@ def test_units_of_rows_and_variables_change_no_margin():
         assert margin(scaled) == pytest.approx(expected, 1e-9)
 
 
-@pytest.mark.parametrize("n", [60, 150])
+@pytest.mark.parametrize("n", [60, pytest.param(150, marks=pytest.mark.slow)])
 def test_a_large_contradiction_of_reals_is_proven_by_an_enclosure(n):
     """The last of n + 1 rows is a rounded combination of the other rows.
 
@@ -221,8 +228,11 @@ def search(seeds):
     return proofs
 
 
-def test_all_infeasibility_proofs_of_a_short_search_are_correct():
-    assert search(range(60)) >= 5
+@pytest.mark.parametrize(
+    ("count", "proofs"), [(24, 2), pytest.param(60, 5, marks=pytest.mark.slow)]
+)
+def test_all_infeasibility_proofs_of_a_short_search_are_correct(count, proofs):
+    assert search(range(count)) >= proofs
 
 
 @pytest.mark.slow

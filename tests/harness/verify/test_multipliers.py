@@ -8,6 +8,8 @@ from mortarbench.harness.verify import multipliers
 from mortarbench.harness.verify.multipliers import with_multipliers
 
 TOL = 1e-8
+#: numbers of random QPs
+SEARCHED = (50, pytest.param(200, marks=pytest.mark.slow))
 
 
 def solved_qp(seed, *, definite=True):
@@ -46,10 +48,11 @@ def solved_qp(seed, *, definite=True):
 
 
 @pytest.mark.parametrize("definite", [True, False])
-def test_a_solution_without_multipliers_is_proven(definite):
+@pytest.mark.parametrize("count", SEARCHED)
+def test_a_solution_without_multipliers_is_proven(count, definite):
     worst = [
         kkt_residuals(qp, with_multipliers(qp, x)).worst
-        for qp, x in (solved_qp(seed, definite=definite) for seed in range(200))
+        for qp, x in (solved_qp(seed, definite=definite) for seed in range(count))
     ]
 
     assert max(worst) <= 1e-13
@@ -67,13 +70,14 @@ def test_signs_of_computed_multipliers_are_those_of_their_bounds():
         assert (s.z_box[at_ub & ~at_lb] >= 0).all()
 
 
-def test_a_point_beside_the_solution_has_no_multipliers():
+@pytest.mark.parametrize("count", SEARCHED)
+def test_a_point_beside_the_solution_has_no_multipliers(count):
     """With an error of 100·tol in every component, a residual above 10·tol remains.
 
     P is strictly convex, so no multipliers have smaller residuals.
     """
     left = []
-    for seed in range(200):
+    for seed in range(count):
         qp, x = solved_qp(seed)
         off = np.random.default_rng(seed).choice([-1.0, 1.0], x.size)
         beside = x + 100 * TOL * np.abs(x).max() * off

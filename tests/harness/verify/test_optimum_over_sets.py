@@ -171,8 +171,11 @@ def search(seed, tries, each=40):
     return wrong, refuted, verified, proven / (tries // each)
 
 
-def test_no_verdict_is_wrong_in_a_short_search_over_sets():
-    wrong, refuted, verified, proven = search(271828, 400)
+@pytest.mark.parametrize(
+    ("tries", "each"), [(100, 20), pytest.param(400, 40, marks=pytest.mark.slow)]
+)
+def test_no_verdict_is_wrong_in_a_short_search_over_sets(tries, each):
+    wrong, refuted, verified, proven = search(271828, tries, each)
 
     assert (wrong, refuted) == ([], [])
     assert verified > 15
@@ -218,7 +221,13 @@ def test_multipliers_of_a_solution_over_balls_prove_it(seed):
     assert kkt_residuals(qp, with_multipliers(qp, s.x, s.y, s.z)).worst <= 1e-13
 
 
-@pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny ball")])
+@pytest.mark.parametrize(
+    "trap",
+    ["", "point", *(
+        pytest.param(trap, marks=pytest.mark.slow) for trap in TRAPS
+        if trap not in ("tiny ball", "point")
+    )],
+)  # fmt: skip
 def test_multipliers_over_balls_are_computed_also_with_common_rows(trap):
     """Solutions are rounded, so they are on the spheres only up to rounding."""
     worst = []
@@ -232,8 +241,9 @@ def test_multipliers_over_balls_are_computed_also_with_common_rows(trap):
     assert np.quantile(worst, 0.9) <= 1e-7
 
 
-def test_no_multipliers_verify_a_non_optimal_point():
-    for seed in range(20):
+@pytest.mark.parametrize("count", [6, pytest.param(20, marks=pytest.mark.slow)])
+def test_no_multipliers_verify_a_non_optimal_point(count):
+    for seed in range(count):
         qp, s = with_solution(seed)
         x = qp.sets[1].project(s.x * (1 + 1e-2 * np.sign(s.x)))
         assert kkt_residuals(qp, with_multipliers(qp, x)).worst > 1e-4

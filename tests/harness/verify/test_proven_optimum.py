@@ -257,15 +257,21 @@ def test_a_false_reference_proves_nothing():
 
 
 CANCELLED = (  # f* = 2⁻²⁰ between terms of 50 to 1400; some multipliers are not unique
-    (("cancelled", "far bounds", "free direction"), 360818169),
-    (("cancelled", "fixed", "redundant"), 879083487),
     (("big-M", "cancelled", "fixed"), 878510873),
     (("cancelled", "duplicates", "redundant"), 716254695),
+    (("cancelled", "far bounds", "free direction"), 360818169),
+    (("cancelled", "fixed", "redundant"), 879083487),
     (("cancelled", "duplicates", "redundant"), 194299169),
 )
 
 
-@pytest.mark.parametrize(("kinds", "number"), CANCELLED)
+@pytest.mark.parametrize(
+    ("kinds", "number"),
+    [
+        *CANCELLED[:2],
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in CANCELLED[2:]),
+    ],
+)
 def test_cancelling_terms_are_evaluated_exactly(kinds, number):
     planted = hard(frozenset(kinds), number)
     attack = Attack(planted, np.random.default_rng(1))
@@ -740,7 +746,13 @@ def search(seed, tries, way, each=40):
     return wrong, refuted, verified
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    "way",
+    [
+        pytest.param(w, marks=[pytest.mark.slow] * (w == "operator, 400 idle"))
+        for w in WAYS
+    ],
+)
 def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(way):
     wrong, refuted, verified = search(271828, 120, way)
 
@@ -876,7 +888,9 @@ def objective(qp, x):
     return bend / 2 + sum(c * a for c, a in zip(q, x, strict=True))
 
 
-@pytest.mark.parametrize("cost", [1e6, 1e9, 1e12])
+@pytest.mark.parametrize(
+    "cost", [1e12, *(pytest.param(c, marks=pytest.mark.slow) for c in (1e6, 1e9))]
+)
 def test_costs_on_bounds_hide_no_error_of_a_vanishing_objective(cost):
     """x* = (0, 0, 0, 1, 1), f* = 0 with terms 1 and ½; the costs have energies C²."""
     qp = qp_of(

@@ -410,7 +410,13 @@ def test_distances_to_normal_cones_are_euclidean():
     assert discs.normal_distances(x, z, 1e-9) == pytest.approx([1, 0, 2])
 
 
-@pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny")])
+@pytest.mark.parametrize(
+    "trap",
+    ["", "steep", "apex", "point", *(
+        pytest.param(trap, marks=pytest.mark.slow) for trap in TRAPS
+        if trap not in ("tiny", "steep", "apex", "point")
+    )],
+)  # fmt: skip
 def test_multipliers_are_computed_for_points(trap):
     worst = []
     for seed in range(5):
@@ -450,7 +456,9 @@ def test_multipliers_are_computed_at_the_apex_of_all_cones():
     assert found.multipliers.y == pytest.approx([0], abs=1e-12)
 
 
-@pytest.mark.parametrize("trap", ["", "steep", "point", "apex"])
+@pytest.mark.parametrize(
+    "trap", ["", "steep", "apex", pytest.param("point", marks=pytest.mark.slow)]
+)
 def test_equivalent_formulations_have_the_same_residuals(trap):
     """Units, order and signs of tangents change exactly, by powers of two."""
     for seed in range(2):
