@@ -65,10 +65,8 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-#: solvers that take seconds for all equivalent formulations
-REWRITTEN = {
-    "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
-}  # fmt: skip
+#: solvers that by default solve all equivalent formulations: our own and two libraries
+REWRITTEN = {"smalbe", "pdas", "feti", "bvls", "clarabel", "quadprog"}
 #: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
@@ -92,11 +90,11 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 
 UNBOUNDED = "claims no success: unbounded"
-#: solvers that take many seconds to reach the iteration limit; `smalbe` represents its
-#: variants
+MEMBRANE = "finds where a membrane of 400 nodes touches"
+#: checks in which a solver takes seconds, mostly to reach its iteration limit
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
-    ("projected-gradient", UNBOUNDED),
+    ("projected-gradient", UNBOUNDED), ("apgd", UNBOUNDED), ("nsgs", MEMBRANE),
 ]  # fmt: skip
 #: planted solutions for all solvers: each shape once, and one shape in all storage
 #: formats
@@ -105,25 +103,50 @@ PLANTED = re.compile(
 )
 IN_EVERY_WAY = "everything"
 ONCE = ", sparse"
+#: one solver of each algorithm of our own, and one of each kind of adapter: of a library
+#: for QPs, of one for cones, and of the two for other libraries
+REPRESENTATIVES = {
+    "smalbe", "smalbe-direct", "pdas", "pdas-amg", "feti", "projected-gradient",
+    "apgd", "nsgs", "bvls", "osqp", "clarabel", "qpsolvers:quadprog", "cvxpy:HIGHS",
+}  # fmt: skip
+#: checks of the other solvers: form, signs and storage of data and answer
+FOR_ALL = {
+    "finds the planted solution: bounds, sparse",
+    "finds the planted solution: everything, sparse",
+    "gives multipliers our signs",
+    "puts none on absent bounds",
+    "leaves the problem alone: sparse",
+    "refuses a misspelt option",
+    "claims no success: infeasible",
+    "takes or declines an operator",
+}
 
 
-def is_for_all(name, check):
+def is_by_default(name, check):
     """Return True if a check runs by default; all checks run for `smalbe`."""
+    if name not in REPRESENTATIVES:
+        return check in FOR_ALL
     planted = PLANTED.match(check)
     return name == "smalbe" or planted is None or (
         planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
     )  # fmt: skip
 
 
-def test_by_default_every_shape_is_planted_for_every_solver():
-    chosen = [check for check in STRICT if is_for_all("any", check)]
+def test_by_default_every_shape_is_planted_for_every_representative():
     kinds = {check.partition(":")[0] for check in STRICT}
-    assert {check.partition(":")[0] for check in chosen} == kinds
-    assert all(any(f": {s}, " in check for check in chosen) for s in SHAPES)
+    for name in REPRESENTATIVES:
+        chosen = [check for check in STRICT if is_by_default(name, check)]
+        assert {check.partition(":")[0] for check in chosen} == kinds
+        assert all(any(f": {s}, " in check for check in chosen) for s in SHAPES)
+
+
+def test_representatives_and_their_checks_exist():
+    assert REPRESENTATIVES <= CONCRETE.keys()
+    assert set(STRICT) >= FOR_ALL
 
 
 def marks(name, check):
-    long = (name, check) in LONG or not is_for_all(name, check)
+    long = (name, check) in LONG or not is_by_default(name, check)
     return pytest.mark.slow if long else ()
 
 
@@ -166,10 +189,7 @@ def weaknesses(solver):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
-        )
-        # the other solvers pass the same QPs to the libraries of these solvers
+        pytest.param(name, marks=() if name in REWRITTEN else pytest.mark.slow)
         for name in CONCRETE
     ],
 )
@@ -366,6 +386,7 @@ PLUGIN_SOLVERS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow  # the command below prints the results of the same checks
 @pytest.mark.parametrize("check", CHECKS)
 def test_a_sound_solver_fails_no_check(check):
     grade, message, _ = run_check(check, Sound())
