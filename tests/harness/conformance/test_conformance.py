@@ -103,19 +103,17 @@ PLANTED = re.compile(
 )
 IN_EVERY_WAY = "everything"
 ONCE = ", sparse"
-#: one solver of each algorithm of our own, and one of each kind of adapter: of a library
-#: for QPs, of one for cones, and of the two for other libraries
+#: one solver for each kind of constraints that our solvers accept, and one of each kind
+#: of adapter: of a library, and of the two for other libraries
 REPRESENTATIVES = {
-    "smalbe", "smalbe-direct", "pdas", "pdas-amg", "feti", "projected-gradient",
-    "apgd", "nsgs", "bvls", "osqp", "clarabel", "qpsolvers:quadprog", "cvxpy:HIGHS",
+    "smalbe", "pdas", "feti", "nsgs", "bvls", "clarabel", "qpsolvers:quadprog",
+    "cvxpy:HIGHS",
 }  # fmt: skip
-#: checks of the other solvers: form, signs and storage of data and answer
+#: checks of the other solvers
 FOR_ALL = {
     "finds the planted solution: bounds, sparse",
     "finds the planted solution: everything, sparse",
     "gives multipliers our signs",
-    "puts none on absent bounds",
-    "leaves the problem alone: sparse",
     "refuses a misspelt option",
     "claims no success: infeasible",
     "takes or declines an operator",

@@ -276,10 +276,15 @@ def check_neighbours(tmp_path, watched, careless):
     assert processes_of(watched) == []
 
 
+@pytest.mark.parametrize(
+    "careless",
+    [RUN_TOGETHER[:3], pytest.param(RUN_TOGETHER, marks=pytest.mark.slow)],
+    ids=["few", "all"],
+)
 def test_measurements_beside_misbehaving_solvers_are_kept_and_undisturbed(
-    tmp_path, watched
+    tmp_path, watched, careless
 ):
-    check_neighbours(tmp_path, watched, RUN_TOGETHER)
+    check_neighbours(tmp_path, watched, careless)
 
 
 @pytest.mark.slow
