@@ -17,12 +17,15 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("harness", "problems", "solvers", "reports", "mortarbench")
 
 
-@cache
 def modules(*packages):
     """Return (path, syntax tree) of all modules of `packages`, default: all five."""
+    return [module for package in packages or PACKAGES for module in parsed(package)]
+
+
+@cache
+def parsed(package):
     return [
         (str(path.relative_to(ROOT)), ast.parse(path.read_text("utf-8")))
-        for package in packages or PACKAGES
         for path in sorted((ROOT / package).rglob("*.py"))
     ]
 

@@ -8,5 +8,6 @@ ROOT = SUPPORT.parents[1]  #: root of the checkout
 ACCIDENTS = SUPPORT / "accidents.py"
 ADVERSARIES = SUPPORT / "adversaries.py"
 FALSE_CLAIMS = SUPPORT / "false_claims.py"
+FAULTY_SOLVERS = SUPPORT / "faulty_solvers.py"
 HISTORIES = SUPPORT / "histories.py"
 TOY_PROBLEM = SUPPORT / "toy_problem.py"

@@ -2,16 +2,14 @@
 
 import gc
 import json
-import os
 import re
-import signal
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mortarbench.harness import Solution, Status, kkt_residuals
+from mortarbench.harness import kkt_residuals
 from mortarbench.harness.conformance import conformance
 from mortarbench.harness.conformance.conformance import (
     CHECKS,
@@ -35,7 +33,28 @@ from mortarbench.harness.conformance.manufactured import (
 )
 from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.solvers import SOLVERS
-from tests.support import ROOT
+from tests.support import FAULTY_SOLVERS, ROOT
+from tests.support.faulty_solvers import (
+    MEMORY,
+    AlwaysSolved,
+    DeclinesAll,
+    FlipsSigns,
+    HoldsAbsentBounds,
+    LeavesRoundOff,
+    MindsTheOrder,
+    MindsUnits,
+    Remembers,
+    RepeatsTheFirst,
+    Scales,
+    Silent,
+    Slow,
+    Sound,
+    StopsAtTheStart,
+    StopsEarly,
+    TakesAnything,
+    TakesOperatorsForZero,
+    Wanders,
+)
 
 #: backends that represent the wildcard entries of the registry; other backends are slow
 BACKENDS = {
@@ -65,10 +84,8 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-#: solvers that take seconds for all equivalent formulations
-REWRITTEN = {
-    "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
-}  # fmt: skip
+#: solvers that by default solve all equivalent formulations: our own and two libraries
+REWRITTEN = {"smalbe", "pdas", "feti", "bvls", "clarabel", "quadprog"}
 #: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
@@ -92,11 +109,11 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 
 UNBOUNDED = "claims no success: unbounded"
-#: solvers that take many seconds to reach the iteration limit; `smalbe` represents its
-#: variants
+MEMBRANE = "finds where a membrane of 400 nodes touches"
+#: checks in which a solver takes seconds, mostly to reach its iteration limit
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
-    ("projected-gradient", UNBOUNDED),
+    ("projected-gradient", UNBOUNDED), ("apgd", UNBOUNDED), ("nsgs", MEMBRANE),
 ]  # fmt: skip
 #: planted solutions for all solvers: each shape once, and one shape in all storage
 #: formats
@@ -105,25 +122,48 @@ PLANTED = re.compile(
 )
 IN_EVERY_WAY = "everything"
 ONCE = ", sparse"
+#: one solver for each kind of constraints that our solvers accept, and one of each kind
+#: of adapter: of a library, and of the two for other libraries
+REPRESENTATIVES = {
+    "smalbe", "pdas", "feti", "nsgs", "bvls", "clarabel", "qpsolvers:quadprog",
+    "cvxpy:HIGHS",
+}  # fmt: skip
+#: checks of the other solvers
+FOR_ALL = {
+    "finds the planted solution: bounds, sparse",
+    "finds the planted solution: everything, sparse",
+    "gives multipliers our signs",
+    "refuses a misspelt option",
+    "claims no success: infeasible",
+    "takes or declines an operator",
+}
 
 
-def is_for_all(name, check):
+def is_by_default(name, check):
     """Return True if a check runs by default; all checks run for `smalbe`."""
+    if name not in REPRESENTATIVES:
+        return check in FOR_ALL
     planted = PLANTED.match(check)
     return name == "smalbe" or planted is None or (
         planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
     )  # fmt: skip
 
 
-def test_by_default_every_shape_is_planted_for_every_solver():
-    chosen = [check for check in STRICT if is_for_all("any", check)]
+def test_by_default_every_shape_is_planted_for_every_representative():
     kinds = {check.partition(":")[0] for check in STRICT}
-    assert {check.partition(":")[0] for check in chosen} == kinds
-    assert all(any(f": {s}, " in check for check in chosen) for s in SHAPES)
+    for name in REPRESENTATIVES:
+        chosen = [check for check in STRICT if is_by_default(name, check)]
+        assert {check.partition(":")[0] for check in chosen} == kinds
+        assert all(any(f": {s}, " in check for check in chosen) for s in SHAPES)
+
+
+def test_representatives_and_their_checks_exist():
+    assert REPRESENTATIVES <= CONCRETE.keys()
+    assert set(STRICT) >= FOR_ALL
 
 
 def marks(name, check):
-    long = (name, check) in LONG or not is_for_all(name, check)
+    long = (name, check) in LONG or not is_by_default(name, check)
     return pytest.mark.slow if long else ()
 
 
@@ -166,10 +206,7 @@ def weaknesses(solver):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
-        )
-        # the other solvers pass the same QPs to the libraries of these solvers
+        pytest.param(name, marks=() if name in REWRITTEN else pytest.mark.slow)
         for name in CONCRETE
     ],
 )
@@ -193,179 +230,7 @@ def test_our_own_solvers_have_no_weakness():
             assert f"- `{name}`" not in page
 
 
-@dataclass(frozen=True)
-class Sound:
-    """PIQP under another name; base class of the faulty solvers."""
-
-    spoilt: str = ""
-
-    def declines(self, qp):
-        return SOLVERS["piqp"].declines(qp)
-
-    def prepare(self, qp, tol):
-        return lambda: self.act(qp, tol)
-
-    def act(self, qp, tol):
-        return self.honest(qp, tol)
-
-    def honest(self, qp, tol):
-        return SOLVERS["piqp"].prepare(qp, tol)()
-
-
-class StopsEarly(Sound):
-    def act(self, qp, tol):
-        return self.honest(qp, 0.1)
-
-
-class FlipsSigns(Sound):
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, y=-s.y)
-
-
-class HoldsAbsentBounds(Sound):
-    by = 1e-13
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, z_box=s.z_box - self.by)
-
-
-class LeavesRoundOff(HoldsAbsentBounds):
-    by = 3.5e-18
-
-
-class Remembers(Sound):
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        first = not MEMORY
-        MEMORY.append(s)
-        return s if first else replace(s, iterations=1)
-
-
-MEMORY = []
-
-
-class Wanders(Sound):
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, x=s.x + 1e-9 * np.random.default_rng().standard_normal())
-
-
-class Scales(Sound):
-    """Solver that scales read-only data in place but returns correct answers."""
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        qp.q.flags.writeable = True
-        qp.q[:] *= 2
-        return s
-
-
-class TakesAnything(Sound):
-    def __init__(self, **options):
-        pass
-
-
-class AlwaysSolved(Sound):
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, status=Status.SOLVED, x=np.nan_to_num(s.x))
-
-
-class Silent(Sound):
-    def act(self, qp, tol):
-        return replace(self.honest(qp, tol), message="")
-
-
-class TakesOperatorsForZero(Sound):
-    def declines(self, qp):
-        return None
-
-    def act(self, qp, tol):
-        if qp.is_explicit:
-            return self.honest(qp, tol)
-        zero = np.zeros(qp.q.size)
-        return Solution(
-            status=Status.SOLVED, x=np.clip(zero, qp.lb, qp.ub), y=qp.b, z=qp.h,
-            z_box=zero,
-        )  # fmt: skip
-
-
-class StopsAtTheStart(Sound):
-    """Solver that claims that its first point is optimal, like HiGHS 1.15.1 without
-    rows.
-    """
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, x=qp.lb) if qp.q.size == 400 else s
-
-
-class Slow(Sound):
-    def act(self, qp, tol):
-        time.sleep(0.1)
-        return self.honest(qp, tol)
-
-
-class MindsUnits(Sound):
-    """Solver that fails for large numbers, as with an absolute tolerance."""
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return s if abs(qp.q).max() < 1e6 else replace(s, x=1.01 * s.x)
-
-
-class SlowInNewtons(Sound):
-    """Solver that takes 49 times the iterations for large unknowns, like OSQP."""
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        factor = 49 if abs(s.x).max() > 1e5 else 1
-        return replace(s, iterations=7 * factor)
-
-
-class MindsTheOrder(Sound):
-    """Solver that fails if the first unknown has the lower bound zero."""
-
-    def act(self, qp, tol):
-        s = self.honest(qp, tol)
-        return replace(s, status=Status.FAILED) if qp.lb[0] == 0 else s
-
-
-class RepeatsTheFirst(Sound):
-    def chain(self, tol):
-        prepare = SOLVERS["piqp"].chain(tol)
-        first = []
-
-        def next_one(qp):
-            first.append(prepare(qp))
-            return first[0]
-
-        return next_one
-
-
-class DeclinesAll(Sound):
-    def declines(self, qp):
-        return "never on a Monday"
-
-
-class SaysFalse(Sound):
-    def declines(self, qp):
-        return False
-
-
-class Dies(Sound):
-    def act(self, qp, tol):
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
-PLUGIN_SOLVERS = {
-    "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
-    "slow": SlowInNewtons(), "false": SaysFalse(),
-}  # fmt: skip
-
-
+@pytest.mark.slow  # the command below prints the results of the same checks
 @pytest.mark.parametrize("check", CHECKS)
 def test_a_sound_solver_fails_no_check(check):
     grade, message, _ = run_check(check, Sound())
@@ -461,22 +326,6 @@ def test_declining_everything_is_not_a_pass():
     assert result == (Grade.DECLINE, "never on a Monday", None)
 
 
-@pytest.fixture
-def plugin(tmp_path):
-    """Return the path of a plug-in with the solvers of this file."""
-    path = tmp_path / "spoilt.py"
-    here = os.path.abspath(__file__)
-    path.write_text(
-        "import importlib.util, sys\n"
-        f"spec = importlib.util.spec_from_file_location('conformance', {here!r})\n"
-        "module = importlib.util.module_from_spec(spec)\n"
-        "sys.modules['conformance'] = module\n"
-        "spec.loader.exec_module(module)\n"
-        "SOLVERS = module.PLUGIN_SOLVERS\n"
-    )
-    return path
-
-
 def command(*arguments):
     from mortarbench.__main__ import main
 
@@ -487,19 +336,17 @@ def command(*arguments):
     return ended.value.code
 
 
-def test_the_command_prints_the_result_of_every_check(plugin, capsys):
-    assert command("test-solver", "sound", "--plugin", plugin, "--json") == 0
+def test_the_command_prints_the_result_of_every_check(capsys):
+    assert command("test-solver", "sound", "--plugin", FAULTY_SOLVERS, "--json") == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["check"] for row in rows] == list(CHECKS)
     assert {row["grade"] for row in rows} == {"pass", "decline"}
 
 
-def test_weaknesses_are_reported_and_solvers_with_some_conform(
-    plugin, capsys, monkeypatch
-):
+def test_weaknesses_are_reported_and_solvers_with_some_conform(capsys, monkeypatch):
     few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
     monkeypatch.setattr(conformance, "CHECKS", few)
-    assert command("test-solver", "minds", "--plugin", plugin) == 0
+    assert command("test-solver", "minds", "--plugin", FAULTY_SOLVERS) == 0
     out = capsys.readouterr().out
     (line,) = (x for x in out.splitlines() if "primal, units N, m " in x)
     assert line.startswith("weak")
@@ -507,11 +354,9 @@ def test_weaknesses_are_reported_and_solvers_with_some_conform(
     assert out.endswith("0 decline, 1 weak, 0 fail\n")
 
 
-def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
-    plugin, capsys
-):
+def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(capsys):
     names = ("sound", "minds", "slow")
-    assert command("test-solver", *names, "--plugin", plugin, "--markdown") == 0
+    assert command("test-solver", *names, "--plugin", FAULTY_SOLVERS, "--markdown") == 0
     page = capsys.readouterr().out
     (sound,) = (x for x in page.splitlines() if x.startswith("| `sound` |"))
     (minds,) = (x for x in page.splitlines() if x.startswith("| `minds` |"))
@@ -525,10 +370,10 @@ def test_the_page_of_weaknesses_has_a_row_per_solver_and_a_line_per_weakness(
     assert line_of("sound", "primal", "units N, m") not in page
 
 
-def test_solvers_can_be_selected_by_patterns(plugin, capsys, monkeypatch):
+def test_solvers_can_be_selected_by_patterns(capsys, monkeypatch):
     few = ("refuses a misspelt option", "keeps its answer: dual, mirrored")
     monkeypatch.setattr(conformance, "CHECKS", few)
-    command("test-solver", "piqp-*", "sound", "--plugin", plugin, "--json")
+    command("test-solver", "piqp-*", "sound", "--plugin", FAULTY_SOLVERS, "--json")
     rows = json.loads(capsys.readouterr().out)
     named = ["piqp-dense", "piqp-sparse", "sound"]
     assert [row["solver"] for row in rows] == np.repeat(named, 2).tolist()
@@ -540,10 +385,10 @@ def test_solvers_can_be_selected_by_patterns(plugin, capsys, monkeypatch):
     assert command("test-solver", "piqp", "--json", "--markdown") == 2
 
 
-def test_a_crash_fails_only_the_current_check(plugin, capsys, monkeypatch):
+def test_a_crash_fails_only_the_current_check(capsys, monkeypatch):
     few = ("gives multipliers our signs", "refuses a misspelt option")
     monkeypatch.setattr(conformance, "CHECKS", few)
-    assert command("test-solver", "dies", "--plugin", plugin) == 1
+    assert command("test-solver", "dies", "--plugin", FAULTY_SOLVERS) == 1
     lines = capsys.readouterr().out.splitlines()
     (options,) = (line for line in lines if "misspelt option" in line)
     assert options.startswith("pass")
@@ -552,12 +397,12 @@ def test_a_crash_fails_only_the_current_check(plugin, capsys, monkeypatch):
     assert "SIGSEGV" in signs
 
 
-def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
-    assert command("test-solver", "declines", "--plugin", plugin) == 1
+def test_a_solver_that_solves_nothing_does_not_conform(capsys):
+    assert command("test-solver", "declines", "--plugin", FAULTY_SOLVERS) == 1
     assert "never on a Monday" in capsys.readouterr().out
 
 
-def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
+def test_failures_are_reported_with_exit_code_1(capsys, monkeypatch):
     few = [
         "finds the planted solution: bounds, sparse", "refuses a misspelt option",
         "gives multipliers our signs",
@@ -565,7 +410,7 @@ def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     monkeypatch.setattr(conformance, "CHECKS", few)
     wrong = "declines returned False; expected None or a string"
 
-    assert command("test-solver", "false", "--plugin", plugin) == 1
+    assert command("test-solver", "false", "--plugin", FAULTY_SOLVERS) == 1
     out, err = capsys.readouterr()
     assert out.count(wrong) == 2
     assert "1 pass, 0 decline, 0 weak, 2 fail" in out
@@ -573,13 +418,13 @@ def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
         f"mortarbench: false does not conform: it fails {few[0]!r}, {few[2]!r}\n"
     )
 
-    assert command("test-solver", "declines", "--plugin", plugin, "--json") == 1
+    assert command("test-solver", "declines", "--plugin", FAULTY_SOLVERS, "--json") == 1
     assert capsys.readouterr().err == (
         "mortarbench: declines does not conform: it passes no check "
         "'finds the planted solution': it solved no QP\n"
     )
 
-    assert command("test-solver", "sound", "--plugin", plugin) == 0
+    assert command("test-solver", "sound", "--plugin", FAULTY_SOLVERS) == 0
     assert capsys.readouterr().err == ""
 
 

@@ -79,9 +79,18 @@ def lagrangian(qp, s):
     )
 
 
-@every_transform
+@pytest.mark.parametrize(
+    ("transform", "dense"),
+    [
+        pytest.param(
+            transform, dense, id=f"{transform}-{'dense' if dense else 'sparse'}",
+            marks=[pytest.mark.slow] * (dense and transform != "all"),
+        )
+        for transform in TRANSFORMS
+        for dense in (False, True)
+    ],
+)  # fmt: skip
 @every_shape
-@pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 def test_the_map_back_recovers_the_solution(manufactured, transform, shape, dense):
     """The solution of the changed QP is mapped to the planted minimiser."""
     qp, expected = manufactured(shape, dense=dense)

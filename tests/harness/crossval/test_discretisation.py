@@ -97,7 +97,12 @@ def true_error(dim, n, folder):
 
 @pytest.mark.parametrize(
     ("dim", "n"),
-    [(1, 15), (1, 24), (2, 8), pytest.param(2, 15, marks=pytest.mark.slow)],
+    [
+        (1, 15),
+        pytest.param(1, 24, marks=pytest.mark.slow),
+        (2, 8),
+        pytest.param(2, 15, marks=pytest.mark.slow),
+    ],
 )
 def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n):
     (found,) = meshes(tmp_path, f"obstacle/dim={dim}/n={n}/primal")
@@ -130,8 +135,11 @@ def test_energies_differ_from_the_error_if_boundary_values_change(
 @pytest.mark.parametrize(
     "name",
     [
-        "contact-patch", "obstacle", "hertz-plane",
-        pytest.param("hertz-cylinder", marks=pytest.mark.slow),
+        "contact-patch", "obstacle",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("hertz-plane", "hertz-cylinder")
+        ),
     ],
 )  # fmt: skip
 def test_energies_of_mechanics_are_those_of_the_case(name):
@@ -231,7 +239,9 @@ def test_differences_below_the_reference_error_are_no_discretisation_error():
         ("obstacle", {}), ("contact-patch", {}), ("beam-ring", {}),
         ("hertz-cylinder", {}), ("cube-wall", dict(n=2)),
         ("contact-patch", dict(dim=3, lower=4, upper=2)),
-        ("beam-ring", dict(Nr=2, Nh=2, depth=1)),
+        pytest.param(
+            "beam-ring", dict(Nr=2, Nh=2, depth=1), marks=pytest.mark.slow
+        ),
         ("beam-ring", dict(Nr=2, Nh=2, depth=2, sides="plane-strain")),
     ],
 )  # fmt: skip

@@ -327,7 +327,7 @@ def test_a_steady_drift_affects_both_arms_equally():
     assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of this error
 
 
-@pytest.mark.parametrize("amplitude", [0.05, 0.5])
+@pytest.mark.parametrize("amplitude", [pytest.param(0.05, marks=pytest.mark.slow), 0.5])
 def test_the_interval_of_a_noisy_clock_contains_the_true_ratio(amplitude):
     rng = np.random.default_rng(271828)
     readings = (k + amplitude * rng.random() for k in count())

@@ -276,10 +276,15 @@ def check_neighbours(tmp_path, watched, careless):
     assert processes_of(watched) == []
 
 
+@pytest.mark.parametrize(
+    "careless",
+    [RUN_TOGETHER[:3], pytest.param(RUN_TOGETHER, marks=pytest.mark.slow)],
+    ids=["few", "all"],
+)
 def test_measurements_beside_misbehaving_solvers_are_kept_and_undisturbed(
-    tmp_path, watched
+    tmp_path, watched, careless
 ):
-    check_neighbours(tmp_path, watched, RUN_TOGETHER)
+    check_neighbours(tmp_path, watched, careless)
 
 
 @pytest.mark.slow
@@ -384,8 +389,9 @@ def test_a_qp_that_changed_on_disk_is_a_fault(bench):
         ("pass", r"point\.npz: No such file"),
     ],
 )
-def test_a_full_disk_and_a_lost_file_are_faults(bench, write, message):
-    program = (
+def test_a_full_disk_and_a_lost_file_are_faults(bench, tmp_path, write, message):
+    program = tmp_path / "program.py"
+    program.write_text(
         "import sys\n"
         "import mortarbench.harness.processes.worker as w\n"
         f"def write_point(*_): {write}\n"
@@ -396,7 +402,7 @@ def test_a_full_disk_and_a_lost_file_are_faults(bench, write, message):
     )
 
     with pytest.raises(FaultError, match=message):
-        bench("honest", command=[sys.executable, "-c", program])
+        bench("honest", command=[sys.executable, "-P", str(program)])
 
 
 def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):

@@ -218,7 +218,8 @@ def test_friction_on_metis_parts_has_the_same_displacement_on_ranks(tmp_path):
             assert answer.record.quantities[state] == alone.record.quantities[state]
 
 
-@pytest.mark.parametrize("parts", [6, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow  # by default, a case of `CASES` has dependent rows on ranks
+@pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
     """Node-to-segment rows do not resist rolling, so the equality rows are
     dependent.
@@ -264,6 +265,7 @@ def test_journal_lines_of_one_rank_are_as_they_were(answers):
     assert not {"ranks", "rank_seconds", "rank_counts"} & line.keys()
 
 
+@pytest.mark.slow  # `problems/feti/test_distributed.py` tests the refusal of the form
 def test_more_ranks_than_subdomains_are_declined():
     answer = mb.solve("membranes/S=1/n=2/dual", "smalbe", ranks=3)
 

@@ -67,7 +67,8 @@ def work(number):
 def open_files():
     return sorted(os.listdir("/proc/self/fd"))
 
-expected = {act: does[act]("first") for act in acts}
+expected = {act: does[act]("first") for act in acts if act != "run"}
+expected["run"] = [expected["solve"][:2]]  # the same case, solver and tolerance
 before, stdout = open_files(), sys.stdout
 crew = [Thread(target=work, args=(i,)) for i in range(threads)]
 for thread in crew:
@@ -105,9 +106,10 @@ def assert_all_right(found, count):
     assert found["scratch"] == []
 
 
-def test_threads_that_build_solve_and_run_at_the_same_time_take_turns(tmp_path):
-    found = of_threads(tmp_path, 3, 2, "solve", "build", "run")
-    assert_all_right(found, 6)
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_threads_that_build_solve_and_run_at_the_same_time_take_turns(tmp_path, times):
+    found = of_threads(tmp_path, 3, times, "solve", "build", "run")
+    assert_all_right(found, 3 * times)
 
 
 @pytest.mark.slow
@@ -252,7 +254,11 @@ def env(tmp_path):
 
 @pytest.mark.parametrize(
     ("number", "code"),
-    [(signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGINT, 130)],
+    [
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
+        (signal.SIGINT, 130),
+    ],
 )
 def test_a_terminated_solve_cleans_up_and_says_so(tmp_path, number, code):
     plugin = tmp_path / "hangs.py"

@@ -3,11 +3,12 @@
 import os
 import shutil
 import subprocess
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import mortarbench as mb
 from mortarbench.cli.main import main
@@ -35,6 +36,14 @@ params = {{ path = "{}" }}
 SPARSE = 3 * 2**30  #: size of a sparse file, which occupies no disk space
 
 
+@contextmanager
+def blank_figures():
+    """Write blank figures, since drawing takes far longer than reading all files."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mortarbench.reports.render.saving.draw", lambda _: Figure())
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder_of_run(tmp_path_factory, svg_only):
     """Create a folder with files of every type, without one measurement of
@@ -53,7 +62,7 @@ def folder_of_run(tmp_path_factory, svg_only):
     mine = [r for r in results.records if r.solver == "smalbe"]
     (record,) = (r for r in mine if r.family == "contact-patch")
     keep_environment(folder, record.environment, {"machine": {}})
-    with svg_only():
+    with svg_only(), blank_figures():
         mb.validate(folder, budget=1)
         mb.report(folder)
     (journal,) = (folder / "journal").iterdir()
@@ -134,8 +143,13 @@ KINDS = (
 
 
 @pytest.fixture
-def read_by_every_command(folder_of_run, tmp_path, capsys, monkeypatch, only_svg):
-    """Run each command that reads a folder, with resource limits; none may raise."""
+def read_by_every_command(
+    folder_of_run, tmp_path, capsys, monkeypatch, only_svg, request
+):
+    """Run each command that reads a folder, with resource limits; none may raise.
+
+    Slow tests draw the figures of the pages.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     suite = tmp_path / "s.toml"
@@ -159,7 +173,9 @@ def read_by_every_command(folder_of_run, tmp_path, capsys, monkeypatch, only_svg
         with bounded(), suppress(InputError):
             assert mb.load(folder).df.shape[0] >= 1
 
-    return read
+    slow = request.node.get_closest_marker("slow")
+    with nullcontext() if slow else blank_figures():
+        yield read
 
 
 def try_commands(folder_of_run, tmp_path, name, kind, read):
@@ -176,14 +192,23 @@ def try_commands(folder_of_run, tmp_path, name, kind, read):
     assert (outside / "precious").read_text() == "precious"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def but_slow(*kinds):
+    """Return the types of files; tests of some are slow."""
+    return [
+        pytest.param(kind, marks=pytest.mark.slow) if kind in kinds else kind
+        for kind in KINDS
+    ]
+
+
+@pytest.mark.parametrize("kind", but_slow(a_folder, empty))
 def test_faults_of_any_type_are_read_or_refused_by_every_command(
     folder_of_run, tmp_path, kind, read_by_every_command
 ):
     try_commands(folder_of_run, tmp_path, FAULTS, kind, read_by_every_command)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+# `test_files_travel.py` tests copies with another content
+@pytest.mark.parametrize("kind", but_slow(empty))
 def test_copies_of_files_are_read_or_refused_if_the_original_is_missing(
     folder_of_run, tmp_path, kind, read_by_every_command
 ):
@@ -231,7 +256,13 @@ def folder_copy(folder_of_run, tmp_path):
     subprocess.run(["rm", "-rf", folder], check=True)
 
 
-@pytest.mark.parametrize("part", ["vectors", "report", "cases", "journal", ".scratch"])
+@pytest.mark.parametrize(
+    "part",
+    [
+        "vectors", "journal", ".scratch",
+        *(pytest.param(part, marks=pytest.mark.slow) for part in ("report", "cases")),
+    ],
+)  # fmt: skip
 def test_folders_nested_without_end_are_refused_in_one_line(folder_copy, part, capsys):
     folder = folder_copy
     (folder / part).mkdir(exist_ok=True)

@@ -82,7 +82,10 @@ def stored(finished, tmp_path):
     return {(r.solver, r.params["depth"], r.repeat): r for r in records}
 
 
-@pytest.mark.parametrize("solver", ["exact", "liar", "picky", "dies", "half"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param("exact", marks=pytest.mark.slow), "liar", "picky", "dies", "half"],
+)
 def test_the_same_solver_on_the_same_case_gets_the_same_verdict(cli, stored, solver):
     then = stored[solver, 2, 0]
     code, out, _ = cli("replay", "done", then.run_id, "--json")
@@ -182,7 +185,9 @@ sequence = "depth"
 """
 
 
-@pytest.mark.parametrize("solver", ["exact (A/A)", "liar"])
+@pytest.mark.parametrize(
+    "solver", ["exact (A/A)", pytest.param("liar", marks=pytest.mark.slow)]
+)
 def test_a_step_of_a_sequence_is_repeated_after_the_earlier_steps(
     cli, tmp_path, solver
 ):

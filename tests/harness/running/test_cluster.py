@@ -31,16 +31,21 @@ if find_spec("distributed") is None:
 
 PLUGIN = load_plugin(TOY_PROBLEM)
 SOLVERS = 4  #: number of measurements per block
+CASES = 3  #: default number of cases
 SUITE = """
 name = "toy_problem"
-repeats = {repeats}
+repeats = 1
 time_limit = 30
 solvers = ["exact", "slow", "picky", "dies"]
 [[problems]]
 family = "well"
-params = {{ depth = [1, 2, 3, 4, 5, 6], n = 3 }}
+params = {{ depth = {depths}, n = 3 }}
 forms = ["dual"]
 """
+
+
+def suite_of(cases):
+    return SUITE.format(depths=[*range(1, cases + 1)])
 
 
 class Cluster:
@@ -107,7 +112,7 @@ def cli(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     monkeypatch.setenv("STARTS", str(tmp_path / "starts"))
-    (tmp_path / "toy.toml").write_text(SUITE.format(repeats=1))
+    (tmp_path / "toy.toml").write_text(suite_of(CASES))
     nothing = {"reference": None}
     registries = Registries(
         families=PLUGIN.problems,
@@ -227,8 +232,8 @@ def test_results_of_a_lost_worker_are_kept_and_the_rest_is_a_new_block(
     (number,) = cut
 
     assert code == 0, err
-    assert len(measured("d")) == 6 * SOLVERS
-    assert len(blocks) == 6 + 1
+    assert len(measured("d")) == CASES * SOLVERS
+    assert len(blocks) == CASES + 1
     (rest,) = [
         n for n, block in blocks.items() if n != number
         and block[0].case == blocks[number][0].case
@@ -410,7 +415,7 @@ def test_a_worker_with_one_cpu_serves_a_run_beside_an_orphaned_worker(
     try:
         code, _, err = cli("run", "toy.toml", "--out", "e", "--dask", cluster.address)
         assert code == 0, err
-        assert len(measured("e")) == 6 * SOLVERS
+        assert len(measured("e")) == CASES * SOLVERS
     finally:
         run.kill()
         run.wait()
@@ -432,9 +437,7 @@ except mb.InputError as e:
 
 def test_a_script_without_a_main_guard_is_refused_in_one_line(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
-    text = (
-        SUITE.format(repeats=1).replace("well", "string").replace('"dual"', '"primal"')
-    )
+    text = suite_of(CASES).replace("well", "string").replace('"dual"', '"primal"')
     (tmp_path / "string.toml").write_text(
         re.sub(
             "params.*",
@@ -457,6 +460,7 @@ def test_a_script_without_a_main_guard_is_refused_in_one_line(tmp_path):
 def test_a_block_that_kills_every_worker_is_abandoned_and_others_are_measured(
     cli, tmp_path
 ):
+    (tmp_path / "toy.toml").write_text(suite_of(6))
     code, out, err = cli(
         "run", "toy.toml", "--out", "d", "--dask", "local",
         "--solver", "exact", "--solver", "murders",

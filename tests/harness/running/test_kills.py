@@ -190,8 +190,16 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     assert not list(out.rglob("*.tmp"))
 
 
-def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path):
-    check(tmp_path, [kill_one, ask_to_end, fill_by_limit], seed=161803, repeats=1)
+@pytest.mark.parametrize(
+    "events",
+    [
+        [kill_one, kill_one],  # kills a worker, later the run
+        pytest.param([kill_one, ask_to_end, fill_by_limit], marks=pytest.mark.slow),
+    ],
+    ids=["few", "all"],
+)
+def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path, events):
+    check(tmp_path, [*events], seed=161803, repeats=1)
 
 
 @pytest.mark.slow

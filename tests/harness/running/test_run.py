@@ -158,14 +158,14 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: solvers that exhaust the time limit; only the slow test includes them
-WAITED_FOR = {"printsendlessly"}
+#: solvers that exhaust a limit for seconds; only the slow test includes them
+EXHAUSTING = {"printsendlessly", "forksahoarder"}
 
 
 @pytest.mark.parametrize(
     "solvers",
     [
-        OUTCOMES.keys() - WAITED_FOR,
+        OUTCOMES.keys() - EXHAUSTING,
         pytest.param(OUTCOMES.keys(), marks=pytest.mark.slow),
     ],
     ids=["few", "all"],
@@ -457,7 +457,7 @@ def test_run_ids_are_distinct_for_distinct_cells_and_equal_for_equal_ones(
     assert other.run_id not in first  # different options, same label
 
 
-@pytest.mark.parametrize("cut", [1, 50, 3000])
+@pytest.mark.parametrize("cut", [1, pytest.param(50, marks=pytest.mark.slow), 3000])
 def test_an_interrupted_run_continues_with_each_measurement_exactly_once(
     measure, tmp_path, cut
 ):
@@ -500,7 +500,9 @@ def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [
-        ("build", "ZeroDivisionError: no stiffness"),
+        pytest.param(
+            "build", "ZeroDivisionError: no stiffness", marks=pytest.mark.slow
+        ),
         ("input", "tiny: fault=input is out of range"),
         ("memory", "it needs more memory than is available"),
         ("exit", "SystemExit: 3"),
@@ -688,7 +690,13 @@ def once_each(folder, count):
     return records
 
 
-@pytest.mark.parametrize("lost", ["journal", "vectors", "cases", ".scratch", ".lock"])
+@pytest.mark.parametrize(
+    "lost",
+    [
+        "journal", "cases", ".lock",
+        *(pytest.param(p, marks=pytest.mark.slow) for p in ("vectors", ".scratch")),
+    ],
+)  # fmt: skip
 def test_files_deleted_during_a_run_lose_no_measurement(measure, tmp_path, lost):
     def delete():
         path = tmp_path / lost

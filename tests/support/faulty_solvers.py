@@ -1,0 +1,184 @@
+"""Solvers with planted faults, for which checks of conformance fail or warn."""
+
+import os
+import signal
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mortarbench.harness import Solution, Status
+from mortarbench.solvers import SOLVERS as SOUND_SOLVERS
+
+
+@dataclass(frozen=True)
+class Sound:
+    """PIQP under another name; base class of the faulty solvers."""
+
+    spoilt: str = ""
+
+    def declines(self, qp):
+        return SOUND_SOLVERS["piqp"].declines(qp)
+
+    def prepare(self, qp, tol):
+        return lambda: self.act(qp, tol)
+
+    def act(self, qp, tol):
+        return self.honest(qp, tol)
+
+    def honest(self, qp, tol):
+        return SOUND_SOLVERS["piqp"].prepare(qp, tol)()
+
+
+class StopsEarly(Sound):
+    def act(self, qp, tol):
+        return self.honest(qp, 0.1)
+
+
+class FlipsSigns(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, y=-s.y)
+
+
+class HoldsAbsentBounds(Sound):
+    by = 1e-13
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, z_box=s.z_box - self.by)
+
+
+class LeavesRoundOff(HoldsAbsentBounds):
+    by = 3.5e-18
+
+
+class Remembers(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        first = not MEMORY
+        MEMORY.append(s)
+        return s if first else replace(s, iterations=1)
+
+
+MEMORY = []
+
+
+class Wanders(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, x=s.x + 1e-9 * np.random.default_rng().standard_normal())
+
+
+class Scales(Sound):
+    """Solver that scales read-only data in place but returns correct answers."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        qp.q.flags.writeable = True
+        qp.q[:] *= 2
+        return s
+
+
+class TakesAnything(Sound):
+    def __init__(self, **options):
+        pass
+
+
+class AlwaysSolved(Sound):
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, status=Status.SOLVED, x=np.nan_to_num(s.x))
+
+
+class Silent(Sound):
+    def act(self, qp, tol):
+        return replace(self.honest(qp, tol), message="")
+
+
+class TakesOperatorsForZero(Sound):
+    def declines(self, qp):
+        return None
+
+    def act(self, qp, tol):
+        if qp.is_explicit:
+            return self.honest(qp, tol)
+        zero = np.zeros(qp.q.size)
+        return Solution(
+            status=Status.SOLVED, x=np.clip(zero, qp.lb, qp.ub), y=qp.b, z=qp.h,
+            z_box=zero,
+        )  # fmt: skip
+
+
+class StopsAtTheStart(Sound):
+    """Solver that claims that its first point is optimal, like HiGHS 1.15.1 without
+    rows.
+    """
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, x=qp.lb) if qp.q.size == 400 else s
+
+
+class Slow(Sound):
+    def act(self, qp, tol):
+        time.sleep(0.1)
+        return self.honest(qp, tol)
+
+
+class MindsUnits(Sound):
+    """Solver that fails for large numbers, as with an absolute tolerance."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return s if abs(qp.q).max() < 1e6 else replace(s, x=1.01 * s.x)
+
+
+class SlowInNewtons(Sound):
+    """Solver that takes 49 times the iterations for large unknowns, like OSQP."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        factor = 49 if abs(s.x).max() > 1e5 else 1
+        return replace(s, iterations=7 * factor)
+
+
+class MindsTheOrder(Sound):
+    """Solver that fails if the first unknown has the lower bound zero."""
+
+    def act(self, qp, tol):
+        s = self.honest(qp, tol)
+        return replace(s, status=Status.FAILED) if qp.lb[0] == 0 else s
+
+
+class RepeatsTheFirst(Sound):
+    def chain(self, tol):
+        prepare = SOUND_SOLVERS["piqp"].chain(tol)
+        first = []
+
+        def next_one(qp):
+            first.append(prepare(qp))
+            return first[0]
+
+        return next_one
+
+
+class DeclinesAll(Sound):
+    def declines(self, qp):
+        return "never on a Monday"
+
+
+class SaysFalse(Sound):
+    def declines(self, qp):
+        return False
+
+
+class Dies(Sound):
+    def act(self, qp, tol):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+SOLVERS = {
+    "sound": Sound(), "dies": Dies(), "declines": DeclinesAll(), "minds": MindsUnits(),
+    "slow": SlowInNewtons(), "false": SaysFalse(),
+}  # fmt: skip
