@@ -76,9 +76,9 @@ def accepts_rows(name, shape, declined, count):
 
 
 @pytest.mark.parametrize(("name", "shape"), PAIRS)
-def test_planted_solutions_over_sets_are_found(name, shape):
-    wrong, declined = faults(name, shape, range(3))
-    accepts_rows(name, shape, declined, 3)
+def test_a_planted_solution_over_sets_is_found(name, shape):
+    wrong, declined = faults(name, shape, range(1))
+    accepts_rows(name, shape, declined, 1)
     assert not wrong
 
 

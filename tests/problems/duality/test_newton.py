@@ -19,6 +19,8 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers.reference.solve import reference_solution
 
+pytestmark = pytest.mark.together
+
 
 def ring_path(steps=2, contact_stiffness="geometric", contact="nts", size=2):
     return beam_ring._newton_path(

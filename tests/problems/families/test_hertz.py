@@ -202,7 +202,7 @@ def sheared_result(form="dual", **keys):
 @pytest.mark.parametrize(
     ("Q", "contact"),
     [
-        (0.5, "nts"),
+        pytest.param(0.5, "nts", marks=pytest.mark.slow),
         (0.9, "mortar"),
         pytest.param(0.25, "mortar", marks=pytest.mark.slow),
         pytest.param(0.75, "mortar", marks=pytest.mark.slow),

@@ -66,8 +66,12 @@ def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, key
     assert values["energy"] == pytest.approx(-(PRESSURE**2) / E, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["tetra", "hexahedron"])
-@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize(
+    ("kind", "contact"),
+    [("tetra", "nts"), ("hexahedron", "mortar"),
+     pytest.param("tetra", "mortar", marks=pytest.mark.slow),
+     pytest.param("hexahedron", "nts", marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
     text = f"bodies:{solid_blocks(tmp_path, KINDS[kind], HELD)}/contact={contact}"
     answers = []

@@ -28,8 +28,14 @@ def facets(named, name):
             for facet in named.curves[name].tolist()}  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        pytest.param(name, kind, marks=[pytest.mark.slow] * (i != j))
+        for i, name in enumerate(WRITERS)
+        for j, kind in enumerate(KINDS)
+    ],
+)
 def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
     path = solid_blocks(tmp_path, KINDS[kind])
     expected = read_msh(tmp_path / "blocks.msh")
