@@ -154,7 +154,7 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
 @pytest.fixture(scope="module")
 def equilibrium():
     """Return a path, its last configuration and the multipliers (places,) there."""
-    path = patch_path(contact="nts")
+    path = patch_path(contact="nts", lower=2, upper=3)
     last = path.iterations(1)[-1]
     lam = path._at_places(last)
     at = path._configuration(last.answer.x, last.load_factor, last.gaps)

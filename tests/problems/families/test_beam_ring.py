@@ -228,12 +228,13 @@ CONVERGED = [
     ("nts 30 stress", (-0.04056, -0.31721, 0.01912, -0.04397), (3.3344, 18.0222), 26),
     ("nts 40 stress", (-0.04057, -0.31729, 0.01913, -0.04398), (3.3386, 18.0208), 35),
 ]  # fmt: skip
+QUICK = ("nts 10", "mortar 30", "nts 30 stress")
 
 
 @pytest.mark.parametrize(
     ("problem", "u", "force", "active"),
     [
-        pytest.param(*row, marks=pytest.mark.slow if " 40" in row[0] else ())
+        pytest.param(*row, marks=[pytest.mark.slow] * (row[0] not in QUICK))
         for row in CONVERGED
     ],
 )

@@ -56,7 +56,9 @@ def quantities(name, form="dual", **keys):
         (0.6, 1.2144261693, -0.7146352056, -0.5884550446),
     ],
 )
-@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize(
+    "slave", [pytest.param("lower", marks=pytest.mark.slow), "upper"]
+)
 def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave):
     """Neo-Hookean blocks between frictionless plates have the digits of an independent
     code."""

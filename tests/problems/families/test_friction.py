@@ -46,10 +46,8 @@ DIGITS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("mu", "tip", "force", "stick"),
-    [pytest.param(*row, marks=[pytest.mark.slow] * (row[0] < 0.6)) for row in DIGITS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("mu", "tip", "force", "stick"), DIGITS)
 def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force, stick):
     _, _, values = solved(
         f"beam-ring/steps=1/relin=8/friction=coulomb/mu={mu}/dual-bounds"

@@ -348,7 +348,7 @@ def sheared_blocks(described):
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
-@pytest.mark.parametrize("step", [1, 2, 3])
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 2, 3])
 def test_a_block_held_by_friction_is_loaded_in_steps(
     sheared_blocks, contact, form, step
 ):

@@ -135,6 +135,7 @@ def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
     assert (theory[2].R, theory[2].E_star) == pytest.approx((6e-3, 200e9 / 0.91 / 3))
 
 
+@pytest.mark.slow
 def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segment():
     """As in the patch test, the meshes do not match."""
     errors = {

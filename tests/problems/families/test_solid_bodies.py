@@ -47,8 +47,14 @@ def build(text):
     return parse(text, PROBLEMS).build(reference_solution)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("keys", ["primal", "dual", "basis=standard/dual"])
+@pytest.mark.parametrize(
+    ("keys", "kind"),
+    [
+        pytest.param(keys, kind, marks=[pytest.mark.slow] * (i != j))
+        for i, keys in enumerate(["primal", "dual", "basis=standard/dual"])
+        for j, kind in enumerate(KINDS)
+    ],
+)
 def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
     """On interfaces that do not match, the displacement is p/E (ν x, ν y, −z) in both
     blocks."""

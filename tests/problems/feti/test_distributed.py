@@ -183,7 +183,7 @@ PRECONDITIONERS = [
 ]
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 8])
+@pytest.mark.parametrize("size", [1, 2, 3, pytest.param(8, marks=pytest.mark.slow)])
 def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
     F, qp = dual_of(torn)
     x = np.random.default_rng(4).standard_normal(qp.q.size)
