@@ -276,9 +276,8 @@ def test_the_load_steps_of_the_paper_are_of_first_order():
     assert abs(tip(steps=1, relin=2) - exact) > errors[1]
 
 
-@pytest.mark.parametrize(
-    "basis", ["dual", pytest.param("standard", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("basis", ["dual", "standard"])
 def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
     def force(contact, Nr):
         keys = dict(steps=1, relin=10, contact=contact, basis=basis)

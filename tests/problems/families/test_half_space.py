@@ -261,7 +261,9 @@ def prototype(n, nu, Q):
     return F, shift, mu * h * h * pressure, mu * load
 
 
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+@pytest.mark.parametrize(
+    "nu", [0.3, *(pytest.param(nu, marks=pytest.mark.slow) for nu in (0.0, 0.45))]
+)
 def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
     """Forces are in units of μP, and displacements in units of μP/(πGa)."""
     F, shift, bound, limit = prototype(12, nu, 0.7)

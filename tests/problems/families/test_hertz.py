@@ -285,7 +285,14 @@ def test_the_tangential_force_rotates_no_body():
     assert abs(reference_solution(case.qp).x[:3]).max() < 1e-3  # turned contact normals
 
 
-@pytest.mark.parametrize("keys", [dict(), dict(contact="nts"), dict(slave="lower")])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        dict(),
+        dict(contact="nts"),
+        pytest.param(dict(slave="lower"), marks=pytest.mark.slow),
+    ],
+)
 def test_slip_starts_from_the_symmetric_position_of_the_cylinders(keys):
     """Without friction, the cylinders could roll on each other under P."""
     keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)

@@ -86,7 +86,9 @@ OF_MOOSE, OF_TWO = (0.1, 15000 / np.pi / 0.01, 0.01), (0.648715, 11.345743, 0.10
         pytest.param("n=8/against=sphere", OF_TWO, 0.01, marks=pytest.mark.slow),
         pytest.param(f"n=8/{MOOSE}", OF_MOOSE, 0.01, marks=pytest.mark.slow),
         ("n=3/against=sphere", OF_TWO, 0.03),
-        (f"n=4/{MOOSE}/basis=standard", OF_MOOSE, 0.03),
+        pytest.param(
+            f"n=4/{MOOSE}/basis=standard", OF_MOOSE, 0.03, marks=pytest.mark.slow
+        ),
         (f"n=3/{MOOSE}/contact=nts", OF_MOOSE, 0.03),
     ],
 )
@@ -139,7 +141,7 @@ def test_formulae_have_the_digits_of_two_larger_spheres():
         ("n=2/dual", "clarabel"),
         ("n=2/feti=4/dual", "smalbe"),
         ("n=1/against=sphere/primal", "piqp"),
-        ("n=2/against=sphere/feti=4/dual", "smalbe"),
+        ("n=1/against=sphere/feti=4/dual", "smalbe"),
     ],
 )
 def test_every_form_has_the_same_contact(keys, solver):

@@ -95,7 +95,10 @@ def press(tmp_path, monkeypatch):
     return "bodies:press.toml"
 
 
-@pytest.mark.parametrize("glue", GLUES)
+@pytest.mark.parametrize(
+    "glue",
+    [*(pytest.param(glue, marks=pytest.mark.slow) for glue in GLUES[:2]), GLUES[2]],
+)
 def test_bodies_of_any_mesh_can_be_decomposed(press, glue):
     check(press, "parts=8", glue)
 

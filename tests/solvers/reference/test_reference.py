@@ -221,7 +221,11 @@ def rounding(qp, s):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "params", "forms", "rel"), CASES)
+@pytest.mark.parametrize(
+    ("name", "params", "forms", "rel"),
+    [pytest.param(*case, marks=[pytest.mark.slow] * (i in (2, 5)))
+     for i, case in enumerate(CASES)],
+)  # fmt: skip
 def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel):
     """The energies agree up to the rounding errors of K and of F = BK⁺Bᵀ, which are
     largest for slender bodies and for stiff bodies on soft ones.
