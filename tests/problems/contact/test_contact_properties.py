@@ -11,7 +11,20 @@ from mortarbench.problems.contact.node_to_segment import closest_points, node_to
 from mortarbench.problems.contact.segment_search import Reach
 from mortarbench.problems.contact.surface import surface
 
-quick = settings(derandomize=True, max_examples=40, deadline=None)
+
+def searched(**drawn):
+    """Return a decorator of a test of drawn examples: by default 10, and 40 if slow."""
+
+    def decorate(check):
+        def test(examples):
+            some = settings(derandomize=True, max_examples=examples, deadline=None)
+            some(given(**drawn)(check))()
+
+        test.__name__, test.__doc__ = check.__name__, check.__doc__
+        counts = [10, pytest.param(40, marks=pytest.mark.slow)]
+        return pytest.mark.parametrize("examples", counts)(test)
+
+    return decorate
 
 
 def numbers(shape, low, high):
@@ -40,8 +53,7 @@ METHODS = {
 }
 
 
-@quick
-@given(side=sides())
+@searched(side=sides())
 def test_rows_are_invariant_under_translations(side):
     for name, method in METHODS.items():
         B, c, *_ = method(*side)
@@ -53,8 +65,7 @@ def test_rows_are_invariant_under_translations(side):
         assert (abs(forces.sum(axis=1) / size) <= 1e-14).all(), name
 
 
-@quick
-@given(side=sides())
+@searched(side=sides())
 def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     points, u, slave, master = side
     B, *_ = node_to_segment(*side)
@@ -67,8 +78,7 @@ def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     assert moment[inside] == pytest.approx(0, abs=1e-14)
 
 
-@quick
-@given(side=sides())
+@searched(side=sides())
 def test_forces_of_a_mortar_row_have_no_moment(side):
     points, u, slave, master = side
     x = points + u.reshape(-1, 2)
@@ -90,8 +100,7 @@ def test_forces_of_a_mortar_row_have_no_moment(side):
         assert (np.abs(moments.sum(axis=(1, 2))) <= 1e-14 * terms).all(), basis
 
 
-@quick
-@given(side=sides(), seed=st.integers(10, 10**6))
+@searched(side=sides(), seed=st.integers(10, 10**6))
 def test_the_dual_hessian_is_symmetric_positive_semidefinite(side, seed):
     points = side[0]
     root = np.random.default_rng(seed).standard_normal((points.size, points.size))
@@ -106,8 +115,7 @@ def test_the_dual_hessian_is_symmetric_positive_semidefinite(side, seed):
             assert np.linalg.eigvalsh(F).min() > -1e-12 * scale, name
 
 
-@quick
-@given(side=sides(), seed=st.integers(10, 10**6))
+@searched(side=sides(), seed=st.integers(10, 10**6))
 def test_numbering_of_the_nodes_does_not_matter(side, seed):
     points, u, slave, master = side
     number = np.random.default_rng(seed).permutation(len(points))
@@ -123,8 +131,7 @@ def test_numbering_of_the_nodes_does_not_matter(side, seed):
         assert (abs(B_renamed.toarray()[:, columns] - B.toarray()) <= 1e-14).all(), name
 
 
-@quick
-@given(side=sides(), seed=st.integers(10, 10**6))
+@searched(side=sides(), seed=st.integers(10, 10**6))
 def test_the_order_of_the_slave_nodes_only_orders_the_rows(side, seed):
     points, u, slave, master = side
     order = np.random.default_rng(seed).permutation(len(slave))
@@ -135,8 +142,7 @@ def test_the_order_of_the_slave_nodes_only_orders_the_rows(side, seed):
     assert (c_o == c[order]).all()
 
 
-@quick
-@given(side=sides())
+@searched(side=sides())
 def test_the_gap_is_the_slack_of_the_row_at_the_linearisation_point(side):
     """Where the closest point is inside a segment, |c − B u| is the distance to the
     master."""

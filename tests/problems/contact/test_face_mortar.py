@@ -233,8 +233,8 @@ def test_only_covered_nodes_have_rows_and_half_covered_faces_pass_the_patch_test
 
 def test_the_overlaps_cover_the_common_part_exactly_once():
     points, slave, master = stacked(
-        grid((40, 40), 0.0, kind="quad", up=True, distort=0.2),
-        grid((37, 43), 0.0, kind="triangle", up=False, distort=0.2),
+        grid((20, 20), 0.0, kind="quad", up=True, distort=0.2),
+        grid((17, 23), 0.0, kind="triangle", up=False, distort=0.2),
     )
     parts = [
         triangulated(current_surface(points, np.zeros(points.size), f, "side"))

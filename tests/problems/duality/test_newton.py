@@ -19,6 +19,8 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers.reference.solve import reference_solution
 
+pytestmark = pytest.mark.together
+
 
 def ring_path(steps=2, contact_stiffness="geometric", contact="nts", size=2):
     return beam_ring._newton_path(
@@ -152,7 +154,7 @@ def test_a_tangent_that_is_not_definite_is_clipped_and_counted():
 @pytest.fixture(scope="module")
 def equilibrium():
     """Return a path, its last configuration and the multipliers (places,) there."""
-    path = patch_path(contact="nts")
+    path = patch_path(contact="nts", lower=2, upper=3)
     last = path.iterations(1)[-1]
     lam = path._at_places(last)
     at = path._configuration(last.answer.x, last.load_factor, last.gaps)

@@ -47,7 +47,9 @@ def emitted(name):
     return case, mb.solve(case, "smalbe" if "dual" in name else "clarabel", tol=1e-9)
 
 
-@pytest.mark.parametrize(("load", "ny"), [(1, 8), (10, 4)])
+@pytest.mark.parametrize(
+    ("load", "ny"), [pytest.param(1, 8, marks=pytest.mark.slow), (10, 4)]
+)
 def test_the_tip_of_a_slender_beam_agrees_with_the_elastica(load, ny):
     case, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
 
@@ -137,7 +139,9 @@ def test_all_forms_define_the_same_iteration():
         mb.build("cantilever/slenderness=4/ny=2/load=2/newton=99/primal")
 
 
-@pytest.mark.parametrize("newton", [1, 3, 0])
+@pytest.mark.parametrize(
+    "newton", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 3))]
+)
 def test_iterations_are_verified_by_smalbe_and_three_generic_solvers(newton):
     name = f"cantilever/slenderness=4/ny=2/load=2/newton={newton}"
     cases = {form: mb.build(f"{name}/{form}") for form in ("primal", "dual")}

@@ -56,7 +56,9 @@ def quantities(name, form="dual", **keys):
         (0.6, 1.2144261693, -0.7146352056, -0.5884550446),
     ],
 )
-@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize(
+    "slave", [pytest.param("lower", marks=pytest.mark.slow), "upper"]
+)
 def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave):
     """Neo-Hookean blocks between frictionless plates have the digits of an independent
     code."""
@@ -71,7 +73,7 @@ def test_pressed_blocks_are_homogeneous(stretch, lateral, nominal, cauchy, slave
         assert got["strain_energy"] / 10e6 == pytest.approx(0.0250180138, abs=2e-10)
 
 
-@pytest.mark.parametrize("stretch", [0.9, 0.65])
+@pytest.mark.parametrize("stretch", [pytest.param(0.9, marks=pytest.mark.slow), 0.65])
 def test_pressed_blocks_of_st_venant_kirchhoff_are_homogeneous(stretch):
     """The exact state is λ₁² = 1 + ν/(1 − ν)(1 − λ₂²), P₂₂ = λ₂E/(1 − ν²)·½(λ₂² −
     1)."""

@@ -186,13 +186,17 @@ def read_mesh_of_quads(tmp_path, *contents):
 
 
 @pytest.mark.parametrize(
-    "keys",
+    ("keys", "form"),
     [
-        "", "/step=1", "/contact=mortar", "/relin=2/plane=stress", "/kinematics=finite",
-        "/kinematics=finite/material=svk/contact_stiffness=geometric/newton=2/step=1",
+        pytest.param(keys, form, marks=[pytest.mark.slow] * (i % 2 == j))
+        for i, keys in enumerate([
+            "", "/step=1", "/contact=mortar", "/relin=2/plane=stress",
+            "/kinematics=finite",
+            "/kinematics=finite/material=svk/contact_stiffness=geometric/newton=2/step=1",
+        ])
+        for j, form in enumerate(["primal", "dual-bounds"])
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("form", ["primal", "dual-bounds"])
 def test_the_user_s_qp_is_that_of_the_benchmark(described, keys, form):
     if "mortar" in keys and "basis" not in PROBLEMS["beam-ring"].defaults:
         pytest.skip("beam-ring has no mortar here")
@@ -348,7 +352,7 @@ def sheared_blocks(described):
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 @pytest.mark.parametrize("form", ["primal", "dual"])
-@pytest.mark.parametrize("step", [1, 2, 3])
+@pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 2, 3])
 def test_a_block_held_by_friction_is_loaded_in_steps(
     sheared_blocks, contact, form, step
 ):

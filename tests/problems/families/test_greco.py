@@ -126,7 +126,9 @@ def test_an_iterate_beyond_the_last_is_refused():
 @pytest.mark.parametrize(
     ("n", "depth"), [(4, 2), pytest.param(8, 2, marks=pytest.mark.slow)]
 )
-@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+@pytest.mark.parametrize(
+    "form", [pytest.param("primal", marks=pytest.mark.slow), "dual", "dual-bounds"]
+)
 def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
     points, states, u = [], [], []
     for keys in ({}, {"dim": 3, "depth": depth}):

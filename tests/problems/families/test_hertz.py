@@ -135,6 +135,7 @@ def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
     assert (theory[2].R, theory[2].E_star) == pytest.approx((6e-3, 200e9 / 0.91 / 3))
 
 
+@pytest.mark.slow
 def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segment():
     """As in the patch test, the meshes do not match."""
     errors = {
@@ -202,7 +203,7 @@ def sheared_result(form="dual", **keys):
 @pytest.mark.parametrize(
     ("Q", "contact"),
     [
-        (0.5, "nts"),
+        pytest.param(0.5, "nts", marks=pytest.mark.slow),
         (0.9, "mortar"),
         pytest.param(0.25, "mortar", marks=pytest.mark.slow),
         pytest.param(0.75, "mortar", marks=pytest.mark.slow),
@@ -284,7 +285,14 @@ def test_the_tangential_force_rotates_no_body():
     assert abs(reference_solution(case.qp).x[:3]).max() < 1e-3  # turned contact normals
 
 
-@pytest.mark.parametrize("keys", [dict(), dict(contact="nts"), dict(slave="lower")])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        dict(),
+        dict(contact="nts"),
+        pytest.param(dict(slave="lower"), marks=pytest.mark.slow),
+    ],
+)
 def test_slip_starts_from_the_symmetric_position_of_the_cylinders(keys):
     """Without friction, the cylinders could roll on each other under P."""
     keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)

@@ -132,7 +132,7 @@ def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
     assert message in str(e.value)
 
 
-@pytest.mark.parametrize("distort", [0.0, 0.2])
+@pytest.mark.parametrize("distort", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 @pytest.mark.parametrize("slave", ["lower", "upper"])
 @pytest.mark.parametrize("basis", ["dual", "standard"])
 def test_face_mortar_reproduces_a_uniform_pressure(basis, slave, distort):

@@ -1,5 +1,6 @@
 """The plate in subdomains: published condition numbers, and agreement of the forms."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from mortarbench.problems.families.plate import Plate
 from mortarbench.problems.models.plate import dual_quantities, model
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.reference.solve import reference_solution
+
+pytestmark = pytest.mark.together
 
 FAMILY = Plate()
 #: test of MSolve (Papagiannakis 2011); E of the left column is 1/1000 of E elsewhere
@@ -28,6 +31,8 @@ PUBLISHED = [
     ({**CUBES, "n": 2}, 348, (15.7460, 21.79912, 2.0329, 1.9021)),
     ({**CUBES, "n": 4}, 1056, (27.3018, 65.02473, 3.7288, 3.0151)),
 ]
+#: one problem in the plane and one in space
+QUICK = [PUBLISHED[0], PUBLISHED[4]]
 
 
 def built(name: str) -> Case:
@@ -36,11 +41,16 @@ def built(name: str) -> Case:
     return FAMILY.build("dual", FAMILY.complete(typed), reference_solution)
 
 
+@cache
 def reported(**keys: Any) -> dict[str, Any]:
     return dual_quantities(model(tuple(FAMILY.complete(keys).items())))
 
 
-@pytest.mark.parametrize(("keys", "multipliers", "numbers"), PUBLISHED)
+@pytest.mark.parametrize(
+    ("keys", "multipliers", "numbers"),
+    [pytest.param(*row, marks=[pytest.mark.slow] * (row not in QUICK))
+     for row in PUBLISHED],
+)  # fmt: skip
 def test_condition_numbers_are_those_of_a_prototype(keys, multipliers, numbers):
     values = reported(**keys)
     names = ("kappa", "norm_PFP", "kappa_lumped", "kappa_dirichlet")
@@ -58,7 +68,7 @@ def test_condition_numbers_are_those_of_a_prototype(keys, multipliers, numbers):
         (10.0, "kappa", 86.2039),
         (10.0, "kappa_dirichlet", 9.1477),
         (10.0, "kappa_dirichlet_stiffness", 3.5126),
-        (1e4, "kappa_dirichlet_stiffness", 2350.7),
+        pytest.param(1e4, "kappa_dirichlet_stiffness", 2350.7, marks=pytest.mark.slow),
     ],
 )
 def test_condition_numbers_with_jumps_are_those_of_a_prototype(jump, name, value):

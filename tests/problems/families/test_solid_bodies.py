@@ -47,8 +47,14 @@ def build(text):
     return parse(text, PROBLEMS).build(reference_solution)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("keys", ["primal", "dual", "basis=standard/dual"])
+@pytest.mark.parametrize(
+    ("keys", "kind"),
+    [
+        pytest.param(keys, kind, marks=[pytest.mark.slow] * (i != j))
+        for i, keys in enumerate(["primal", "dual", "basis=standard/dual"])
+        for j, kind in enumerate(KINDS)
+    ],
+)
 def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
     """On interfaces that do not match, the displacement is p/E (ν x, ν y, −z) in both
     blocks."""
@@ -66,8 +72,12 @@ def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, key
     assert values["energy"] == pytest.approx(-(PRESSURE**2) / E, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", ["tetra", "hexahedron"])
-@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize(
+    ("kind", "contact"),
+    [("tetra", "nts"), ("hexahedron", "mortar"),
+     pytest.param("tetra", "mortar", marks=pytest.mark.slow),
+     pytest.param("hexahedron", "nts", marks=pytest.mark.slow)],
+)  # fmt: skip
 def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
     text = f"bodies:{solid_blocks(tmp_path, KINDS[kind], HELD)}/contact={contact}"
     answers = []

@@ -65,8 +65,14 @@ def check(name, cut, glue):
     assert bound <= 1e-5
 
 
-@pytest.mark.parametrize("glue", GLUES)
-@pytest.mark.parametrize(("name", "cut"), CASES)
+@pytest.mark.parametrize(
+    ("name", "cut", "glue"),
+    [
+        pytest.param(*case, glue, marks=[pytest.mark.slow] * (i % 3 != j))
+        for i, case in enumerate(CASES)
+        for j, glue in enumerate(GLUES)
+    ],
+)
 def test_the_displacement_is_that_of_the_undecomposed_bodies(name, cut, glue):
     check(name, cut, glue)
 
@@ -89,7 +95,10 @@ def press(tmp_path, monkeypatch):
     return "bodies:press.toml"
 
 
-@pytest.mark.parametrize("glue", GLUES)
+@pytest.mark.parametrize(
+    "glue",
+    [*(pytest.param(glue, marks=pytest.mark.slow) for glue in GLUES[:2]), GLUES[2]],
+)
 def test_bodies_of_any_mesh_can_be_decomposed(press, glue):
     check(press, "parts=8", glue)
 

@@ -95,7 +95,7 @@ both_elements = pytest.mark.parametrize("nu", [0.3, 0.47])
 
 
 @every_material
-@both_elements
+@pytest.mark.parametrize("nu", [pytest.param(0.3, marks=pytest.mark.slow), 0.47])
 def test_forces_and_tangent_are_the_derivatives_of_the_energy(name, nu):
     c = cells(name, nu)
     u, h = random_state(c.mesh), 1e-6

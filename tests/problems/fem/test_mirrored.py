@@ -134,7 +134,7 @@ def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
 
 
 @every_method
-@pytest.mark.parametrize("relin", [1, 2])
+@pytest.mark.parametrize("relin", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_the_mirrored_path_is_the_mirror_of_the_path(bodies, contact, basis, relin):
     there = mirrored(bodies, 1.0)
     here, other = (load_path(b, contact, basis, relin) for b in (bodies, there))
@@ -169,7 +169,11 @@ def measured(units=None):
 
 @every_method
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-@pytest.mark.parametrize("units", UNITS, ids=str)
+@pytest.mark.parametrize(
+    "units",
+    [pytest.param(u, marks=[pytest.mark.slow] * (u not in UNITS[1:3])) for u in UNITS],
+    ids=str,
+)
 def test_units_of_the_qp_change_no_physical_result(contact, basis, form, units):
     bodies, other = measured(), measured(units)
     (u, here), (v, there) = (results(b, contact, basis, form) for b in (bodies, other))

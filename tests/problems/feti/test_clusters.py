@@ -50,7 +50,11 @@ def solved(name, tol=1e-8, **options):
     return case, replace(SOLVERS["smalbe"], **options).prepare(case.qp, tol)()
 
 
-@pytest.mark.parametrize(("name", "kappa", "motions"), PUBLISHED)
+@pytest.mark.parametrize(
+    ("name", "kappa", "motions"),
+    [pytest.param(*row, marks=[pytest.mark.slow] * (row[0] != "plate/cluster=2"))
+     for row in PUBLISHED],
+)  # fmt: skip
 def test_condition_numbers_are_those_of_a_prototype(name, kappa, motions):
     values = plate.dual_quantities(plate.model(tuple(params(name).items())))
 
@@ -207,9 +211,12 @@ def test_the_displacement_does_not_depend_on_clusters(name, cut):
 @pytest.mark.parametrize(
     ("name", "side"),
     [
-        ("plate", 2), ("plate", 4), ("cube-wall/n=8/feti=2", 2),
-        ("beam-ring/Nr=8/Nh=4/steps=1/feti=4", 2), ("greco/n=16/feti=4", 2),
-        ("beam-ring/Nr=8/Nh=4/steps=1/feti=4", 4), ("greco/n=16/feti=4", 4),
+        ("plate", 2), ("plate", 4),
+        pytest.param("cube-wall/n=8/feti=2", 2, marks=pytest.mark.slow),
+        ("beam-ring/Nr=8/Nh=4/steps=1/feti=4", 2),
+        ("beam-ring/Nr=8/Nh=4/steps=1/feti=4", 4),
+        *(pytest.param("greco/n=16/feti=4", side, marks=pytest.mark.slow)
+          for side in (2, 4)),
     ],
 )  # fmt: skip
 def test_products_grow_at_most_like_the_root_of_the_side(name, side):

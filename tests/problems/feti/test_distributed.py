@@ -183,7 +183,9 @@ PRECONDITIONERS = [
 ]
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 8])
+@pytest.mark.parametrize(
+    "size", [1, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 8))]
+)
 def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
     F, qp = dual_of(torn)
     x = np.random.default_rng(4).standard_normal(qp.q.size)

@@ -188,7 +188,9 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
     assert P(x) == pytest.approx(dense @ np.linalg.lstsq(dense, x, rcond=None)[0])
 
 
-@pytest.mark.parametrize("floating", [True, False])
+@pytest.mark.parametrize(
+    "floating", [True, pytest.param(False, marks=pytest.mark.slow)]
+)
 def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
     """The space is ker G ∩ range B, or range B without a coarse problem."""
     without_lock(monkeypatch, DualOperator, "_blocks")

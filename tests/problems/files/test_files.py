@@ -532,7 +532,9 @@ SMALL = "beam-ring/Nr=2/Nh=1/steps=2"
 @pytest.mark.parametrize(
     ("suffix", "form"),
     [
-        pytest.param(s, f, marks=[pytest.mark.slow] * (s == "parquet" and f == "dual"))
+        pytest.param(
+            s, f, marks=[pytest.mark.slow] * (s == "parquet" and f != "primal")
+        )
         for s in ("npz", "mat", "parquet")
         for f in ("primal", "dual", "dual-bounds")
     ],

@@ -11,7 +11,11 @@ from mortarbench.solvers.baselines.pdas_amg import PDASAMG
 
 
 @pytest.mark.parametrize(
-    "case", ["cube-wall/n=4/primal", "beam-ring/Nr=4/Nh=3/steps=1/primal"]
+    "case",
+    [
+        "cube-wall/n=4/primal",
+        pytest.param("beam-ring/Nr=4/Nh=3/steps=1/primal", marks=pytest.mark.slow),
+    ],
 )
 def test_multigrid_and_factors_find_the_same_displacements(case):
     qp = mb.build(case).qp

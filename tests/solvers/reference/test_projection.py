@@ -8,9 +8,12 @@ from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.box_stack import box_stack
 
 
-@pytest.mark.parametrize("mu", [0.5, pytest.param(0.8, marks=pytest.mark.slow)])
-def test_a_problem_over_cones_with_p_of_half_rank_is_solved_to_rounding(mu):
-    M, H, f, mu_of = box_stack(3, mu, seed=0)
+@pytest.mark.parametrize(
+    ("boxes", "mu"),
+    [(2, 0.5), *(pytest.param(3, mu, marks=pytest.mark.slow) for mu in (0.5, 0.8))],
+)
+def test_a_problem_over_cones_with_p_of_half_rank_is_solved_to_rounding(boxes, mu):
+    M, H, f, mu_of = box_stack(boxes, mu, seed=0)
     W, q = H.T @ (H / M[:, None]), H.T @ (f / M)
     W, q = W / W.diagonal().max(), q / np.abs(q).max()
     index = np.arange(q.size).reshape(-1, 3)
@@ -23,7 +26,9 @@ def test_a_problem_over_cones_with_p_of_half_rank_is_solved_to_rounding(mu):
     assert np.linalg.norm(step) <= 1e-12 * np.linalg.norm(s.x)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in (2, 3, 4))]
+)
 def test_cones_with_curvatures_of_different_size_are_solved_to_rounding(seed):
     """Friction between stiff and soft bodies, with indeterminate forces."""
     rng = np.random.default_rng(seed)

@@ -22,6 +22,13 @@ from tests.support.textbook.projected import by_lanczos, projected_problem
 
 pytestmark = pytest.mark.together
 
+
+def seeds(few, all_):
+    """Return the seeds below `all_`; those from `few` on are slow."""
+    slow = pytest.mark.slow
+    return [*range(few), *(pytest.param(k, marks=slow) for k in range(few, all_))]
+
+
 PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 
 
@@ -63,7 +70,7 @@ def contact(request):
     return family.build(request.param, params, reference_solution).qp
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(5, 20))
 @pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
 def test_a_product_is_the_product_and_is_counted(seed, kind):
     qp = random_qp(seed, kind)
@@ -129,7 +136,7 @@ def prepared_problem(qp, steps):
     return compiled_problem(qp, partial(compiled_by_lanczos, steps=steps))
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", seeds(10, 40))
 def test_compiled_preparation_agrees_with_the_textbook(seed):
     qp = random_qp(seed)
     fast = prepared_problem(qp, 12)
@@ -153,12 +160,13 @@ def test_compiled_preparation_agrees_with_the_textbook(seed):
 
 @pytest.mark.parametrize("kind", ["random", "graded", "split", "equal", "huge", "tiny"])
 @pytest.mark.parametrize("k", [1, 2, 3, 5, 6, 12])
-def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(k, kind):
+@pytest.mark.parametrize("count", [5, pytest.param(50, marks=pytest.mark.slow)])
+def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(count, k, kind):
     """The matrices are graded over 16 orders of magnitude, decoupled by zeros, or near
     the limits of double precision.
     """
     rng = np.random.default_rng([k, len(kind)])
-    for _ in range(50):
+    for _ in range(count):
         d, e = rng.standard_normal(k), rng.standard_normal(max(k - 1, 0))
         if kind == "graded":
             d, e = d * 10 ** rng.uniform(-8, 8, k), e * 10 ** rng.uniform(-8, 8, k - 1)
@@ -183,7 +191,7 @@ def test_eigenpairs_of_zero_and_nan_matrices_terminate():
 
 @pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
 @pytest.mark.parametrize("name", PRESETS)
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(4, 12))
 def test_compiled_steps_agree_with_the_textbook(seed, name, kind):
     """The types of the first 25 steps agree; later steps of long runs differ by
     rounding.
@@ -191,7 +199,7 @@ def test_compiled_steps_agree_with_the_textbook(seed, name, kind):
     they_agree(random_qp(seed, kind), replace(SOLVERS[name], max_steps=25))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", seeds(4, 12))
 def test_a_penalty_below_the_tail_is_omitted_as_in_the_textbook(seed):
     """The first rows of the model are those of the penalty."""
     they_agree(random_qp(seed), replace(SOLVERS["smalbe"], max_steps=25, rho=1e-3))
@@ -199,7 +207,7 @@ def test_a_penalty_below_the_tail_is_omitted_as_in_the_textbook(seed):
 
 @pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
 @pytest.mark.parametrize("rows", ["sparse", "dense", "none"])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", seeds(2, 6))
 def test_steps_with_other_rows_and_preconditioners_agree_with_the_textbook(
     seed, rows, preconditioner, monkeypatch
 ):
@@ -310,7 +318,7 @@ def test_products_on_contact_agree_with_the_textbook(contact, name, monkeypatch)
     )
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", seeds(10, 30))
 def test_recovery_agrees_with_the_textbook(seed):
     qp, options = random_qp(seed), SOLVERS["smalbe"]
     problem = prepared_problem(qp, 12)
@@ -334,7 +342,11 @@ def test_recovery_agrees_with_the_textbook(seed):
     )
 
 
-@pytest.mark.parametrize("seeds", [range(k, k + 50) for k in (0, 50, 100, 150)])
+@pytest.mark.parametrize(
+    "seeds",
+    [range(10), *(pytest.param(range(k, k + 50), marks=pytest.mark.slow)
+                  for k in (0, 50, 100, 150))],
+)  # fmt: skip
 def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
     """The points are near a solution or far from it, with multipliers of
     either sign.

@@ -18,6 +18,12 @@ FACTORS = replace(SOLVERS["smalbe"], preconditioner="incomplete")
 KEEP = 0.95  #: share of dropped entries that goes to the diagonal
 
 
+def seeds(few, all_):
+    """Return the seeds below `all_`; those from `few` on are slow."""
+    slow = pytest.mark.slow
+    return [*range(few), *(pytest.param(k, marks=slow) for k in range(few, all_))]
+
+
 def factor(P, keep=True):
     one = np.ones(P.shape[0])
     return IncompleteFactor(csr_array(P), one, one, keep)
@@ -74,7 +80,7 @@ def test_on_a_tridiagonal_matrix_the_factor_is_the_one_of_cholesky(n):
 
 
 @pytest.mark.parametrize("kind", ["five-point", "nine-point", "line", "graph", "wide"])
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", seeds(2, 10))
 def test_the_factor_agrees_with_the_textbook(seed, kind):
     """Factors by diagonals and by columns, from one end or from both, agree with the
     textbook on every face.
@@ -144,7 +150,7 @@ def test_the_diagonal_is_shifted_if_pivots_fail():
     assert np.linalg.eigvalsh(M).min() > 0
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", seeds(4, 60))
 def test_the_inverse_is_positive_definite_on_every_face(seed):
     """This also holds for an indefinite matrix with a positive diagonal."""
     rng = np.random.default_rng([8, seed])
@@ -291,7 +297,7 @@ def test_in_a_random_order_a_factor_needs_a_wide_spread(case, pays):
 
 
 @pytest.mark.parametrize(
-    "seeds", [range(40), pytest.param(range(40, 1000), marks=pytest.mark.slow)], ids=str
+    "seeds", [range(10), pytest.param(range(10, 1000), marks=pytest.mark.slow)], ids=str
 )
 @pytest.mark.parametrize("tol", [1e-6, 1e-10])
 @pytest.mark.parametrize("solver", [SOLVERS["smalbe"], FACTORS], ids=["auto", "factor"])
@@ -308,7 +314,7 @@ def test_a_search_finds_no_sparse_qp_that_it_does_not_solve(seeds, tol, solver):
         assert qp.objective(s.x) <= low + 1e-3 * (abs(low) + x @ (qp.P @ x)), seed
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", seeds(5, 30))
 @pytest.mark.parametrize("expansion", ["model", "std", "mixed"])
 def test_every_step_is_feasible_and_decreases_the_cost(seed, expansion):
     qp, _ = qp_with_minimum(seed)
@@ -326,7 +332,7 @@ def test_every_step_is_feasible_and_decreases_the_cost(seed, expansion):
     assert (np.diff(np.r_[0 * size, cost]) <= 1e-9 * size)[1:].all()
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", seeds(4, 20))
 def test_the_unit_of_a_variable_changes_nothing(seed):
     """If bounds, cost and matrix are expressed in other units, the steps are the same
     up to rounding.

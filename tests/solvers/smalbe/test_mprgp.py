@@ -223,7 +223,13 @@ def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
 
 
 @pytest.mark.parametrize("expansion", sorted({*EXPANSIONS} - {"projcg", "spectral"}))
-@pytest.mark.parametrize("seed", [271828, 314159, 161803])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        271828,
+        *(pytest.param(seed, marks=pytest.mark.slow) for seed in (314159, 161803)),
+    ],
+)
 def test_every_iterate_is_feasible_and_the_cost_never_rises(
     minimise, manufactured, seed, expansion
 ):

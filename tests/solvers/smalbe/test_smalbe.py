@@ -307,9 +307,15 @@ def test_too_few_steps_are_not_called_solved(dual):
     assert "step limit" in s.message
 
 
-@pytest.mark.parametrize("is_compiled", [True, False])
-@pytest.mark.parametrize("bounds", [False, True])
-@pytest.mark.parametrize("orders", [6, 9])
+@pytest.mark.parametrize(
+    ("orders", "bounds", "is_compiled"),
+    [
+        *((orders, bounds, True) for orders in (6, 9) for bounds in (False, True)),
+        (6, True, False),
+        *(pytest.param(*row, False, marks=pytest.mark.slow)
+          for row in [(6, False), (9, False), (9, True)]),
+    ],
+)  # fmt: skip
 def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
     orders, bounds, is_compiled, monkeypatch
 ):
