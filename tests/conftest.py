@@ -170,3 +170,30 @@ def only_svg(svg_only):
     """Write the figures of reports as SVG only."""
     with svg_only():
         yield
+
+
+@pytest.fixture(scope="module")
+def blank():
+    """Return a context manager in which the figures of reports are drawn empty.
+
+    For tests of tables and text: all files of figures are written, without content.
+    """
+
+    @contextmanager
+    def context():
+        from matplotlib.figure import Figure  # slow; few processes need it
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                "mortarbench.reports.render.saving.draw", lambda _: Figure((1, 1))
+            )
+            yield
+
+    return context
+
+
+@pytest.fixture
+def blank_figures(blank):
+    """Draw the figures of reports empty."""
+    with blank():
+        yield

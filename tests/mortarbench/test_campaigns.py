@@ -378,7 +378,7 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     assert told["not_measured"] == []
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_fails_on_the_requested_conditions_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):

@@ -25,6 +25,7 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.usefixtures("blank_figures")
 def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsys):
     """Each example runs in an empty working directory, so that it cannot depend on
     another one.

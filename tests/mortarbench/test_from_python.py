@@ -18,6 +18,7 @@ from tests.support import TOY_PROBLEM
 pytestmark = pytest.mark.together
 
 SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
+FURTHER = ("dual-bounds", "primal")  #: forms
 #: min ½(x₁² + 2x₂²) − x₁ − x₂ with x₁ ≤ ½: x = (½, ½), z = ½
 QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
 
@@ -147,7 +148,7 @@ print(*(result.grade for result in found.results.values()))
 """
 
 
-@pytest.mark.parametrize("threads", [False, True])
+@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
     """The class is also copied if the script, like a notebook, has several threads and
     must not fork.
@@ -272,7 +273,9 @@ def test_wrong_multipliers_are_refuted_at_the_right_point():
     assert mb.verify(QP, [0.5, 0.5], z=[0.0]).residuals.dual > 0.1
 
 
-@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
+@pytest.mark.parametrize(
+    "form", ["dual", *(pytest.param(f, marks=pytest.mark.slow) for f in FURTHER)]
+)
 def test_verify_agrees_with_solve(form):
     """`verify` is called with the point alone and with the multipliers of
     the solver.

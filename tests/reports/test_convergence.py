@@ -212,7 +212,7 @@ def test_runs_of_very_different_length_have_a_logarithmic_axis(folder):
     assert scale(71) == "log"
 
 
-def test_invalid_histories_are_left_out(folder, svg_only):
+def test_invalid_histories_are_left_out(folder, blank):
     strange = {
         "step": [1, 2, 3, 4], "products": ["a"] * 4, "outer": ["x", "y", "z", "z"],
         "free_gradient": [np.nan, np.inf, 2, 1], "chopped_gradient": [0, 0, 0, 0],
@@ -222,7 +222,7 @@ def test_invalid_histories_are_left_out(folder, svg_only):
     (gradient,) = convergence_figure(comparison(out)).axes
 
     assert curves(gradient) == [[[3, 1], [4, 0.5]]]
-    with svg_only():
+    with blank():
         write_report(out, ["html", "md"])
 
 
@@ -298,11 +298,11 @@ def test_the_first_stored_history_of_the_repeats_is_used(folder):
     assert "r1." in section(out).pictures[0].caption
 
 
-def test_a_report_without_histories_has_no_such_section(folder, svg_only):
+def test_a_report_without_histories_has_no_such_section(folder, blank):
     out = folder(("a", {}, {}), ("b", {}, {"vectors": None}))
 
     assert section(out) is None
-    with svg_only():
+    with blank():
         names = {f.name for f in write_report(out, ["html", "md", "tex"])}
     assert not any("convergence" in name or "active" in name for name in names)
 

@@ -258,7 +258,7 @@ def test_tolerances_are_compared_separately_tightest_first(record, evidence):
     assert "b on the primal form was the fastest over 8 problems at tol 1e-3" in other
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_report_prints_only_the_first_sentence(record, tmp_path, capsys):
     with Journal(tmp_path, "test") as journal:
         for r in four_ways(record):
@@ -269,7 +269,7 @@ def test_the_command_report_prints_only_the_first_sentence(record, tmp_path, cap
     assert sum(line.startswith("all forms: ") for line in printed) == 1
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_the_first_sentence_is_the_same_in_the_report_and_in_plain_text(
     record, tmp_path
 ):
