@@ -83,7 +83,7 @@ def imported(folder_of_user):
     program = (
         "import sys, mortarbench.cli.main, mortarbench.processes, "
         "mortarbench.reports.folder, mortarbench.solvers.smalbe.solver; "
-        "print(*sys.modules)"
+        "import mortarbench.problems.fem.mesh; print(*sys.modules)"
     )
     done = subprocess.run(
         [sys.executable, "-c", program], cwd=folder_of_user,

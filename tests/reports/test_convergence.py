@@ -18,7 +18,7 @@ from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.data.histories import MOST, chosen
 from mortarbench.reports.figures import convergence
 from mortarbench.reports.folder import compose
-from mortarbench.reports.render.saving import draw
+from mortarbench.reports.render.saving import ENDINGS, draw
 from mortarbench.reports.render.writing import write_page
 from tests.support.stored import save_solution
 
@@ -318,7 +318,11 @@ def test_a_missing_history_is_reported(folder):
     assert len(found.pictures) == 2
 
 
-def test_figures_in_page_and_files_are_reproducible(folder):
+@pytest.mark.parametrize(
+    "endings", [(".svg",), pytest.param(ENDINGS, marks=pytest.mark.slow)]
+)
+def test_figures_in_page_and_files_are_reproducible(folder, monkeypatch, endings):
+    """Figures are written in all formats, and again in those of `endings`."""
     out = folder(("a", KNOWN, {}), ("_b$x^2", KNOWN, {}))
 
     def written(target):
@@ -328,9 +332,12 @@ def test_figures_in_page_and_files_are_reproducible(folder):
             f.name: f.read_bytes() for f in write_page(shown, target, ["html", "md"])
         }
 
-    files, again = written(out / "one"), written(out / "two")
+    files = written(out / "one")
+    monkeypatch.setattr("mortarbench.reports.render.saving.ENDINGS", endings)
+    again = written(out / "two")
 
-    assert files == again
+    assert files | again == files
+    assert {name.rpartition(".")[2] for name in again} >= {"html", "md", "svg"}
     for ending in ("pdf", "svg", "png"):
         assert {f"convergence-1.{ending}", f"active-set-1.{ending}"} <= files.keys()
     assert b'id="convergence-1-' in files["index.html"]

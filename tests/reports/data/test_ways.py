@@ -134,11 +134,12 @@ def test_equal_combinations_tie_with_interval_and_advice(record, evidence):
     assert ratio_after("c on the primal form, took", claim)[0] > 4
 
 
-def test_intervals_of_ties_contain_one(record, evidence):
+@pytest.mark.parametrize("seeds", [8, pytest.param(25, marks=pytest.mark.slow)])
+def test_intervals_of_ties_contain_one(record, evidence, seeds):
     """Intervals of combinations that are called slower do not contain 1."""
     rng = np.random.default_rng(3)
     for count in (6, 7, 9):
-        for seed in range(25):
+        for seed in range(seeds):
             ways = {
                 f"{s}_{form}": 1e-3 * (1 + (form == "primal")) * rng.uniform(1, 1.5)
                 for s in "abc" for form in ("dual", "primal")
