@@ -153,7 +153,7 @@ def svg_only():
     """Return a context manager in which reports write figures as SVG only.
 
     Pages contain the SVG figures. All formats are tested in
-    `reports/test_convergence.py` and `reports/figures/test_pictures.py`.
+    `reports/paper/test_paper.py` and `reports/figures/test_pictures.py`.
     """
 
     @contextmanager

@@ -321,8 +321,14 @@ def test_the_matrix_of_an_operator_is_its_product_with_the_identity():
     assert np.linalg.eigvalsh(P)[0] >= -1e-10 * np.abs(P).max()
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "parquet", "qps"])
-@pytest.mark.parametrize("what", [QP, SMALL])
+@pytest.mark.parametrize(
+    ("what", "ending"),
+    [
+        *((QP, ending) for ending in ("npz", "mat", "parquet", "qps")),
+        *((SMALL, ending) for ending in ("npz", "mat", "qps")),
+        pytest.param(SMALL, "parquet", marks=pytest.mark.slow),
+    ],
+)
 def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     monkeypatch.chdir(tmp_path)
     path = mb.export(what, f"qp.{ending}")
