@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,32 +13,12 @@ import mortarbench as mb
 from mortarbench.harness import plugin
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.active_row import QP, ActiveRow
 
 pytestmark = pytest.mark.together
 
 SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
 FURTHER = ("dual-bounds", "primal")  #: forms
-#: min ½(x₁² + 2x₂²) − x₁ − x₂ with x₁ ≤ ½: x = (½, ½), z = ½
-QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
-
-
-@dataclass(frozen=True)
-class ActiveRow:
-    """Solver of `QP` that assumes an active row; `shift` perturbs the answer."""
-
-    shift: float = 0.0
-
-    def declines(self, qp):
-        return None if (qp.q.size, qp.h.size) == (2, 1) else "other sizes"
-
-    def prepare(self, qp, tol):
-        x = np.array([qp.h[0], -qp.q[1] / 2]) + self.shift
-        z = np.array([-qp.q[0] - qp.h[0]])
-        none = np.zeros(0)
-        solution = mb.Solution(
-            status=mb.Status.SOLVED, x=x, y=none, z=z, z_box=np.zeros(2)
-        )
-        return lambda: solution
 
 
 def test_a_qp_is_solved_like_a_case():
@@ -171,6 +150,7 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
     )
 
 
+@pytest.mark.slow
 def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
     """The script's own `solvers.py` and `msgspec.py` take precedence in the
     script only.

@@ -396,6 +396,7 @@ def in_many_threads(program, folder):
     ).stdout  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
     """With a different digest, no stored answer could be verified."""
     program = (
