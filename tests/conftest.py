@@ -153,7 +153,7 @@ def svg_only():
     """Return a context manager in which reports write figures as SVG only.
 
     Pages contain the SVG figures. All formats are tested in
-    `reports/test_convergence.py` and `reports/figures/test_pictures.py`.
+    `reports/paper/test_paper.py` and `reports/figures/test_pictures.py`.
     """
 
     @contextmanager
@@ -169,4 +169,31 @@ def svg_only():
 def only_svg(svg_only):
     """Write the figures of reports as SVG only."""
     with svg_only():
+        yield
+
+
+@pytest.fixture(scope="module")
+def blank():
+    """Return a context manager in which the figures of reports are drawn empty.
+
+    For tests of tables and text: all files of figures are written, without content.
+    """
+
+    @contextmanager
+    def context():
+        from matplotlib.figure import Figure  # slow; few processes need it
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                "mortarbench.reports.render.saving.draw", lambda _: Figure((1, 1))
+            )
+            yield
+
+    return context
+
+
+@pytest.fixture
+def blank_figures(blank):
+    """Draw the figures of reports empty."""
+    with blank():
         yield

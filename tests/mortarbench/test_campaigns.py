@@ -71,7 +71,7 @@ def made(tmp_path_factory):
     """
     where = tmp_path_factory.mktemp("made")
     for name, depths in (("a", "1"), ("b", "2")):
-        (where / f"{name}.toml").write_text(suite(depths=depths))
+        (where / f"{name}.toml").write_text(suite(depths=depths, repeats=2))
         mb.run(where / f"{name}.toml", out=where / name, plugins=[TOY_PROBLEM])
     return where
 
@@ -194,9 +194,9 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
 
 
 def test_equal_measurements_of_two_machines_are_kept_and_marked(
-    measure, tmp_path, environment
+    measure, campaign, tmp_path, environment
 ):
-    measure("a")
+    shutil.copytree(campaign / "before", tmp_path / "a")
     environment["machine"] = {"cpu": "two"}
     measure("b")
     orders = [
@@ -227,9 +227,9 @@ def test_equal_measurements_of_two_machines_are_kept_and_marked(
     assert read_journal(tmp_path / "ab") == records
 
 
-def test_duplicates_in_one_environment_count_once(measure, tmp_path):
+def test_duplicates_in_one_environment_count_once(measure, campaign, tmp_path):
     first = measure("a", depths="1")
-    measure("b", depths="1, 2")
+    shutil.copytree(campaign / "before", tmp_path / "b")
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
 
     assert merged.records[:4] == first.records
@@ -378,7 +378,7 @@ def test_a_strict_run_fails_if_a_claim_is_refuted_or_a_solver_fails(
     assert told["not_measured"] == []
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_fails_on_the_requested_conditions_and_says_so(
     cli, measure, tmp_path, monkeypatch
 ):
@@ -434,7 +434,7 @@ def test_conditions_that_cannot_be_judged_fail_with_a_separate_line(
 def test_folders_are_merged_from_the_command_line(cli, stored):
     code, out, _ = cli("merge", "a", "b", "--out", "all")
     assert code == 0
-    assert out.splitlines()[-1] == "all: 12 measurements"
+    assert out.splitlines()[-1] == "all: 8 measurements"
     code, out, err = cli("merge", "a", "nowhere", "--out", "more")
     assert (code, out) == (2, "")
     assert "nowhere: no such folder; expected a result folder of `run`" in err

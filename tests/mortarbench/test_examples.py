@@ -22,9 +22,15 @@ EXAMPLES = {
         )
     },
 }  # fmt: skip
+#: functions whose examples repeat the run of "smoke", after which they are called in
+#: the tests of the command line and of a script
+LATER = {"load", "replay", "report", "validate"}
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (n in LATER)) for n in EXAMPLES]
+)
+@pytest.mark.usefixtures("blank_figures")
 def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsys):
     """Each example runs in an empty working directory, so that it cannot depend on
     another one.

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,31 +13,12 @@ import mortarbench as mb
 from mortarbench.harness import plugin
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
+from tests.support.active_row import QP, ActiveRow
 
 pytestmark = pytest.mark.together
 
 SMALL = "beam-ring/Nr=4/Nh=3/steps=1/dual"
-#: min ½(x₁² + 2x₂²) − x₁ − x₂ with x₁ ≤ ½: x = (½, ½), z = ½
-QP = mb.QP.from_arrays(np.diag([1.0, 2.0]), [-1, -1], G=[1, 0], h=0.5)
-
-
-@dataclass(frozen=True)
-class ActiveRow:
-    """Solver of `QP` that assumes an active row; `shift` perturbs the answer."""
-
-    shift: float = 0.0
-
-    def declines(self, qp):
-        return None if (qp.q.size, qp.h.size) == (2, 1) else "other sizes"
-
-    def prepare(self, qp, tol):
-        x = np.array([qp.h[0], -qp.q[1] / 2]) + self.shift
-        z = np.array([-qp.q[0] - qp.h[0]])
-        none = np.zeros(0)
-        solution = mb.Solution(
-            status=mb.Status.SOLVED, x=x, y=none, z=z, z_box=np.zeros(2)
-        )
-        return lambda: solution
+FURTHER = ("dual-bounds", "primal")  #: forms
 
 
 def test_a_qp_is_solved_like_a_case():
@@ -147,7 +127,7 @@ print(*(result.grade for result in found.results.values()))
 """
 
 
-@pytest.mark.parametrize("threads", [False, True])
+@pytest.mark.parametrize("threads", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, threads):
     """The class is also copied if the script, like a notebook, has several threads and
     must not fork.
@@ -170,6 +150,7 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
     )
 
 
+@pytest.mark.slow
 def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
     """The script's own `solvers.py` and `msgspec.py` take precedence in the
     script only.
@@ -272,7 +253,9 @@ def test_wrong_multipliers_are_refuted_at_the_right_point():
     assert mb.verify(QP, [0.5, 0.5], z=[0.0]).residuals.dual > 0.1
 
 
-@pytest.mark.parametrize("form", ["dual", "dual-bounds", "primal"])
+@pytest.mark.parametrize(
+    "form", ["dual", *(pytest.param(f, marks=pytest.mark.slow) for f in FURTHER)]
+)
 def test_verify_agrees_with_solve(form):
     """`verify` is called with the point alone and with the multipliers of
     the solver.
@@ -318,8 +301,14 @@ def test_the_matrix_of_an_operator_is_its_product_with_the_identity():
     assert np.linalg.eigvalsh(P)[0] >= -1e-10 * np.abs(P).max()
 
 
-@pytest.mark.parametrize("ending", ["npz", "mat", "parquet", "qps"])
-@pytest.mark.parametrize("what", [QP, SMALL])
+@pytest.mark.parametrize(
+    ("what", "ending"),
+    [
+        *((QP, ending) for ending in ("npz", "mat", "parquet", "qps")),
+        *((SMALL, ending) for ending in ("npz", "mat", "qps")),
+        pytest.param(SMALL, "parquet", marks=pytest.mark.slow),
+    ],
+)
 def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     monkeypatch.chdir(tmp_path)
     path = mb.export(what, f"qp.{ending}")
@@ -421,8 +410,8 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
     """
     program = (
         "import pkgutil, importlib, mortarbench as mb\n"
-        "names = {m.name for m in pkgutil.iter_modules(mb.__path__)} - {'__main__'}\n"
-        "for n in names: importlib.import_module(f'mortarbench.{n}')\n"
+        "names = {m.name for m in pkgutil.iter_modules(mb.__path__)}\n"
+        "for n in names & {*mb.__all__}: importlib.import_module(f'mortarbench.{n}')\n"
         "print([n for n in mb.__all__ if type(getattr(mb, n)).__name__ == 'module'])\n"
     )
     done = subprocess.run(

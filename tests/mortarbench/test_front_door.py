@@ -173,14 +173,15 @@ def test_a_run_is_a_table_of_its_journal(results, capfd):
 
 def test_functions_print_only_on_request(tmp_path, results, capfd):
     suite = results.folder.parent / "s.toml"
-    mb.run(suite, out=tmp_path / "a", plugins=[TOY_PROBLEM])
+    few = {"plugins": [TOY_PROBLEM], "repeats": 1, "cases": ["*/dual"]}
+    mb.run(suite, out=tmp_path / "a", **few)
     mb.load(tmp_path / "a")
     assert capfd.readouterr() == ("", "")
 
-    mb.run(suite, out=tmp_path / "b", plugins=[TOY_PROBLEM], progress=True)
+    mb.run(suite, out=tmp_path / "b", **few, progress=True)
     out, err = capfd.readouterr()
     assert out == ""
-    assert "8/8 " in err
+    assert "2/2 " in err
 
 
 def test_progress_is_passed_to_a_function(tmp_path, results):
@@ -200,8 +201,8 @@ def test_progress_is_passed_to_a_function(tmp_path, results):
     assert {event.done for event in told} == set(range(9))
 
 
-def test_a_report_names_its_page(results, svg_only):
-    with svg_only():
+def test_a_report_names_its_page(results, blank):
+    with blank():
         found = results.report(formats=["html", "md"])
         compared = mb.report(results.folder, results.folder, formats=["md"])
 
@@ -213,8 +214,8 @@ def test_a_report_names_its_page(results, svg_only):
     assert compared.said
 
 
-def test_answers_of_a_folder_are_validated(smoke, svg_only):
-    with svg_only():
+def test_answers_of_a_folder_are_validated(smoke, blank):
+    with blank():
         found = smoke.validate(budget=0)
 
     assert found.agreed
@@ -255,41 +256,54 @@ def test_a_solver_of_another_registry_has_its_own_description():
     assert row["description"] == "Another solver."
 
 
-@pytest.mark.parametrize(
-    "argv",
-    [
-        ["--help"],
-        ["run", "--help"],
-        ["--version"],
-        ["list", "solvers"],
-        ["list", "problems", "--json"],
-        ["list", "suites"],
-        ["solve", "beam-ring/Nr=0/dual", "--solver", "smalbe"],
-        ["solve", "beam-ring/dual", "--solver", "smalb"],
-        ["solve", "beam-ring/dual", "--solver", "smalbe", "--plot", "a.txt"],
-        ["export", "hertz-plane/Q=1/dual", "a.npz"],
-        ["run", "dem"],
-        ["report", "nowhere"],
-        ["validate", "nowhere"],
-        ["replay", "nowhere", "abc"],
-        ["test-solver", "smalb"],
-    ],
-)
-def test_help_lists_and_refusals_import_no_numerical_library(argv, tmp_path):
+LIGHT = [
+    ["--help"],
+    ["run", "--help"],
+    ["--version"],
+    ["list", "solvers"],
+    ["list", "problems", "--json"],
+    ["list", "suites"],
+    ["solve", "beam-ring/Nr=0/dual", "--solver", "smalbe"],
+    ["solve", "beam-ring/dual", "--solver", "smalb"],
+    ["solve", "beam-ring/dual", "--solver", "smalbe", "--plot", "a.txt"],
+    ["export", "hertz-plane/Q=1/dual", "a.npz"],
+    ["run", "dem"],
+    ["report", "nowhere"],
+    ["validate", "nowhere"],
+    ["replay", "nowhere", "abc"],
+    ["test-solver", "smalb"],
+]
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory):
+    """Run the commands of `LIGHT` in one process.
+
+    Returns the words of the last line after each command: "loaded" and the libraries
+    that are imported by then.
+    """
     program = (
-        "import sys, mortarbench.__main__ as m\n"
-        "sys.argv[0] = 'mortarbench'\n"
-        "try: m.main()\n"
-        "except SystemExit: pass\n"
+        "import json, sys, mortarbench.__main__ as m\n"
         "slow = {'numpy', 'scipy', 'pandas', 'matplotlib', 'rich'}\n"
-        "print('loaded', *sorted(slow & set(sys.modules)))\n"
+        "for argv in json.loads(sys.argv[1]):\n"
+        "    sys.argv = ['mortarbench', *argv]\n"
+        "    try: m.main()\n"
+        "    except SystemExit: pass\n"
+        "    print('loaded', *sorted(slow & set(sys.modules)))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, *argv],
-        cwd=tmp_path, capture_output=True, text=True, check=True,
+        [sys.executable, "-c", program, json.dumps(LIGHT)],
+        cwd=tmp_path_factory.mktemp("light"), capture_output=True, text=True,
+        check=True,
     )  # fmt: skip
+    lines = [line for line in done.stdout.splitlines() if line.startswith("loaded")]
+    return [line.split() for line in lines]
 
-    assert done.stdout.splitlines()[-1] == "loaded"
+
+@pytest.mark.parametrize("number", range(len(LIGHT)), ids=map(" ".join, LIGHT))
+def test_help_lists_and_refusals_import_no_numerical_library(loaded, number):
+    assert len(loaded) == len(LIGHT)
+    assert loaded[number] == ["loaded"]
 
 
 @pytest.mark.slow
@@ -382,6 +396,7 @@ def in_many_threads(program, folder):
     ).stdout  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_case_built_in_many_threads_is_the_one_that_was_measured(smoke):
     """With a different digest, no stored answer could be verified."""
     program = (

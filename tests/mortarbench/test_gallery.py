@@ -1,6 +1,6 @@
 """The notebooks of docs/gallery run unchanged and show what their text states.
 
-Each notebook runs in its own kernel in an empty folder. Of the shortest notebooks, only
+Each notebook runs in its own kernel in an empty folder. Of the shortest notebook, only
 the code runs by default, without a kernel.
 """
 
@@ -132,6 +132,7 @@ def test_the_code_of_your_own_steps(run_code):
     found["plt"].close("all")
 
 
+@pytest.mark.slow
 def test_the_code_of_your_own_solver(run_code):
     """The gradient method reduces the error by 1 − 1/κ per step, and some of its claims
     are refuted.

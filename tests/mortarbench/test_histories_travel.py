@@ -14,6 +14,7 @@ import pytest
 
 from mortarbench.cli.main import main
 from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness.conformance.manufactured import manufactured as drawn
 from mortarbench.harness.files.store import (
     load_history,
     load_solution,
@@ -97,25 +98,32 @@ def test_a_stored_history_records_the_iterations(manufactured):
     assert np.hypot(h["free_gradient"], h["chopped_gradient"])[-1] <= 1e-9
 
 
+@pytest.fixture(scope="module")
+def kept():
+    """Return the answer of a solver without history."""
+    return measure(PLUGIN.solvers["descent"], drawn("box")[0], 1e-8).solution
+
+
 @pytest.mark.parametrize(
     ("solver", "word"),
     [
         ("ragged", "columns have different lengths: cost 3, active 2"),
         ("square", "cost has shape (2, 2)"),
-        ("scalar", "cost has shape ()"),
+        pytest.param("scalar", "cost has shape ()", marks=pytest.mark.slow),
         ("objects", "cost has dtype object"),
-        ("complex", "cost has dtype complex128"),
-        ("long", "step has dtype <U17"),
+        pytest.param("complex", "cost has dtype complex128", marks=pytest.mark.slow),
+        pytest.param("long", "step has dtype <U17", marks=pytest.mark.slow),
         ("path", "'../cost' is the name of a column"),
-        ("number", "7 is the name of a column"),
+        pytest.param("number", "7 is the name of a column", marks=pytest.mark.slow),
         ("none", "it is of type NoneType"),
-        ("list", "it is of type list"),
+        pytest.param("list", "it is of type list", marks=pytest.mark.slow),
         ("angry", "no history for you"),
     ],
 )
-def test_a_malformed_history_is_dropped_and_the_answer_kept(manufactured, solver, word):
+def test_a_malformed_history_is_dropped_and_the_answer_kept(
+    manufactured, kept, solver, word
+):
     qp, _ = manufactured("box")
-    kept = measure(PLUGIN.solvers["descent"], qp, 1e-8).solution
     s = measure(PLUGIN.solvers[solver], qp, 1e-8).solution
 
     assert (s.status, s.iterations) == (Status.SOLVED, kept.iterations)

@@ -55,6 +55,7 @@ def test_a_claim_that_the_objective_is_unbounded_is_not_verified(qps, capsys):
     assert json.loads(capsys.readouterr().out)["status"] == "infeasible_claim"
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_verified_infeasibility_passes_a_strict_run(qps, tmp_path, capsys):
     out = tmp_path / "out"
     path = write(qps, "none", "some")

@@ -33,7 +33,7 @@ def test_the_records_of_an_old_folder_are_read_unchanged(old):
     assert {r.solver for r in records} == {"smalbe", "osqp", "clarabel", "proxqp"}
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_an_old_folder_can_be_reported(old, capsys):
     assert command("report", old, "--format", "md,csv") == 0
     assert "beam-ring/Nr=4/Nh=3/step=1/dual" in (old / "report/report.md").read_text()
@@ -74,14 +74,19 @@ class There(Registries):
         return stored
 
 
-@pytest.fixture(params=[SMOKE, PLUGINS], ids=["smoke", "plugins"])
+@pytest.fixture(
+    params=[
+        pytest.param(SMOKE, id="smoke", marks=pytest.mark.slow),
+        pytest.param(PLUGINS, id="plugins"),
+    ]
+)
 def before_namespace(request, tmp_path, monkeypatch):
     folder = shutil.copytree(request.param, tmp_path / "old")
     monkeypatch.setattr(There, "folder", folder, raising=False)
     return folder, ([PLUGIN] if request.param is PLUGINS else [])
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_run_in_a_folder_from_before_the_namespace_continues(before_namespace):
     folder, plugins = before_namespace
     before = {r.run_id: r for r in read_journal(folder)}

@@ -3,6 +3,7 @@
 import re
 import sys
 import unicodedata
+from functools import cache
 from xml.etree import ElementTree
 
 import markdown
@@ -40,13 +41,18 @@ Loader.add_multi_constructor("", lambda *_: None)
 
 def rendered(text):
     """Return the HTML of a page before the hooks of mkdocs."""
+    return markdown.markdown(
+        text, extensions=list(extensions()), extension_configs=extensions()
+    )
+
+
+@cache
+def extensions():
+    """Return the extensions of Markdown and their options in mkdocs.yml."""
     options = yaml.load((ROOT / "mkdocs.yml").read_text("utf-8"), Loader)
-    named = [
+    return dict(
         next(iter(e.items())) if isinstance(e, dict) else (e, {})
         for e in options["markdown_extensions"]
-    ]
-    return markdown.markdown(
-        text, extensions=[name for name, _ in named], extension_configs=dict(named)
     )
 
 

@@ -171,17 +171,27 @@ def starting(capsys, monkeypatch, tmp_path):
     return run
 
 
-def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
+STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
+ONE_PER_KIND = list({check.partition(":")[0]: check for check in STRICT}.values())
+
+
+@pytest.mark.parametrize(
+    "checks",
+    [
+        pytest.param(ONE_PER_KIND, id="one-per-kind"),
+        pytest.param(STRICT, id="all", marks=pytest.mark.slow),
+    ],
+)
+def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting, checks):
     code, out, err = starting("new", "solver", "my-own")
     solver = load_plugin("my-own.py").solvers["my-own"]
-    strict = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-    results = {check: run_check(check, solver) for check in strict}
+    results = {check: run_check(check, solver) for check in checks}
 
     assert (code, out) == (0, "my-own.py\n")
     assert "mortarbench test-solver my-own --plugin my-own.py" in err
     assert Conformance(solver="my-own", results=results).conforms
     declined = {c for c, r in results.items() if r.grade is Grade.DECLINE}
-    over_sets = {check for check in CHECKS if check.startswith(SETS_PREFIX)}
+    over_sets = {check for check in checks if check.startswith(SETS_PREFIX)}
     assert declined == {"solves a sequence", *over_sets}
 
 

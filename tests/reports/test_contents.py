@@ -289,7 +289,7 @@ def test_bodies_in_space_have_forces_in_newtons_and_others_per_metre(measured, p
         assert told["energy"].endswith(f" J{per}")
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_missing_picture_of_bodies_in_space_is_reported(measured, tmp_path):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured(fields="0123456789abcdef", quantities=IN_SPACE))
@@ -301,7 +301,7 @@ def test_a_missing_picture_of_bodies_in_space_is_reported(measured, tmp_path):
 
 
 @pytest.mark.parametrize("damaged", [False, True])
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_report_needs_only_the_journal(measured, tmp_path, damaged):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured(fields="0123456789abcdef"))
@@ -360,7 +360,7 @@ def test_words_are_left_aligned_in_every_format(measured, page):
     assert [words.wordy(i) for i in range(2)] == [False, True]
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_a_wide_table_scrolls_with_a_fixed_first_column(measured, tmp_path):
     with Journal(tmp_path, "test") as journal:
         journal.append(measured())

@@ -37,8 +37,11 @@ NAMES = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory, svg_only):
+@pytest.fixture(
+    scope="module", params=["blank", pytest.param("drawn", marks=pytest.mark.slow)]
+)
+def report(request, tmp_path_factory, svg_only, blank):
+    """Return a report with all names, by default with empty figures."""
     folder = tmp_path_factory.mktemp("hostile")
     with Journal(folder, "test") as journal:
         for i, name in enumerate(NAMES):
@@ -53,7 +56,7 @@ def report(tmp_path_factory, svg_only):
                     complementarity=1e-9, quantities={"dofs": size, name: name},
                     environment=name, started=name,
                 ))  # fmt: skip
-    with svg_only():
+    with svg_only() if request.param == "drawn" else blank():
         write_report(folder, ["html", "md", "tex", "csv"])
     return folder / "report"
 

@@ -155,11 +155,16 @@ def toggle(page, solver):
     page.locator("#solvers button", has_text=solver).click()
 
 
-FIRST_SCREENS = [(1400, 900), (390, 844)]
+FIRST_SCREENS = [
+    (1400, 900, "light"),
+    (390, 844, "dark"),
+    pytest.param(1400, 900, "dark", marks=pytest.mark.slow),
+    pytest.param(390, 844, "light", marks=pytest.mark.slow),
+]
+WIDE_LATER = [pytest.param(1400, marks=pytest.mark.slow), 390]
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), FIRST_SCREENS)
+@pytest.mark.parametrize(("width", "height", "scheme"), FIRST_SCREENS)
 def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
     visit, folder, width, height, scheme
 ):
@@ -178,7 +183,7 @@ def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
     assert subjects == ["dual", "primal"]
 
 
-@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("width", WIDE_LATER)
 def test_navigation_and_filters_are_folded_until_opened(visit, folder, width):
     page = visit(folder, width=width, folded=True)
     link = page.get_by_role("link", name="Summary", exact=True).first
@@ -190,7 +195,7 @@ def test_navigation_and_filters_are_folded_until_opened(visit, folder, width):
     assert page.url.endswith("#summary")
 
 
-@pytest.mark.parametrize("width", [1400, 390])
+@pytest.mark.parametrize("width", WIDE_LATER)
 def test_no_text_of_the_first_figure_leaves_its_drawing(visit, folder, width):
     drawing = visit(folder, width=width).locator("#answer .panel > svg").first
     drawing.scroll_into_view_if_needed()
@@ -329,7 +334,10 @@ def test_a_redrawn_hostile_table_equals_the_written_one(visit, hostile):
     assert page.locator("bdi").count() > 3  # right-to-left text
 
 
-@pytest.mark.parametrize(("scheme", "paper"), [("light", 255), ("dark", 21)])
+@pytest.mark.parametrize(
+    ("scheme", "paper"),
+    [pytest.param("light", 255, marks=pytest.mark.slow), ("dark", 21)],
+)
 def test_colours_follow_the_system_until_a_theme_is_chosen(
     visit, folder, scheme, paper
 ):

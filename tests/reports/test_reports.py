@@ -460,8 +460,13 @@ def square():
     )  # fmt: skip
 
 
-@pytest.mark.usefixtures("only_svg")
-def test_the_same_journal_gives_the_same_bytes(measured, square, tmp_path):
+@pytest.mark.parametrize(
+    "figures", ["blank_figures", pytest.param("only_svg", marks=pytest.mark.slow)]
+)
+def test_the_same_journal_gives_the_same_bytes(
+    request, measured, square, tmp_path, figures
+):
+    request.getfixturevalue(figures)
     folders = []
     for name in ("one", "two"):
         folder = tmp_path / name
@@ -539,7 +544,7 @@ def test_csv_contains_full_precision_and_intervals_of_times(measured, tmp_path):
     assert float(row["energy"]) == -12345.678901234
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_only_the_requested_formats_are_written(measured, tmp_path):
     write(tmp_path, [measured("a")])
     write_report(tmp_path, ["md"])

@@ -46,7 +46,7 @@ PLUGINS = ("mortarbench.cli.main", "mortarbench.processes")
 #: modules loaded for ``python -P -m mortarbench``, with its own solvers and cases
 OURS = (
     *PLUGINS, "mortarbench.solvers.smalbe.solver", "mortarbench.problems.fem.kernels",
-    "sksparse.cholmod",
+    "mortarbench.solvers.reference.solve", "scipy.optimize", "sksparse.cholmod",
 )  # fmt: skip
 
 #: modules loaded for ``python -P -m dask``, the processes of a cluster

@@ -120,7 +120,9 @@ def test_in_reverse_order_a_regression_is_an_improvement(changed):
         assert a.ratio.value * b.ratio.value == pytest.approx(1)
 
 
-@pytest.mark.parametrize("repeats", [3, 5, 10])
+@pytest.mark.parametrize(
+    "repeats", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 10))]
+)
 def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats):
     """Of 600 cells, 5 % (30 ± 12 at three standard deviations) may show a change."""
     named = cells = 0
@@ -134,7 +136,9 @@ def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats
     assert 14 <= named <= 46
 
 
-@pytest.mark.parametrize("cells", [4, 8, 30])
+@pytest.mark.parametrize(
+    "cells", [4, *(pytest.param(n, marks=pytest.mark.slow) for n in (8, 30))]
+)
 def test_the_interval_over_cells_has_its_nominal_coverage(cells):
     """Of 400 intervals, 20 should miss the true value; 7 to 33 are within
     three sigma.
@@ -172,7 +176,7 @@ def test_unresolved_cells_are_counted_separately(changed):
     assert "0 slower, 0 faster, 1 no change seen, 1 not resolved" in said
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_comparing_a_folder_with_itself_is_reported(tmp_path):
     with Journal(tmp_path / "a", "j") as journal:
         for r in suite(1, cases=2, repeats=2):
@@ -293,7 +297,7 @@ def test_times_of_another_version_on_the_same_machine_are_compared(folders):
     assert any("two: 1.5" in line and "slower" in line for line in said)
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_times_of_another_machine_are_not_compared(folders):
     other = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     after = suite(2, cases=4, repeats=3, one=9.0, two=9.0, three=9.0)
@@ -309,7 +313,7 @@ def test_times_of_another_machine_are_not_compared(folders):
     assert "~~" in (b / "report/against-a/report.md").read_text()  # struck out
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_equal_environments_are_reported_with_one_machine(folders):
     busy = HERE | {"now": {"load": 3.0}}
     a, b = folders(HERE, busy)

@@ -75,7 +75,12 @@ def skewed(rng):
 
 
 @pytest.mark.parametrize(
-    ("draw", "shape"), [(normal, (8, 3, 3)), (heavy, (10, 3, 2)), (skewed, (3, 2, 2))]
+    ("draw", "shape"),
+    [
+        (skewed, (3, 2, 2)),
+        pytest.param(normal, (8, 3, 3), marks=pytest.mark.slow),
+        pytest.param(heavy, (10, 3, 2), marks=pytest.mark.slow),
+    ],
 )
 def test_equal_runs_cause_at_most_five_percent_of_alarms(changed, draw, shape):
     """The number of alarms is consistent with an error probability of 5 %."""

@@ -134,11 +134,12 @@ def test_equal_combinations_tie_with_interval_and_advice(record, evidence):
     assert ratio_after("c on the primal form, took", claim)[0] > 4
 
 
-def test_intervals_of_ties_contain_one(record, evidence):
+@pytest.mark.parametrize("seeds", [8, pytest.param(25, marks=pytest.mark.slow)])
+def test_intervals_of_ties_contain_one(record, evidence, seeds):
     """Intervals of combinations that are called slower do not contain 1."""
     rng = np.random.default_rng(3)
     for count in (6, 7, 9):
-        for seed in range(25):
+        for seed in range(seeds):
             ways = {
                 f"{s}_{form}": 1e-3 * (1 + (form == "primal")) * rng.uniform(1, 1.5)
                 for s in "abc" for form in ("dual", "primal")
@@ -258,7 +259,7 @@ def test_tolerances_are_compared_separately_tightest_first(record, evidence):
     assert "b on the primal form was the fastest over 8 problems at tol 1e-3" in other
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_the_command_report_prints_only_the_first_sentence(record, tmp_path, capsys):
     with Journal(tmp_path, "test") as journal:
         for r in four_ways(record):
@@ -269,7 +270,7 @@ def test_the_command_report_prints_only_the_first_sentence(record, tmp_path, cap
     assert sum(line.startswith("all forms: ") for line in printed) == 1
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_the_first_sentence_is_the_same_in_the_report_and_in_plain_text(
     record, tmp_path
 ):

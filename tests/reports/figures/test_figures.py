@@ -128,7 +128,13 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
             )
 
 
-@pytest.mark.parametrize("spread", [1.0, 1 + 1e-9, 1.02, 1.5, 4.0, 1e6])
+@pytest.mark.parametrize(
+    "spread",
+    [
+        1.0, 1.02, 1e6,
+        *(pytest.param(s, marks=pytest.mark.slow) for s in (1 + 1e-9, 1.5, 4.0)),
+    ],
+)  # fmt: skip
 def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):
     """For sizes from n to 100n, the guide of slope 3/2 rises by a factor of seven."""
     grown = [
@@ -155,7 +161,13 @@ def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):
     assert canvas.axes[0].get_position().height >= 0.5
 
 
-@pytest.mark.parametrize("place", [(1.0, 1e9), (1e-9, 1.0), (1e9, 1e-9)])
+@pytest.mark.parametrize(
+    "place",
+    [
+        (1e9, 1e-9),
+        *(pytest.param(p, marks=pytest.mark.slow) for p in ((1.0, 1e9), (1e-9, 1.0))),
+    ],
+)
 def test_a_text_beside_the_axes_does_not_change_their_limits(place):
     def room(*texts):
         axis = Axis(log=True, low=0.1, high=10.0)

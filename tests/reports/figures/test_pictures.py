@@ -361,7 +361,12 @@ def test_without_stress_bodies_have_a_uniform_colour(bodies):
 
 
 @pytest.mark.parametrize(
-    ("ending", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")]
+    ("ending", "start"),
+    [
+        pytest.param("png", b"\x89PNG", marks=pytest.mark.slow),
+        ("pdf", b"%PDF"),
+        ("svg", b"<?xml"),
+    ],
 )
 def test_pictures_have_reproducible_bytes(bodies, tmp_path, ending, start):
     first, second = tmp_path / f"a.{ending}", tmp_path / f"b.{ending}"

@@ -23,7 +23,7 @@ SHEARED = dict(n=8, m=8, load=0.1, friction="coulomb", mu=0.4, Q=0.6)
 
 @pytest.mark.parametrize(
     ("family", "given"),
-    [("hertz-cylinder", SHEARED),
+    [pytest.param("hertz-cylinder", SHEARED, marks=pytest.mark.slow),
      ("hertz-cylinder", {**SHEARED, "slave": "lower", "Q": 0.2, "peak": 0.6}),
      ("half-plane", dict(n=60)),
      ("half-plane", dict(n=61, law="cattaneo", Q=0.2, peak=0.7)),

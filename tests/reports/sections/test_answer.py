@@ -441,7 +441,7 @@ def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
     assert r"\item[{dual}] fast was the fastest" in tex
 
 
-@pytest.mark.usefixtures("only_svg")
+@pytest.mark.usefixtures("blank_figures")
 def test_plain_sentences_equal_the_sentences_of_the_report(record, tmp_path):
     with Journal(tmp_path, "test") as journal:
         for r in one_case(record, fast=1.0, slow=2.0):

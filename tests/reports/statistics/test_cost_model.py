@@ -85,15 +85,18 @@ def test_superlinear_speed_up_gives_no_negative_work():
     assert slower.speed_up(16).value < 1
 
 
-def test_the_band_contains_the_true_speed_up():
+@pytest.mark.parametrize(
+    ("runs", "least"), [(10, 8), pytest.param(40, 34, marks=pytest.mark.slow)]
+)
+def test_the_band_contains_the_true_speed_up(runs, least):
     rng = np.random.default_rng(3)
     held = 0
-    for _ in range(40):
+    for _ in range(runs):
         times = {N: modelled(N) * rng.lognormal(0, 0.02, 5) for N in (1, 2, 4)}
         at = cost_model(times, {}, [sent_on(4)]).speed_up(16)
         assert at.low <= at.value <= at.high
         held += at.low <= 2.1 / modelled(16) <= at.high
-    assert held >= 34  # 95 % of forty are 38
+    assert held >= least  # 95 % of forty are 38
 
 
 def test_single_runs_have_no_band():
