@@ -164,6 +164,11 @@ def _plain_truth(
     qp, why = answers[0].case.qp, ""
     try:
         s, name = solve(qp), "reference"
+        left = kkt_residuals(qp, s).worst
+        if not left <= MAX_REFERENCE_RESIDUAL:
+            raise ArithmeticError(
+                f"the reference solve left a KKT residual of {left:.1e}"
+            )
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:
         why = str(e)
         best = min(answers, key=lambda g: nan_last(residuals_of(g).worst))
