@@ -176,8 +176,8 @@ def _eliminated(
     between problems, as in Newton's method, a new factor for each problem would cost
     more time than it saves. Over discs, a new factor always saves time. On
     `contact-patch/dim=3` with friction and `ratio=10`, the number of products decreases
-    from 517 to 266, and for bodies whose moduli differ by 100 and whose slave nodes
-    have supports along the contact, from 18 936 to 261: tangential rows are then nearly
+    from 517 to 367, and for bodies whose moduli differ by 100 and whose slave nodes
+    have supports along the contact, from 18 936 to 602: tangential rows are then nearly
     linearly dependent on the rows of supports.
     """
     may_follow = kind in ELIMINATION_PRECONDITIONERS or (

@@ -37,7 +37,8 @@ class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equality rows.
 
     SMALBE needs only products with P. It also accepts discs, which bound friction
-    forces in three dimensions.
+    forces in three dimensions. With discs and a dense P, variables without constraints
+    are first eliminated by a Cholesky factor.
 
     `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
     problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only, the default options test the
@@ -50,7 +51,8 @@ class SMALBE(Options):
         licence="BSD-3-Clause",
         method="augmented Lagrangian with an inner active-set method (MPRGP)",
         linear_solver="none (products with P, small dense systems of the model, "
-        "incomplete factors of a sparse P)",
+        "incomplete factors of a sparse P; with discs and in sequences, a Cholesky "
+        "factor of the free block of P)",
         phases="orthonormalisation of rows and Lanczos process (preparing); iterations "
         "(solving)",
         sequence="reuses the point, multipliers, Ritz pairs and the factor of the "
