@@ -103,7 +103,7 @@ class Friction:
 
     ::
 
-        energy of friction:  Σ gᵢ‖Tᵢu − sᵢ‖,   multipliers:  ‖λᵢ‖ ≤ gᵢ
+        friction work:  Σ gᵢ‖Tᵢu − sᵢ‖,   multipliers:  ‖λᵢ‖ ≤ gᵢ
 
     T u is the tangential displacement of the slave side relative to the master side.
     The slip is measured from s. For a single static load, s = 0; for slip increments, s
@@ -143,7 +143,7 @@ class Friction:
         return np.asarray((self.T @ u - self.start)[self.vectors])
 
     def work(self, u: NDArray[Any]) -> float:
-        """Return the energy of friction Σ gᵢ‖Tᵢu − sᵢ‖ for a displacement u (n,)."""
+        """Return the friction work Σ gᵢ‖Tᵢu − sᵢ‖ for a displacement u (n,)."""
         radius = self.bound[self.vectors[:, 0]]
         return float(radius @ norms(self.slip(u)))
 
@@ -367,7 +367,7 @@ class Exact(NamedTuple):
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
-        """Return the energy of friction gᵢ‖vᵢ‖ of each friction vector."""
+        """Return the friction work gᵢ‖vᵢ‖ of each friction vector."""
         discs = self.forces.discs
         return np.asarray(discs.radius * norms(self.motion(u)[discs.index]))
 
@@ -534,7 +534,7 @@ class Mechanics:
 
         min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
 
-    With `friction`, the energy of friction is added to the objective.
+    With `friction`, the friction work is added to the objective.
     """
 
     #: P = K, q = −f, G = B, h = c, b = 0; each row of A has a single entry 1, at a

@@ -312,7 +312,7 @@ def _journal() -> dict[str, Field[Any]]:
     return {journal_name(f.name): f for f in ordered}
 
 
-#: fields of a record by their journal names, in the order of a line
+#: fields of a record by their journal names, in their order within a journal line
 JOURNAL: Mapping[str, Field[Any]] = _journal()
 _NOT_NEGATIVE = (
     "repeat",

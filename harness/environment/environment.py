@@ -268,7 +268,7 @@ def _version(package: str) -> str | None:
 
 
 def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
-    """Return digests of the code of plug-ins by name.
+    """Return digests of plug-in code, by plug-in name.
 
     If several files have the same name, the result contains one digest of these files.
     """

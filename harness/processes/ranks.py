@@ -119,10 +119,10 @@ class _RankExits:
     """Exits of the ranks, in chronological order.
 
     epoll(7) lists file descriptors in the order in which they became ready, even if the
-    caller waits for them late. This order identifies the rank that ended first, whereas
-    mpiexec names the ended rank with the lowest number. The parent process of a rank
-    writes the exit status of the rank. The status is unknown if the parent process was
-    killed before it wrote the status.
+    caller polls only after several of them are ready. This order identifies the rank
+    that ended first, whereas mpiexec names the lowest-numbered rank that has ended. The
+    parent process of a rank writes the exit status of the rank. The status is unknown
+    if the parent process was killed before it wrote the status.
     """
 
     def __init__(self, record: int, ranks: int) -> None:

@@ -93,6 +93,6 @@ def _parsed(line: bytes, path: Path, number: int) -> Fault:
     if not fields or any(type(fields[k]) is not kind for k, kind in _TYPES.items()):
         raise InputError(
             f"{path}, line {number}: damaged; expected a JSON object with "
-            f"{', '.join(_TYPES)}, as written by a run; the line may be deleted"
+            f"{', '.join(_TYPES)}, as written by a run; you can delete this line"
         )
     return Fault(**fields)

@@ -135,8 +135,8 @@ def on_cluster(
                 if isinstance(e, InputError) or not is_gone:
                     raise
                 raise InputError(
-                    f"the Dask scheduler at {address} is gone; start one, and the same "
-                    "command continues"
+                    f"the Dask scheduler at {address} is gone; start "
+                    "a scheduler at this address, and repeat the command to continue"
                 ) from e
 
         yield opened

@@ -142,7 +142,7 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        If ranks emit a QP and execute no code of plug-ins, the ranks also judge the
+        If ranks emit a QP and execute no plug-in code, the ranks also judge the
         answer. The case is then built only for values that the ranks cannot evaluate.
 
         Raises

@@ -58,7 +58,8 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
 
     Returns
     -------
-    the nodes in elimination order, and the fronts of positions in that order
+    the nodes in elimination order, and the fronts, which are sets of positions in this
+    order
 
     """
     nodes = len(points)

@@ -67,7 +67,7 @@ class _QPSModel:
 
 
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
-    """Parse a QPS text; return the problem and the sign of its objective.
+    """Parse the text of a QPS file; return the problem and the sign of its objective.
 
     If the objective is to be maximised, the sign is −1, and the returned problem is to
     minimise the negative objective, including its constant.
@@ -103,7 +103,7 @@ def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
 
 
 def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
-    """Write `qp` as a QPS text; an operator P is assembled.
+    """Write `qp` as a QPS file; an operator P is assembled.
 
     meta : metadata of plain types, written as comments because QPS has no metadata
 
@@ -136,7 +136,7 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of a QPS text.
+    """Yield the lines of a QPS file.
 
     Rows e1, e2, … represent Ax = b, rows i1, i2, … represent Gx ≤ h, and columns x1,
     x2, … represent the variables.

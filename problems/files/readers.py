@@ -26,7 +26,7 @@ from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 #: constant
 Loaded = tuple[QP, float, float]
 
-#: bound on the memory of the Python objects of a QPS text, relative to the file size
+#: bound on the memory of the Python objects of a QPS file, relative to the file size
 _COPIES = 16
 
 
@@ -68,11 +68,11 @@ def _parquet(path: Path) -> Loaded:
 
 
 def _qps(path: Path) -> Loaded:
-    data = content(path, "a QPS text", copies=_COPIES)
+    data = content(path, "a QPS file", copies=_COPIES)
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8; expected a QPS text") from None
+        raise InputError(f"{path}: not UTF-8; expected a QPS file") from None
     with located(str(path)):
         two_sided, sign = parse_qps(text)
         return one_sided(two_sided), sign, sign * two_sided.r

@@ -55,7 +55,7 @@ def headline(c: Comparison) -> str:
 
 
 def sentences(c: Comparison) -> tuple[str, ...]:
-    """Return sentences on conditions, and counts of changes."""
+    """Return sentences about conditions, times and numbers of changes."""
     if not c.pairs:
         return (TEXT("nothing", c),)
     by_name = _named_sentences(c)

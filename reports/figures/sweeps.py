@@ -54,7 +54,7 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
         return None
     points: dict[tuple[str, bool], list[tuple[Any, float, Outcome]]] = {}
     for o in shown:
-        time, excess = o.seconds("total"), (o.worst or 0.0) / o.first.asked_tol
+        time, excess = o.seconds("total"), (o.worst or 0.0) / o.first.judged_at
         point = time and time.value, max(excess, _LEAST_RATIO), o
         points.setdefault((o.solver, o.verified), []).append(point)
     looks = {s: replace(look(i), dash=None) for i, s in enumerate(evidence.solvers)}

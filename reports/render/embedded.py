@@ -160,7 +160,7 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Encode a column by distinct values if they are few; 1, 1.0 and True differ."""
+    """Dictionary-encode a column if few values are distinct; 1, 1.0 and True are."""
     tables = {
         id(v): v for v in values if type(v) in (dict, list)
     }  # many records share one object

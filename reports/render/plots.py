@@ -1,6 +1,7 @@
-"""Figures of curves as plain data for the script of the page.
+"""Conversion of figures with curves to plain data for the script of the page.
 
-Labels contain mathtext formulas of matplotlib; the page shows them as plain text.
+Formulas in labels are written in matplotlib's mathtext; the page shows them as plain
+text.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""All modules are in one package, so that files of the user with the names of its
-folders are harmless.
-"""
+"""All modules are in one package, so a user's files may have the names of its folders."""
 
 import subprocess
 import sys

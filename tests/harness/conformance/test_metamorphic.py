@@ -171,7 +171,10 @@ def test_names_and_units_change_no_residual_at_any_point(
 
 
 def preimage(qp, new):
-    """Invert the affine map `recover`, given its images of unit vectors."""
+    """Return the inverse of the affine map `new.recover`.
+
+    The map is found from its values at zero and at the unit vectors.
+    """
     parts = ("x", "y", "z", "z_box")
     sizes = [new.qp.q.size, new.qp.b.size, new.qp.h.size, new.qp.q.size]
     cuts = np.cumsum(sizes)[:-1]

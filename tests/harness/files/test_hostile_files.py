@@ -306,7 +306,7 @@ def test_a_damaged_gzip_file_is_refused(tmp_path, damage):
     with pytest.raises(InputError) as e:
         build(tmp_path / "a.qps.gz")
     assert str(e.value) == (
-        f"{tmp_path}/a.qps.gz: not a gzip file, or damaged; expected a QPS text, "
+        f"{tmp_path}/a.qps.gz: not a gzip file, or damaged; expected a QPS file, "
         "compressed"
     ) or (damage == b"" and "no ENDATA" in str(e.value))
 

@@ -321,7 +321,7 @@ def test_a_lost_scheduler_ends_the_run_and_the_same_command_continues(
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", cluster.address)
     before = measured("d")
     assert code == 2
-    assert err.splitlines()[-1].endswith("the same command continues")
+    assert err.splitlines()[-1].endswith("and repeat the command to continue")
 
     cluster.close()
     assert cli("run", "toy.toml", "--out", "d")[0] == 0

@@ -108,8 +108,8 @@ def test_stiffness_and_load_are_mirrored(bodies):
 
 
 def kinked(bodies):
-    """Return a displacement that bends the beam to a V, whose tip is the closest point
-    of several nodes."""
+    """Return a displacement that bends the beam into a V whose tip is the closest point
+    to several nodes."""
     u = np.zeros((len(bodies.mesh.points), 2))
     beam = bodies.body_of_node == 0
     u[beam, 1] = 2 * abs(bodies.mesh.points[beam, 0] - 1.0625)

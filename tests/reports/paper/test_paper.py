@@ -379,7 +379,10 @@ def test_published_times_are_compared_at_the_published_size_only(experiment):
 
 
 def with_orders(p):
-    """Return tips and forces with errors of 0.1·steps⁻ᵖ."""
+    """Return rows with relative errors of 0.1·steps⁻ᵖ, and the exact row.
+
+    The errors are those of `tip_x` and `force_y`.
+    """
 
     def row(steps, relin, error):
         return {"steps": steps, "relin": relin, "tip_x": 3 * (1 + error), "tip_y": 4,

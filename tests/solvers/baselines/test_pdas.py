@@ -280,7 +280,7 @@ def test_an_operator_is_declined():
 
 
 def test_the_forms_of_a_contact_problem_agree():
-    """Multipliers of the contact rows and displacements equal those of the
+    """The displacements and the multipliers of contact rows equal those of the
     reference.
     """
     family, forms = PROBLEMS["beam-ring"], ("dual-bounds", "dual", "primal")
