@@ -11,17 +11,12 @@ import mortarbench as mb
 from mortarbench.harness import QP, Box, Cones, Discs, Solution, Status
 from mortarbench.solvers import SOLVERS
 from tests.support.discs import mindlin, natural_map, qp_on_cones, qp_on_discs
+from tests.support.slow_seeds import seeds
 
 SMALBES = ["smalbe", "smalbe-paper", "smalbe-espreso"]
 ON_CONES = ["projected-gradient", "apgd", "nsgs"]
 ON_DISCS = [*ON_CONES, *SMALBES]
 TOL = 1e-9
-
-
-def seeds(few, all_):
-    """Return the seeds below `all_`; those from `few` on are slow."""
-    slow = pytest.mark.slow
-    return [*range(few), *(pytest.param(k, marks=slow) for k in range(few, all_))]
 
 
 def solve(name, qp, tol=TOL, **options):

@@ -1,5 +1,7 @@
 """Every solver that accepts discs or cones finds planted solutions."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,15 @@ FEW = ("discs", "cones", "discs and cones")
 #: square root of the gap. These are the largest errors in x at their smallest
 #: tolerance, about twice the largest of 1250 QPs.
 ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def only_own_garbage():
+    """Exclude the objects of other tests from the collections of `measure`, which would
+    take most of the time.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def faults(name, shape, seeds):

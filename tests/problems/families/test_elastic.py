@@ -16,12 +16,17 @@ PATCH = PROBLEMS["contact-patch"]
 STRETCHED = dict(lower=3, upper=2, ratio=3.0)
 
 
-@pytest.mark.parametrize("form", ["primal", "dual"])
 @pytest.mark.parametrize(
-    ("law", "keys"),
-    [(FrictionLaw("tresca", bound=1e5), dict(friction="tresca", bound=1e5)),
-     (FrictionLaw("coulomb", mu=0.1), dict(friction="coulomb", mu=0.1)),
-     (None, {})],
+    ("law", "keys", "form"),
+    [
+        pytest.param(law, keys, form, marks=[pytest.mark.slow] * (i % 2 != j))
+        for i, (law, keys) in enumerate([
+            (FrictionLaw("tresca", bound=1e5), dict(friction="tresca", bound=1e5)),
+            (FrictionLaw("coulomb", mu=0.1), dict(friction="coulomb", mu=0.1)),
+            (None, {}),
+        ])
+        for j, form in enumerate(["primal", "dual"])
+    ],
 )  # fmt: skip
 def test_a_case_of_one_step_equals_the_case_of_the_family(form, law, keys):
     params = PATCH.complete(STRETCHED | keys)

@@ -350,8 +350,12 @@ def sheared_blocks(described):
     return lambda toml=SHEARED: described(mesh, toml)
 
 
-@pytest.mark.parametrize("contact", ["nts", "mortar"])
-@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize(
+    ("contact", "form"),
+    [("nts", "dual"), ("mortar", "primal"),
+     pytest.param("nts", "primal", marks=pytest.mark.slow),
+     pytest.param("mortar", "dual", marks=pytest.mark.slow)],
+)  # fmt: skip
 @pytest.mark.parametrize("step", [pytest.param(1, marks=pytest.mark.slow), 2, 3])
 def test_a_block_held_by_friction_is_loaded_in_steps(
     sheared_blocks, contact, form, step

@@ -60,7 +60,7 @@ def test_radius_pressure_and_approach_are_those_of_hertz(n, limit):
         "n=2/against=sphere/Q=0.5/",
     ],
 )
-@pytest.mark.parametrize("tol", [1e-6, 1e-8])
+@pytest.mark.parametrize("tol", [1e-6, pytest.param(1e-8, marks=pytest.mark.slow)])
 def test_contact_forces_balance_the_load_more_accurately_than_the_tolerance(keys, tol):
     """Without projections at the end of a solve, the error of the balance was up to
     3.2e-9.

@@ -16,18 +16,12 @@ from mortarbench.solvers.smalbe import rows as rows_module
 from mortarbench.solvers.smalbe.driver import outer_loop, recovered
 from mortarbench.solvers.smalbe.projected import by_lanczos as compiled_by_lanczos
 from mortarbench.solvers.smalbe.projected import projected_problem as compiled_problem
+from tests.support.slow_seeds import seeds
 from tests.support.textbook import loop
 from tests.support.textbook.outer_loop import first_iterate
 from tests.support.textbook.projected import by_lanczos, projected_problem
 
 pytestmark = pytest.mark.together
-
-
-def seeds(few, all_):
-    """Return the seeds below `all_`; those from `few` on are slow."""
-    slow = pytest.mark.slow
-    return [*range(few), *(pytest.param(k, marks=slow) for k in range(few, all_))]
-
 
 PRESETS = ["smalbe", "smalbe-permon", "smalbe-espreso", "smalbe-paper"]
 

@@ -11,17 +11,12 @@ from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.smalbe.compiled import IncompleteFactor, sparsity
 from mortarbench.solvers.smalbe.preconditioner import has_sparse_factor
+from tests.support.slow_seeds import seeds
 from tests.support.sparse_qps import laplacian, qp_with_minimum, sparse_matrix
 from tests.support.textbook.incomplete import incomplete_cholesky, incomplete_inverse
 
 FACTORS = replace(SOLVERS["smalbe"], preconditioner="incomplete")
 KEEP = 0.95  #: share of dropped entries that goes to the diagonal
-
-
-def seeds(few, all_):
-    """Return the seeds below `all_`; those from `few` on are slow."""
-    slow = pytest.mark.slow
-    return [*range(few), *(pytest.param(k, marks=slow) for k in range(few, all_))]
 
 
 def factor(P, keep=True):
