@@ -1,4 +1,4 @@
-"""All modules are in one package, so a user's files may have the names of its folders."""
+"""All modules are in one package, so a user's files may be named like its folders."""
 
 import subprocess
 import sys
