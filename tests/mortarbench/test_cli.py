@@ -80,7 +80,7 @@ def test_problems_are_listed_with_defaults_and_forms(cli):
 
     assert code == 0
     assert (
-        out == "well  A parabola over a half line.  n=3 depth=1  primal | dual\n"
+        out == "well  Separable quadratics over x ≥ 0.  n=3 depth=1  primal | dual\n"
     )  # the first of two sentences
 
 
@@ -89,7 +89,7 @@ def test_solvers_are_listed_one_line_each(cli):
 
     assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
     first = " ".join(out.splitlines()[0].split())
-    assert first == "exact Solver for a diagonal P. factor=1.0 reason=None"
+    assert first == "exact Solver for P = I and inactive bounds. factor=1.0 reason=None"
     assert "Lost(" not in out  # the docstring is only the signature by dataclass
 
 
@@ -102,9 +102,9 @@ def test_suites_are_listed_with_their_purpose(cli):
     [
         ("problems", {"name": "well", "forms": ["primal", "dual"],
                       "defaults": {"n": 3, "depth": 1},
-                      "description": "A parabola over a half line."}),
+                      "description": "Separable quadratics over x ≥ 0."}),
         ("solvers", {"name": "exact", "options": {"factor": 1.0, "reason": None},
-                     "description": "Solver for a diagonal P."}),
+                     "description": "Solver for P = I and inactive bounds."}),
     ],
 )  # fmt: skip
 def test_lists_can_be_printed_as_one_json_array(cli, what, expected):

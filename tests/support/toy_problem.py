@@ -70,7 +70,7 @@ class Well:
 
 @dataclass(frozen=True)
 class Exact:
-    """Solver for P = I and inactive bounds, only for toy problems."""
+    """Solver for P = I and inactive bounds."""
 
     factor: float = 1.0
     reason: str | None = None
