@@ -61,6 +61,7 @@ def folder_of_user(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [["script.py"], pytest.param(["-c", PROGRAM], marks=pytest.mark.slow)],

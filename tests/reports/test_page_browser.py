@@ -325,6 +325,7 @@ def test_redrawn_tables_equal_the_written_ones(visit, folder):
     assert page.evaluate(f"{bodies}.map((t) => t{clean})") == written
 
 
+@pytest.mark.slow
 def test_a_redrawn_hostile_table_equals_the_written_one(visit, hostile):
     page = visit(hostile)
     rows = "[...document.querySelectorAll('tbody tr')].map((r) => r.innerText.trim())"

@@ -151,6 +151,7 @@ def test_a_planted_error_is_measured_and_only_its_solver_is_named(
     assert found["error"] >= found["assessment"]["error"]
 
 
+@pytest.mark.slow
 def test_answers_of_all_forms_that_are_exact_agree(truths, tmp_path, cli, only_svg):
     answers = [
         (label, f"{BEAM}/step={step}/{form}", s)

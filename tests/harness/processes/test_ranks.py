@@ -321,6 +321,7 @@ params = { S = 2, n = 4 }
 """
 
 
+@pytest.mark.slow
 def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))

@@ -259,6 +259,7 @@ def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
     assert said[0].startswith("2.mat (1 MiB) is not copied to the result folder")
 
 
+@pytest.mark.slow
 def test_merged_folders_have_one_copy_of_a_file_at_two_paths(
     measured, tmp_path, monkeypatch
 ):

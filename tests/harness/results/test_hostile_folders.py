@@ -228,6 +228,7 @@ def test_a_pipe_in_a_folder_is_refused_at_once(sent, command, name):
         assert f"{pipe} is a link, pipe or device" in err
 
 
+@pytest.mark.slow
 def test_links_to_a_folder_or_among_other_files_are_accepted(sent, command, tmp_path):
     folder = sent(record("a.npz"))
     (folder / "notes").symlink_to(tmp_path)

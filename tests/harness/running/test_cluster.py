@@ -337,6 +337,7 @@ def descendants(process):
     return [*children, *(d for child in children for d in descendants(child))]
 
 
+@pytest.mark.slow
 def test_a_finished_run_leaves_nothing_on_the_nodes(cli, cluster):
     worker = cluster.join()
     assert soon(lambda: descendants(worker.pid))  # processes that would outlive the run
@@ -435,6 +436,7 @@ except mb.InputError as e:
 """
 
 
+@pytest.mark.slow
 def test_a_script_without_a_main_guard_is_refused_in_one_line(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
     text = suite_of(CASES).replace("well", "string").replace('"dual"', '"primal"')

@@ -59,6 +59,7 @@ def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force,
     assert values["friction_residual"] <= 1e-10
 
 
+@pytest.mark.slow
 def test_an_unreachable_bound_makes_open_rows_stick_as_well():
     """The expected digits are the limit g → ∞ of the other code, with all rows of the
     arc."""

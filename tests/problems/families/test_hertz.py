@@ -234,6 +234,7 @@ def test_unloading_causes_reverse_slip_from_the_edge(Q):
     assert got["stick"] == pytest.approx(40 * np.sqrt(1 - (0.6 - Q) / 2), abs=2)
 
 
+@pytest.mark.slow
 def test_under_proportional_load_only_the_edge_nodes_slip():
     """For a single static load, the tractions are as if Q had been applied last."""
     keys = dict(n=6, m=6, Q=0.5)
