@@ -5,8 +5,15 @@ import pytest
 from scipy.sparse import csr_array
 
 from mortarbench.harness.mechanics import NO_FRICTION, AdmissibleForces, Exact, Real
+from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.verify import admissible as module
-from mortarbench.harness.verify.admissible import admissible, feasible_at_rows
+from mortarbench.harness.verify.admissible import (
+    _newton,
+    admissible,
+    feasible_at_rows,
+    relative,
+    supported_and_floating,
+)
 from tests.support.supported_by_contact import disc_between_plates
 
 
@@ -65,6 +72,71 @@ def test_supported_bodies_are_scaled_until_admissible():
     assert found.theta == pytest.approx(1 / 2)
     assert found.u.astype(float) == pytest.approx([1, 1.5])
     assert (found.u <= [1, 2]).all()
+
+
+def test_a_row_that_is_closed_at_zero_scales_a_displacement_to_zero():
+    found = moved(np.eye(2), [0, 2], [2, 3], softness=[0, 0])
+
+    assert found.theta == 0
+    assert (found.u == 0).all()
+
+
+def test_rows_with_negative_entries_are_satisfied_in_the_last_digit():
+    """From (1, 1), u₁ + u₂ ≥ 3 is satisfied by δ = (½, ½)."""
+    found = moved([[-1, -1]], [-3], [1, 1])
+
+    assert found.u.astype(float) == pytest.approx([1.5, 1.5], rel=1e-12)
+    assert found.u.sum() >= 3
+
+
+def test_multipliers_are_relative_to_the_largest():
+    for given, expected in (([1, 2, 4], [0.25, 0.5, 1]), ([0, -1, 0], [1, 1, 1])):
+        assert (relative(np.array(given, dtype=Real)) == expected).all()
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
+@pytest.mark.parametrize(("size", "supported"), [(1e-4, 2), (1e-6, 1)])
+def test_a_motion_floats_relative_to_the_best_supported_one(size, supported, unit):
+    G = unit * np.diag([1, size]).astype(Real)
+    held, floating = supported_and_floating(G, np.ones(2, dtype=Real))
+
+    assert (held.shape[1], floating.shape[1]) == (supported, 2 - supported)
+
+
+def near(multipliers, w, G, load, discs):
+    """Return the nearest multipliers with Gᵀλ = load, for a single motion."""
+    multipliers, w, G, load = (
+        np.array(v, dtype=Real) for v in (multipliers, w, G, load)
+    )
+    return _newton(
+        AdmissibleForces(w.size, discs), multipliers, w, G[:, None], load,
+        lambda lam: np.abs(load) + np.abs(G)[None] @ np.abs(lam),
+    )  # fmt: skip
+
+
+def test_rows_without_weight_keep_their_multipliers():
+    """λ₁ + λ₂ + λ₃ = 3.1 with λ₃ = 0.1 fixed adds ½ to λ₁ = λ₂ = 1."""
+    G = np.full(3, 0.5**0.5)
+    found = near([1, 1, 0.1], [1, 1, 0], G, [G @ [1.5, 1.5, 0.1]], NO_FRICTION.discs(3))
+
+    assert found.astype(float) == pytest.approx([1.5, 1.5, 0.1], rel=1e-15)
+
+
+def test_friction_at_its_bound_leaves_the_load_to_weakly_coupled_contact():
+    """λ₂ ≤ 1 is reached, so λ₁ alone balances 0.1λ₁ + √0.99λ₂ = 0.2 + √0.99."""
+    G = np.array([0.1, 0.99**0.5])
+    found = near([1, 1], [1, 1], G, [G @ [2, 1]], Discs([[1]], [1]))
+
+    assert found.astype(float) == pytest.approx([2, 1], rel=1e-14)
+
+
+def test_motions_that_change_no_gap_are_removed():
+    mechanics = disc_between_plates().mechanics
+    free = mechanics.motions.free
+    none = np.zeros(mechanics.exact.c.size, dtype=bool)
+    found = admissible(mechanics, free @ np.array([1e-3, 2e-3], dtype=Real), none)
+
+    assert np.abs(free.T @ found).max() <= 1e-18
 
 
 def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypatch):

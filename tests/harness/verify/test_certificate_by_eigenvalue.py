@@ -14,6 +14,7 @@ import mortarbench as mb
 from mortarbench.harness import Case, Solution, Status
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.verify.certificate import (
+    PRODUCT_ROUNDING,
     UncertifiableError,
     certify_by_eigenvalue,
 )
@@ -122,6 +123,20 @@ def test_an_interior_point_is_bounded_without_its_multipliers():
         s = Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=np.full(2, 7.0))
         found = certify_by_eigenvalue(qp, s, 1.0)
         assert delta <= found.bound <= 1.01 * delta
+
+
+@pytest.mark.parametrize("stiffness", [0.25, 4.0, 2.0**20])
+def test_the_bound_of_an_exact_solution_is_the_rounding_of_its_products(stiffness):
+    """min ½d‖x‖² − dx₁ at (1, 0) has r = 0 and terms 2d‖x‖ + ‖q‖ = 3d; √μ = √d."""
+    qp = mb.QP.from_arrays(stiffness * np.eye(2), [-stiffness, 0])
+    x, none = np.array([1.0, 0]), np.zeros(0)
+    s = Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=0 * x)
+    found = certify_by_eigenvalue(qp, s, stiffness)
+
+    expected = 3 * stiffness**0.5 * PRODUCT_ROUNDING
+    assert (found.x == x).all()
+    assert found.distance == pytest.approx(expected, rel=1e-9)
+    assert found.norm == pytest.approx(stiffness**0.5, rel=1e-12)
 
 
 class Scaled:

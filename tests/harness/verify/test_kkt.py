@@ -20,7 +20,13 @@ from mortarbench.harness import (
 from mortarbench.harness.conformance.manufactured import manufactured
 from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
 from mortarbench.harness.operators import SerialisableOperator
-from mortarbench.harness.verify.kkt import energy_at
+from mortarbench.harness.verify.kkt import (
+    NEGLIGIBLE,
+    energy_at,
+    largest_eigenvalue,
+    own_sizes,
+    scales_at,
+)
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.adapters.osqp_ import OSQP
@@ -59,6 +65,23 @@ def test_a_multiplier_on_an_absent_bound_fails():
     assert r.dual == pytest.approx(1)
 
 
+def test_a_wrong_sign_is_measured_without_the_multipliers_of_other_rows():
+    """min ½x² − x, x ≤ 0 (twice): x* = 0 with z₁ + z₂ = 1."""
+    qp = replace(one_variable(q=-1.0), G=np.ones((2, 1)), h=np.zeros(2))
+    s = replace(point(0.0), z=np.array([-1e-6, 1.0]))
+
+    assert kkt_residuals(qp, s).dual == pytest.approx(1e-6)
+
+
+def test_forces_at_rest_are_relative_to_the_stiffness_of_soft_variables():
+    """P = ¼, x ≤ 10: the natural energy is 25, E = ¼ and √(EP) = ¼."""
+    qp = replace(one_variable(q=0.0, h=99.0), P=np.eye(1) / 4, ub=np.array([10.0]))
+    qp = replace(qp, G=no_rows(1), h=np.zeros(0))
+    s = replace(point(0.0, z_box=-0.01), z=np.zeros(0))
+
+    assert kkt_residuals(qp, s).dual == pytest.approx(0.04)
+
+
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_box_multiplier_pushing_outwards_fails(sign):
     """An active bound has the multiplier of the opposite bound, balanced by q."""
@@ -86,12 +109,14 @@ def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
         # E = xᵀPx = 2: the energy changes by E over the length √(E/P₁₁) = √2 > |x₁|
         (dict(A=np.ones((1, 2)), b=np.array([1.75])), 0.25 / (1.75 + 2 * 2**0.5)),
         (dict(A=np.ones((1, 2)), b=np.array([2.25])), 0.25 / (2.25 + 2 * 2**0.5)),
+        (dict(A=np.array([[1, -1.0]]), b=np.array([0.25])),
+         0.25 / (0.25 + 2 * 2**0.5)),
         (dict(G=np.ones((1, 2)), h=np.array([1.75])), 0.25 / (1.75 + 2 * 2**0.5)),
         (dict(lb=np.array([1.25, -np.inf])), 0.25 / (1.25 + 2**0.5)),
         (dict(ub=np.array([np.inf, 0.75])), 0.25 / (0.75 + 2**0.5)),
     ],
-    ids=["A x > b", "A x < b", "G x > h", "x < lb", "x > ub"],
-)
+    ids=["A x > b", "A x < b", "difference", "G x > h", "x < lb", "x > ub"],
+)  # fmt: skip
 def test_each_violated_constraint_is_measured_relative_to_its_terms(broken, expected):
     """Each constraint is violated by ¼ at x = (1, 1)."""
     free = dict(
@@ -232,6 +257,13 @@ def test_the_verdict_follows_from_the_residuals_at_tol_1e_8(claimed, worst, expe
     assert verdict(claimed, Residuals(0, worst, 0, 0), 1e-8) is expected
 
 
+def test_a_claim_of_infeasibility_is_verified_by_a_proof_only():
+    none = Residuals(*[np.nan] * 4)
+
+    found = [verdict(Status.INFEASIBLE, none, 1e-8, infeasible=v) for v in (1, 0)]
+    assert found == [Verdict.VERIFIED_INFEASIBLE, Verdict.INFEASIBLE_CLAIM]
+
+
 def test_a_loose_tolerance_does_not_verify_a_refutation():
     assert verdict(Status.SOLVED, Residuals(0, 1.0, 0, 0), 0.5) is Verdict.WRONG
     assert verdict(Status.SOLVED, Residuals(0, 0.05, 0, 0), 0.5) is Verdict.VERIFIED
@@ -320,6 +352,7 @@ def test_rounding_in_products_with_an_operator_does_not_refute_an_answer():
     [
         (diagonal([1], [-1]), 1 / 2),  # |½x² − x| at x = 1
         (diagonal([4], [-1]), 1 / 8),
+        (diagonal([0.25], [-1]), 2),  # at x = 4
         (diagonal([1], [-1], ub=10), 1 / 2),
         (diagonal([1], [-1], ub=0.5), 3 / 8),  # at x = ½
         (diagonal([1], [0], ub=10), 100),  # no cost: Pl² over the length of the bound
@@ -334,6 +367,51 @@ def test_the_least_energy_scale_is_a_hundredth_of_the_gain_of_one_variable(
         found = energy_at(qp, nowhere)
 
     assert found == pytest.approx(expected / 100)
+
+
+def test_the_generous_energy_scale_is_the_lower_median_of_the_gains():
+    """The gains q²/2P of the variables are ½, ⅛ and 1/32."""
+    for bends, expected in (([1], 1 / 2), ([1, 4], 1 / 8), ([1, 4, 16], 1 / 8)):
+        qp = diagonal(bends, [-1] * len(bends))
+        nowhere = at(0 * qp.q, z_box=0 * qp.q)
+        with np.errstate(invalid="ignore"):  # 0·∞ for absent bounds
+            found = energy_at(qp, nowhere, generous=True)
+
+        assert found == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("unit", [2.0**-20, 1.0, 2.0**20])
+def test_multipliers_that_cancel_hide_a_gap_of_at_most_a_small_fraction(unit):
+    """min ½x², x = 1 (twice): the multipliers −2³⁹ − 1 − δ and 2³⁹ leave a gap of δ.
+
+    The rounding of their sum, 2e-3, exceeds δ = 2⁻¹⁰, but is not subtracted entirely.
+    """
+    gap = 2.0**-10
+    qp = diagonal([unit], [0], A=[[1], [1]], b=[1, 1])
+    s = at([1], [-unit * (2.0**39 + 1 + gap), unit * 2.0**39], z_box=[0])
+
+    expected = gap / (1 + gap) - NEGLIGIBLE
+    assert kkt_residuals(qp, s).gap == pytest.approx(expected, rel=1e-9)
+
+
+def test_only_active_rows_define_the_sizes_of_idle_variables():
+    """x₁ + x₂ ≤ 100 is active up to a slack of 2e-4 · 200."""
+    qp = replace(
+        diagonal([1, 0], [-100, 0]), G=np.array([[1.0, 1.0]]), h=np.array([100.0])
+    )
+
+    for x, size in ((-0.01, 200), (-1.0, 1)):
+        sizes = scales_at(qp, np.array([100, x]), 1e4).x
+        assert sizes == pytest.approx([100, size])
+
+
+def test_sizes_of_variables_are_positive():
+    assert (own_sizes(diagonal([1, 1], [0, 0]), np.array([-1.0, 2])) == [10, 20]).all()
+
+
+@pytest.mark.parametrize("d", [0, 4])
+def test_the_largest_eigenvalue_may_be_zero(d):
+    assert largest_eigenvalue(diagonal([0, d], [1, 1])) == pytest.approx(d)
 
 
 class Diagonal:

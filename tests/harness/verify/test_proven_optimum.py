@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from scipy.sparse import eye_array
+from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import (
     QP,
@@ -19,6 +19,7 @@ from mortarbench.harness import (
 from mortarbench.harness.record import Record
 from mortarbench.harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
 from mortarbench.harness.verify.optimum import (
+    coupled,
     decided,
     error_at,
     exact_optimum,
@@ -361,22 +362,53 @@ def test_active_sets_that_recur_prove_nothing():
     assert known.value < 0
 
 
+@pytest.mark.parametrize("coupling", [0, 1])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point(sign):
-    """x₁ + x₂ = 2 (twice) and x₁ = x₂: the least multipliers are used."""
+def test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point(sign, coupling):
+    """x₁ + x₂ = 2 (twice) and x₁ = x₂: the least multipliers are used.
+
+    If P couples all variables, they are too many for rational arithmetic.
+    """
     A = np.zeros((3, MANY))
     A[:, :2] = sign * np.array([[1, 1], [1, 1], [1, -1]])
-    q = np.zeros(MANY)
-    q[:2] = -1, -3
-    qp = qp_of(np.eye(MANY), q, A=A, b=[sign * 2, sign * 2, 0])
+    q = np.full(MANY, -2.0 * coupling)
+    q[:2] -= 1, 3
+    qp = qp_of(np.eye(MANY) + coupling, q, A=A, b=[sign * 2, sign * 2, 0])
     x = np.where(np.arange(MANY) < 2, 1.0, 0.0)
     y = sign * np.array([1 + 2.0**40, -(2.0**40), -1])
 
     optimum = proven_optimum(qp, lambda _: at(x, y))
 
     assert optimum is not None
-    assert optimum.value == -3
+    assert optimum.value == -3 - 2 * coupling
     assert optimum.doubt <= 1e-13
+
+
+def test_a_multiplier_of_a_bound_balances_the_gradient_in_a_proof():
+    """x* = (0, 1, …, 1) for many coupled variables; the bound x₁ ≥ 0 has z_box = −1."""
+    P, x, pull = np.eye(MANY) + 1, np.ones(MANY), np.zeros(MANY)
+    x[0], pull[0] = 0, -1
+    qp = qp_of(P, -(P @ x) - pull, lb=0)
+
+    optimum = proven_optimum(qp, lambda _: at(x, z_box=pull))
+
+    assert optimum is not None
+    assert optimum.value == -(MANY - 1) * MANY / 2
+    assert optimum.doubt <= 1e-10
+
+
+def test_an_objective_without_terms_has_no_scale():
+    assert proven_optimum(qp_of([0], [0]), lambda _: at([0])) is None
+
+
+def test_variables_are_coupled_by_entries_other_than_zero():
+    """x₁ and x₂ are coupled by P, x₅ by a row; stored zeros couple no variables."""
+    row, column = [0, 0, 1, 1, 2, 3], [0, 1, 0, 1, 3, 2]
+    P = csr_array(([2.0, 1, 1, 2, 0, 0], (row, column)), shape=(5, 5))
+    qp = replace(qp_of([0] * 5, [0] * 5, A=[[0, 0, 0, 0, 1]], b=[1]), P=P)
+
+    assert P.nnz == 6
+    assert coupled(qp).tolist() == [True, True, False, False, True]
 
 
 @pytest.mark.parametrize(("rows", "expected"), [(0, True), (1, False)])
