@@ -31,6 +31,7 @@ from mortarbench.reports.figures.style import curve, legible, look
 PANELS = 4  #: largest number of forms in a figure
 SOLVERS = 12  #: largest number of solvers in a panel
 _NAME = 28  #: largest number of characters of a name beside an axis
+_CASES = 88  #: largest number of characters of the cases in the titles of a row
 _ROW = 0.3  #: height of a row, inches
 _BESIDE = 0.24  #: distance between a mean and the ratios of its cases, rows
 _TALL = 0.38  #: height of rows with ratios and a verdict, inches
@@ -54,7 +55,7 @@ def fastest_figure(
     if not shown:
         return None
     columns = min(len(shown), 2)
-    panels = _on_one_scale([_panel(f, solvers, most) for f in shown])
+    panels = _on_one_scale([_panel(f, solvers, most, _CASES // columns) for f in shown])
     rows = []
     for i in range(0, len(shown), columns):
         height = 0.75 + max(_height(f, most) for f in shown[i : i + columns])
@@ -76,8 +77,11 @@ def _height(f: FastestSolver, most: int) -> float:
     return max(len(_rows(f, most)), 4) * (_TALL if shared else _ROW)
 
 
-def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
-    """Draw times relative to the fastest solver, which is in the top row."""
+def _panel(f: FastestSolver, solvers: Sequence[str], most: int, length: int) -> Panel:
+    """Draw times relative to the fastest solver, which is in the top row.
+
+    length : largest number of characters of the cases in the title
+    """
     marks: list[Mark] = []
     texts = []
     for k, c in enumerate(_rows(f, most)):
@@ -101,7 +105,7 @@ def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
         marks=tuple(marks),
         rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if _has_reference(f) else (),
         texts=tuple(texts),
-        title=f"{legible(f.key.title)}, {legible(_cases(f), 44)}",
+        title=f"{legible(f.key.title)}, {legible(_cases(f), length)}",
         grid="x",
     )
 
