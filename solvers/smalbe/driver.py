@@ -148,7 +148,30 @@ def prepared(
     task = _Task(
         qp, inner, eliminated, scaled, problem, options, rho, loop, history, carry
     )
-    return lambda: _solve_to_tolerance(task, tol)
+    if eliminated is None or not has_discs:
+        return lambda: _solve_to_tolerance(task, tol)
+    plain = replace(options, eliminate="never")
+    whole = partial(prepared, qp, tol, plain, None, in_sequence=in_sequence)
+    return lambda: _with_second_attempt(_solve_to_tolerance(task, tol), whole)
+
+
+def _with_second_attempt(
+    first: tuple[Solution, Callable[[], Carry | None]], prepare: Callable[[], Solve]
+) -> tuple[Solution, Callable[[], Carry | None]]:
+    """Return the first result, or a second one without elimination if it failed.
+
+    If rows of discs depend exactly on the rows of free variables, the reduced P
+    consists of rounding errors along these rows, and large discs permit large motions
+    along them. The counts of products and iterations include both attempts.
+    """
+    spent = first[0]
+    if spent.status is Status.SOLVED:
+        return first
+    s, left = prepare()()
+    products = spent.counts.get("P_products", 0) + s.counts.get("P_products", 0)
+    iterations = (spent.iterations or 0) + (s.iterations or 0)
+    counts = {**s.counts, "P_products": products}
+    return replace(s, iterations=iterations, counts=counts), left
 
 
 def _on_discs(qp: QP, options: Options) -> Options:

@@ -260,3 +260,29 @@ def test_friction_along_supports_takes_few_products_for_any_stiffness(tmp_path, 
 
     assert s.status is Status.SOLVED
     assert s.counts["P_products"] - s.counts["factorised_columns"] < 600
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(12), pytest.param(range(12, 400), marks=pytest.mark.slow)]
+)
+def test_discs_that_depend_exactly_on_free_variables_are_solved(seeds):
+    """P = WWᵀ with W_I = T W_E: the Schur complement consists of rounding errors, along
+    which large discs permit large motions.
+    """
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        k, e = 2 * int(rng.integers(1, 4)), int(rng.integers(1, 7))
+        W = rng.standard_normal((e, e))
+        W = np.vstack([W, rng.standard_normal((k, e)) @ W])
+        P = W @ W.T
+        qp = QP(
+            P=(P + P.T) / 2, q=-P @ rng.standard_normal(e + k),
+            A=np.zeros((0, e + k)), b=np.zeros(0), G=no_rows(e + k), h=np.zeros(0),
+            sets=(Box.unbounded(e + k), Discs(
+                np.arange(e, e + k).reshape(-1, 2), rng.choice([1.0, 1e8], size=k // 2)
+            )),
+        )  # fmt: skip
+        s = SMALBE().prepare(qp, 1e-8)()
+
+        assert s.status is Status.SOLVED, seed
+        assert kkt_residuals(qp, s).worst <= 5e-8, seed
