@@ -545,7 +545,7 @@ class Mechanics:
     to_primal: Callable[[Solution], Solution]
     factorise: Callable[
         [], Inverse
-    ]  #: factorises K and returns K⁺; called at the first access to `inverse`
+    ]  #: factorises K and returns K⁺; called on first access to `inverse`
     #: cell size of the contact side, in the unit of length of `primal`
     mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, for checks of
@@ -585,7 +585,7 @@ class Mechanics:
 
     @cached_property
     def inverse(self) -> Inverse:
-        """Generalised inverse K⁺; K is factorised at the first access."""
+        """Generalised inverse K⁺; K is factorised on first access."""
         return self.factorise()
 
     @cached_property

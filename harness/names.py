@@ -41,7 +41,7 @@ _TYPE_NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class CaseId:
-    """A valid choice of family, keys and form; `str` returns the canonical name."""
+    """A family, a form, and valid values of all keys; `str` is the canonical name."""
 
     family: Family = field(compare=False, repr=False)
     name: str  #: canonical name, without keys whose value follows from the other keys

@@ -37,7 +37,7 @@ class Case(plugin.Case):
 
     @cached_property
     def family_case(self) -> plugin.Case:
-        """Result of `Family.build`, computed at the first access.
+        """Result of `Family.build`, computed on first access.
 
         Raises
         ------

@@ -161,7 +161,7 @@ def _between_forms(
 def _between(
     problems: Sequence[Problem], solver: str, other: str, tol: float
 ) -> Iterable[float]:
-    """Yield the distances between answers of two solvers in any forms."""
+    """Yield the distances between the answers of two solvers, whatever their forms."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]

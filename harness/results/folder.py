@@ -121,8 +121,8 @@ def _only_plain_copies(folder: os.DirEntry[str]) -> None:
         for entry in entries:
             if is_copy(entry.name) and not entry.is_file(follow_symlinks=False):
                 raise InputError(
-                    f"{entry.path} is not a regular file; expected a copy of an input "
-                    "file, as in every result folder"
+                    f"{entry.path} is not a regular file; expected a regular file, "
+                    "since copies of input files have such names"
                 )
 
 

@@ -10,7 +10,7 @@ can be united.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import chain
+from itertools import chain, combinations
 from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
@@ -82,30 +82,30 @@ def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
 
     """
     union: dict[str, Any] = {}
-    first = ""
-    for folder, table in tables.items():
-        _refuse_unequal(first, union, folder, table)
+    for (one, a), (other, b) in combinations(tables.items(), 2):
+        _refuse_unequal(one, a, other, b)
+    for table in tables.values():
         _add(union, table)
-        first = first or folder
     return union
 
 
-def _refuse_unequal(first: str, union: Table, folder: str, table: Table) -> None:
-    if not union:
-        return
-    a, b = {**DEFAULTS, **union}, {**DEFAULTS, **table}
+def _refuse_unequal(one: str, a: Table, other: str, b: Table) -> None:
+    """Refuse suites `a`, `b` of two folders with unequal settings or labels."""
     for key in FIXED_KEYS:
-        if a[key] != b[key]:
+        values = a.get(key, DEFAULTS[key]), b.get(key, DEFAULTS[key])
+        if values[0] != values[1]:
             raise InputError(
-                f"{key} is {_text(a[key])} in {first}, {_text(b[key])} in {folder}; "
+                f"{key} is {_text(values[0])} in {one}, {_text(values[1])} in {other}; "
                 "expected equal settings"
             )
-    one, other = _entries(union), _entries(table)
-    for label in one.keys() & other.keys():
-        if one[label] != other[label]:
+    entries = _entries(a), _entries(b)
+    for label in sorted(entries[0].keys() & entries[1].keys()):
+        values = entries[0][label], entries[1][label]
+        if values[0] != values[1]:
             raise InputError(
-                f"the label {shown(label)} is {_text(one[label])} in {first}, "
-                f"{_text(other[label])} in {folder}; expected one solver for a label"
+                f"the label {shown(label)} is {_text(values[0])} in {one}, "
+                f"{_text(values[1])} in {other}; expected labels to denote the same "
+                "solver with the same options in all folders"
             )
 
 

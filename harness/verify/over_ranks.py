@@ -179,7 +179,10 @@ class MPIReduction:
     def places(
         self, at: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return local positions of `at` (w,), and a mask of the local components."""
+        """Return the local position of each component `at`, and a mask of local ones.
+
+        Both have the shape (w,). Positions are meaningless where the mask is False.
+        """
         local = self._local.components
         places = np.minimum(np.searchsorted(local, at), local.size - 1)
         return places, local[places] == at

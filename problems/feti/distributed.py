@@ -154,12 +154,12 @@ def balanced_partition(
     ranks: int,
     cluster: NDArray[np.int64] | None = None,
 ) -> NDArray[np.int64]:
-    """Partition subdomains over ranks, balancing both work and size (S,).
+    """Partition S subdomains over ranks, balancing both work and size.
 
     METIS balances a single weight. The work is tried first. On graded half discs, where
     a few subdomains account for most of the work, the sizes are then out of balance. In
-    such cases, several combinations of work and size are tried. Among the partitions
-    that keep the work balanced, the one with the best balance of sizes is returned.
+    such cases, several combinations of work and size are tried. A trial replaces the
+    first partition if it keeps the work balanced and has a better balance of sizes.
 
     Parameters
     ----------

@@ -406,10 +406,10 @@ class Clusters:
     def restrict(
         self, subdomains: Nodes, classes: Nodes, domains: Subdomains
     ) -> Clusters:
-        """Return a selection of whole clusters.
+        """Return the restriction to a selection of clusters.
 
         subdomains : all subdomains of the selected clusters, ascending
-        classes : classes of these subdomains, ascending
+        classes : distinct classes of these subdomains, ascending
         domains : these subdomains as `Subdomains`
         """
         columns = np.concatenate(

@@ -139,7 +139,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
-    """Raise InputError if a description of solids has keys of plane bodies."""
+    """Raise InputError if bodies are solids and a key has a value for plane bodies."""
     if elastic.shape.dim > 2:
         check_plane_only("bodies", params, "volumes")
 

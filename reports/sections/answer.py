@@ -338,9 +338,9 @@ def _reservations(found: Sequence[FastestSolver]) -> list[str]:
 
 
 def own_results(a: Analysis) -> Iterator[Statement | Picture]:
-    """Summarise growth of iterations, condition numbers and speed-up on ranks.
+    """Summarise the growth of iteration counts, condition numbers, parallel speed-up.
 
-    Suites of several solvers yield nothing.
+    Yield nothing if the suite has several solvers.
     """
     firsts = (o.first for o in a.evidence.flat)
     cold = {r.solver for r in firsts if not r.role and r.ranks == 1}

@@ -233,7 +233,7 @@ def _range(low: int, high: int) -> Cell:
 
 @section(44, "profiles", "Profiles")
 def profiles(a: Analysis) -> Iterator[Part]:
-    """Draw and tabulate the profiles of every group."""
+    """Tabulate the profiles of every ranked group; draw those of the first `DRAWN`."""
     if a.rankings:
         yield from TEXT.parts("profiles", len(a.rankings), DRAWN)
     yield from not_compared(a)

@@ -14,10 +14,11 @@ from mortarbench.harness import QP, Matrix, Vector
 from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
 
-#: δᵢ/Dᵢ: weight of the proximal term of xᵢ, relative to the curvature Dᵢ = Pᵢᵢ
+#: δᵢ/Dᵢ: weight δᵢ of the proximal term of xᵢ, relative to the curvature Dᵢ = Pᵢᵢ; a
+#: typical curvature replaces a negligible Pᵢᵢ, see `penalise`
 DELTA = 1e-9
-#: ρ·aD⁻¹aᵀ, with D = diag P: penalty ρ of a row a of A or G, relative to the curvature
-#: of the objective along a
+#: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to the curvature of the objective
+#: along a
 KAPPA = 1e4
 #: Largest number of consecutive changes of the active set that do not reduce the number
 #: of wrong constraints. Afterwards, constraints are exchanged one at a time.
@@ -59,7 +60,7 @@ class Problem:
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) diagonal of P; zeros are replaced by the mean positive entry
+    D: Vector  #: (n,) diagonal of P, with its mean in place of negligible entries
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise

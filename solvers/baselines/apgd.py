@@ -42,8 +42,8 @@ class AcceleratedGradient:
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
     shrink: float = 0.9  #: multiplies L after each step; with 1, L never decreases
-    #: factor by which an increase multiplies L; if the curvature along the step is
-    #: larger than the product, L increases to the curvature
+    #: each increase raises L to growth·L, or to the curvature along the step if the
+    #: curvature is larger
     growth: float = 2.0
     max_iter: int = 50_000
 

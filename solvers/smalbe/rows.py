@@ -352,9 +352,9 @@ def is_sparse(G: Matrix) -> bool:
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """Orthonormalise the rows of G (m, n), with a sparse factor if G `is_sparse`.
 
-    Linearly dependent sparse rows are converted to a dense array. If this array would
-    exceed the memory limit, or if the rows are distributed over ranks, the rows are
-    replaced by a maximal independent subset.
+    If the rows of such a G are linearly dependent, G is converted to a dense array. If
+    the dense factorisation would exceed the memory limit, or if the columns of G are
+    distributed over ranks, a maximal independent subset of the rows is used instead.
 
     bounded : (n,) mask of components with a bound
     """

@@ -257,7 +257,7 @@ def test_duplicates_in_one_environment_count_once(measure, campaign, tmp_path):
             lambda a, b: (b / "suite.toml").write_text(
                 'solvers = [{ name = "lax", label = "exact" }]\n'
             ),
-            "label 'exact' is {'name': 'exact'} in .* expected one solver for a label",
+            "label 'exact' is {'name': 'exact'} in .* expected labels to denote",
         ),
         (lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"), "is not a suite"),
         (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),

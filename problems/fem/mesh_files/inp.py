@@ -120,7 +120,10 @@ class _Sets:
         members = np.unique(np.append(before, members))
         self._limit -= members.size
         if self._limit < 0:  # nested sets could grow exponentially
-            raise InputError("the sets have too many members; expected fewer sets")
+            raise InputError(
+                "the sets have too many members in total; expected fewer or smaller "
+                "sets"
+            )
         self._members[name.upper()] = name, members
 
     def resolve(self, fields: Iterable[str], where: str) -> Nodes:

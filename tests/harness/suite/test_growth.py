@@ -2,7 +2,8 @@
 
 import pytest
 
-from mortarbench.harness.suite.growth import incompatibility
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.suite.growth import incompatibility, unite
 
 SUITE = {
     "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,
@@ -57,3 +58,14 @@ def test_a_stopping_rule_may_only_become_stricter():
         incompatibility(ruled, ruled | {"null_arm": None})
         == "null_arm was 'a', now not set"
     )
+
+
+def test_a_conflict_of_labels_names_the_two_folders_in_conflict():
+    """The folder without the label is not blamed, although it comes first."""
+    tables = {
+        "a": {"solvers": ["piqp"]},
+        "b": {"solvers": [{"name": "osqp", "label": "mine"}]},
+        "c": {"solvers": [{"name": "clarabel", "label": "mine"}]},
+    }
+    with pytest.raises(InputError, match=r"'osqp'} in b, .*'clarabel'} in c;"):
+        unite(tables)
