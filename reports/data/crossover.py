@@ -21,7 +21,7 @@ from mortarbench.reports.data.rank_series import base_label
 from mortarbench.reports.data.size_series import SIZES, SeriesKey, fixed_keys
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
-MULTIGRID = "pdas-amg"  #: solver that forms a separate route
+MULTIGRID = ("pdas-amg", "ipm-amg")  #: solvers that form a separate route
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
 #: values of `Route.kind` in a complete map
@@ -30,7 +30,7 @@ PRIMAL = KINDS[:2]
 
 
 class Route(NamedTuple):
-    """Form, decomposition and number of ranks; only `MULTIGRID` has its own kind."""
+    """Form, decomposition and number of ranks; `MULTIGRID` has a kind of its own."""
 
     kind: str  #: one of `KINDS`
     layout: str  #: keys of the decomposition, "feti=16"; empty without decomposition
@@ -209,7 +209,7 @@ def _route(o: Outcome) -> Route:
     layout = ", ".join(f"{k}={v}" for k, v in keys.items() if v)
     if not layout:
         kind = r.form
-        if kind == PRIMAL[0] and base_label(o) == MULTIGRID:
+        if kind == PRIMAL[0] and base_label(o) in MULTIGRID:
             kind = PRIMAL[1]
     else:
         kind = "hybrid TFETI" if keys["cluster"] else "TFETI"

@@ -1,0 +1,327 @@
+"""Interior-point method whose linear systems multigrid with a contact filter solves.
+
+The linear systems are those of the contact miniapp of MFEM (Petrides et al., AMG with
+filtering: an efficient preconditioner for interior point methods in large-scale contact
+mechanics optimization, arXiv:2505.18576, 2025). Inequality rows and finite bounds are
+collected in Cx + s = d with s ≥ 0. All rows c of C and of A are divided by √(c D⁻¹cᵀ),
+where D is the diagonal of P. Each iteration takes these steps:
+
+1. Proximal method of multipliers (Rockafellar 1976; for interior points: Schwan, Jiang,
+   Kuhn and Jones, PIQP, CDC 2023), with its centre in the current point. The Newton
+   step then exists even if P is singular or rows are repeated:
+
+       (P + δD)dx + Aᵀdy + Cᵀdz = −(Px + q + Aᵀy + Cᵀz)
+       A dx − dy/κ              = b − Ax
+       C dx + ds − dz/κ_C       = d − Cx − s
+       z ds + s dz              = σμ − sz
+
+2. Elimination of dy, ds and dz. The matrix of dx is
+
+       H = P + δD + κAᵀA + CᵀWC,   W = (S Z⁻¹ + 1/κ_C)⁻¹.
+
+3. Mehrotra's predictor (σ = 0), the centring σ = (μ_aff/μ)³, and the corrector.
+4. Conjugate gradients for both right-hand sides. At the solution, W is large at active
+   rows and small at all others, and multigrid alone would fail. With the V-cycle B for
+   H and the components F that occur in rows, the preconditioner is
+
+       z ← H_FF⁻¹ r_F,   z ← z + B(r − Hz),   z ← z + H_FF⁻¹ (r − Hz)_F.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
+from scipy.sparse.linalg import LinearOperator, cg
+from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
+
+from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
+from mortarbench.solvers.baselines.active_set import row_norms
+from mortarbench.solvers.baselines.face import InnerSolveError, Mask
+from mortarbench.solvers.baselines.multigrid import (
+    multigrid,
+    near_kernel,
+    needs_sparse,
+)
+from mortarbench.solvers.common.conversion import check_positive
+
+#: δ: weight of the proximal term of xᵢ, relative to Dᵢ
+DELTA = 1e-9
+#: κ: penalty of the scaled equality rows
+KAPPA = 1e6
+#: κ_C: largest weight W of a scaled inequality row
+MAX_WEIGHT = 1e8
+#: relative residual of conjugate gradients
+CG_RTOL = 1e-4
+#: conjugate gradients also end at a residual of this factor times tol·‖q‖; the error of
+#: the step is a part of the next dual residual
+CG_SHARE = 0.01
+MAX_CG = 1000  #: largest number of CG steps per solve; contact cases need 5 to 60
+#: share of the distance to the boundary s = 0 or z = 0 that a step may cover
+TO_BOUNDARY = 0.995
+#: When the products sz are below the tolerance, the remaining residuals come from
+#: rounding and from inexact solves. The method then ends after this number of
+#: iterations that did not halve the smallest residual.
+PATIENCE = 10
+#: largest KKT residual of a point that is claimed as a solution, relative to tol
+CLAIM_FACTOR = 5.0
+
+
+class Point(NamedTuple):
+    """Variables x, multipliers y and z of the scaled rows, and slacks s."""
+
+    x: Vector
+    y: Vector
+    z: Vector
+    s: Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A QP with scaled rows: min ½xᵀPx + qᵀx, Ax = b, Cx + s = d, s ≥ 0."""
+
+    qp: QP
+    P: csr_array
+    D: Vector  #: (n,) diagonal of P, with its mean in place of negligible entries
+    A: csr_array
+    b: Vector
+    A_norms: Vector  #: (m,) factors by which the rows of A were divided
+    C: csr_array  #: (p, n) rows of G, then upper bounds, then lower bounds
+    d: Vector
+    C_norms: Vector  #: (p,) factors by which the rows of C were divided
+    upper: NDArray[np.intp]  #: components with a finite upper bound
+    lower: NDArray[np.intp]
+    fixed: Mask  #: (n,) components with lb = ub, which have no rows in C
+    filter: NDArray[np.intp]  #: components that occur in the rows of A or G
+    kernel: NDArray[np.float64]  #: (n, k) near-kernel vectors
+
+    def gradient(self, at: Point) -> Vector:
+        """Return Px + q + Aᵀy + Cᵀz."""
+        return np.asarray(self.P @ at.x + self.qp.q + self.A.T @ at.y + self.C.T @ at.z)
+
+    def solution(self, at: Point) -> Solution:
+        """Return the point with the multipliers of the original rows and bounds."""
+        z, p = at.z / self.C_norms, self.qp.h.size
+        z_box = np.zeros(at.x.size)
+        z_box[self.upper] += z[p : p + self.upper.size]
+        z_box[self.lower] -= z[p + self.upper.size :]
+        z_box[self.fixed] = -self.gradient(at)[self.fixed]
+        return Solution(
+            status=Status.SOLVED,
+            x=at.x,
+            y=at.y / self.A_norms,
+            z=z[:p],
+            z_box=z_box,
+        )
+
+
+@dataclass(frozen=True)
+class IPMAMG:
+    """In-house interior-point method with filtered multigrid (AMG with filtering).
+
+    P must be sparse. The iteration stops when the KKT residuals of the QP are at most
+    tol. If rounding prevents further progress, the solver also claims a point with
+    residuals of at most 5·tol. It counts conjugate-gradient steps, and multigrid setups
+    as factorisations. The solver does not detect infeasible QPs.
+    """
+
+    max_iter: int = 100
+
+    about: ClassVar[About] = About(
+        title="Interior points with multigrid (ours)",
+        licence="BSD-3-Clause",
+        method="primal-dual interior point, in a proximal method of multipliers",
+        linear_solver="conjugate gradients, preconditioned by smoothed aggregation "
+        "(pyamg) and a Cholesky factor on the components of contact rows (CHOLMOD)",
+        phases="scaling of the rows (preparing); multigrid setups and iterations "
+        "(solving)",
+        package="pyamg",
+        limits=(
+            "The near-kernel does not contain rotations, because a QP contains no "
+            "coordinates.",
+            "Infeasible and unbounded QPs end at the limit of iterations.",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        check_positive(max_iter=self.max_iter)
+
+    def declines(self, qp: QP) -> str | None:
+        return needs_sparse(qp)
+
+    def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        problem = _scale(qp)
+
+        def solve() -> Solution:
+            counts = Counter[str]()
+            try:
+                solution = _iterate(problem, tol, self.max_iter, counts)
+            except (InnerSolveError, CholmodNotPositiveDefiniteError) as e:
+                solution = Solution.without_point(qp, Status.FAILED, f"{e}")
+            name = {"linear_solver": "smoothed aggregation (pyamg)"}
+            return replace(solution, counts=counts, reported=name)
+
+        return solve
+
+
+def _scale(qp: QP) -> Problem:
+    """Collect and scale the rows."""
+    P, A, G = csr_array(qp.P), csr_array(qp.A), csr_array(qp.G)
+    D = P.diagonal()
+    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
+    D = np.where(D > 1e-12 * usual, D, usual)
+    fixed = qp.lb == qp.ub
+    upper = np.flatnonzero(np.isfinite(qp.ub) & ~fixed)
+    lower = np.flatnonzero(np.isfinite(qp.lb) & ~fixed)
+    unit = csr_array(eye_array(qp.q.size))
+    C = csr_array(vstack([G, unit[upper], -unit[lower]]))
+    d = np.concatenate([qp.h, qp.ub[upper], -qp.lb[lower]])
+    A_norms, C_norms = row_norms(A, D), row_norms(C, D)
+    occurs = np.zeros(qp.q.size, dtype=bool)
+    occurs[np.concatenate([A.indices, G.indices])] = True
+    return Problem(
+        qp=qp,
+        P=P,
+        D=D,
+        A=csr_array(diags_array(1 / A_norms) @ A),
+        b=qp.b / A_norms,
+        A_norms=A_norms,
+        C=csr_array(diags_array(1 / C_norms) @ C),
+        d=d / C_norms,
+        C_norms=C_norms,
+        upper=upper,
+        lower=lower,
+        fixed=fixed,
+        filter=np.flatnonzero(occurs & ~fixed),
+        kernel=near_kernel(P),
+    )
+
+
+def _iterate(
+    problem: Problem, tol: float, max_iter: int, counts: Counter[str]
+) -> Solution:
+    at = _start(problem, tol, counts)
+    best, best_worst, stalled = problem.solution(at), np.inf, 0
+    for k in range(max_iter + 1):
+        solution = replace(problem.solution(at), iterations=k, message="converged")
+        residuals = kkt_residuals(problem.qp, solution)
+        if residuals.worst <= tol:
+            return solution
+        stalled = 0 if residuals.worst < best_worst / 2 else stalled + 1
+        if residuals.worst < best_worst:
+            best, best_worst = solution, residuals.worst
+        if stalled >= PATIENCE and residuals.complementarity <= tol:
+            break
+        at = _step(problem, at, tol, counts)
+        if not all(np.isfinite(v).all() for v in at):
+            break
+    if best_worst <= CLAIM_FACTOR * tol:
+        return best
+    return replace(best, status=Status.ITERATION_LIMIT, message="no further progress")
+
+
+def _start(problem: Problem, tol: float, counts: Counter[str]) -> Point:
+    """Return Mehrotra's starting point.
+
+    x minimises the objective plus ½‖Cx − d‖² and the penalty of Ax = b. The slacks
+    d − Cx and the multipliers Cx − d are then shifted into the interior.
+    """
+    qp, (p, n) = problem.qp, problem.C.shape
+    x = np.clip(np.zeros(n), qp.lb, qp.ub)
+    at = Point(x, 0 * problem.b, np.zeros(p), np.zeros(p))
+    solve = _solver(problem, np.ones(p), tol, counts)
+    r = KAPPA * (problem.A.T @ (problem.b - problem.A @ x))
+    x = x + solve(r + problem.C.T @ (problem.d - problem.C @ x) - problem.gradient(at))
+    y = KAPPA * (problem.A @ x - problem.b)
+    s = problem.d - problem.C @ x
+    s, z = s + max(-1.5 * s.min(initial=0.0), 0), max(1.5 * s.max(initial=0.0), 0) - s
+    if p and not s @ z > 0:  # no constraint is active at x
+        unit = np.sqrt(np.abs(qp.q @ x)) or 1.0
+        s, z = s + unit, z + unit
+    if p:
+        product = s @ z
+        s, z = s + 0.5 * product / z.sum(), z + 0.5 * product / s.sum()
+    return Point(x, y, z, s)
+
+
+def _step(problem: Problem, at: Point, tol: float, counts: Counter[str]) -> Point:
+    """Return the next point, see steps 1 to 3 of the module."""
+    (x, _, z, s), A, C = at, problem.A, problem.C
+    W = 1 / (s / z + 1 / MAX_WEIGHT)
+    solve = _solver(problem, W, tol, counts)
+    r_d, r_A, r_C = -problem.gradient(at), problem.b - A @ x, problem.d - C @ x - s
+
+    def direction(product: Vector) -> Point:
+        t = r_C - product / z
+        dx = solve(r_d + KAPPA * (A.T @ r_A) + C.T @ (W * t))
+        dz = W * (C @ dx - t)
+        return Point(dx, KAPPA * (A @ dx - r_A), dz, (product - s * dz) / z)
+
+    if not s.size:
+        step = direction(s)
+        return Point(*(v + dv for v, dv in zip(at, step, strict=True)))
+    mu = s @ z / s.size
+    affine = direction(-s * z)
+    a = _length(at, affine)
+    centring = ((s + a * affine.s) @ (z + a * affine.z) / (s @ z)) ** 3
+    step = direction(centring * mu - s * z - affine.s * affine.z)
+    a = min(1.0, TO_BOUNDARY * _length(at, step))
+    return Point(*(v + a * dv for v, dv in zip(at, step, strict=True)))
+
+
+def _length(at: Point, step: Point) -> float:
+    """Return the largest a ≤ 1 with s + a·ds ≥ 0 and z + a·dz ≥ 0."""
+    v, dv = np.concatenate([at.s, at.z]), np.concatenate([step.s, step.z])
+    return float(min(1.0, (v[dv < 0] / -dv[dv < 0]).min(initial=1.0)))
+
+
+def _solver(
+    problem: Problem, W: Vector, tol: float, counts: Counter[str]
+) -> Callable[[Vector], Vector]:
+    """Set up the preconditioner of H; return r (n,) ↦ dx (n,), zero where fixed."""
+    A, C, D, fixed, F = problem.A, problem.C, problem.D, problem.fixed, problem.filter
+    H = problem.P + diags_array(DELTA * D) + KAPPA * (A.T @ A)
+    H = H + C.T @ (diags_array(W) @ C)
+    # keep fixed components as uncoupled rows, so that every node keeps its rows
+    free = diags_array(1.0 * ~fixed)
+    H = csr_array(free @ H @ free + diags_array(np.where(fixed, D, 0.0)))
+    V_cycle = multigrid(H, problem.kernel)
+    counts["factorisations"] += 1
+    if F.size:
+        factor = cholesky(csc_array(H[F][:, F]))
+
+    def filtered(r: Vector) -> Vector:
+        if not F.size:
+            return np.asarray(V_cycle @ r)
+        z = np.zeros(r.size)
+        z[F] = factor(r[F])
+        z += V_cycle @ (r - H @ z)
+        z[F] += factor((r - H @ z)[F])
+        return z
+
+    precondition = LinearOperator(H.shape, matvec=filtered, dtype=float)
+    atol = CG_SHARE * tol * float(np.linalg.norm(problem.qp.q))
+
+    def count(_: object) -> None:
+        counts["cg"] += 1
+
+    def solve(r: Vector) -> Vector:
+        dx, failed = cg(
+            H,
+            np.where(fixed, 0.0, r),
+            rtol=CG_RTOL,
+            atol=atol,
+            maxiter=MAX_CG,
+            M=precondition,
+            callback=count,
+        )
+        if failed:
+            raise InnerSolveError(f"no convergence in {MAX_CG} steps of CG")
+        return np.where(fixed, 0.0, dx)
+
+    return solve
