@@ -1,4 +1,4 @@
-"""Histories of the in-house solvers."""
+"""Histories of the SMALBE presets."""
 
 from dataclasses import replace
 

@@ -396,7 +396,7 @@ SOLVERS = {"mine": Mine()}
 
 
 def test_former_package_names_remain_valid_in_plugins(tmp_path):
-    """Test also imports in calls; a neighbour module has precedence over `solvers`."""
+    """Also test imports in calls. A neighbour `solvers` replaces the former package."""
     (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
     (tmp_path / "plug.py").write_text(OF_OLD)
     of_user = sys.modules.get("harness")

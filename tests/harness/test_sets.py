@@ -446,7 +446,7 @@ def test_a_row_that_no_point_of_a_ball_satisfies_is_infeasible():
 
 @dataclass(frozen=True)
 class Careless:
-    """Solver that accepts every QP."""
+    """Solver that declines no QP, without a declaration of sets."""
 
     def declines(self, qp):
         return None

@@ -412,7 +412,7 @@ def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
     assert measure(two).records == []
 
 
-def test_a_block_is_every_solver_once_in_an_order_that_changes(measure, tmp_path):
+def test_a_block_has_every_solver_once_in_an_order_that_changes(measure, tmp_path):
     names = ("honest", "warm", "zero", "mutatesbyforce")
     measure(suite(*names, repeats=6))
     records = read_journal(tmp_path)

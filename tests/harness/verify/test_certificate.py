@@ -260,7 +260,7 @@ def test_bounds_of_all_solvers_are_sharp(name):
         "obstacle/n=10/dual-bounds",
     ],
 )
-def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
+def test_smalbe_at_tol_1e_8_reaches_six_digits_in_energy_norm(name):
     case = parse(name, PROBLEMS).build(reference_solution)
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
     assert certify(case.mechanics, case.mechanics.to_primal(s)).bound <= 1e-6

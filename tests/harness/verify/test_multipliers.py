@@ -86,7 +86,7 @@ def test_a_point_beside_the_solution_has_no_multipliers(count):
     assert min(left) > 10 * TOL
 
 
-def test_the_force_of_a_nearly_active_row_is_limited_by_its_slack():
+def test_a_nearly_active_row_has_a_force_and_a_small_residual():
     """For min ½x² − x, x ≤ ½, at x = ½ − δ, the multiplier ½ leaves a gap of ½δ."""
     delta = 1e-9
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])

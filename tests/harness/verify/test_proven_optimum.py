@@ -752,8 +752,8 @@ class Attack:
 def search(seed, tries, way, each=40):
     """Attack QPs with up to three traps; return wrong verdicts and a count.
 
-    If the optimum is proven, f* has three correct digits even if its terms cancel; with
-    idle variables, this is not always true.
+    In the variant "as it is", a verified point must have three correct digits of f*,
+    even if terms cancel. In all variants, its errors must be small relative to terms.
     """
     rng = np.random.default_rng(seed)
     wrong, refuted, verified = [], [], 0
