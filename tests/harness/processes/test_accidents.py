@@ -92,8 +92,9 @@ def watched(monkeypatch):
 def beside_a_witness(tmp_path_factory):
     """Return a function that measures a solver and then a witness.
 
-    The witness fails if another process of the test runs during its solve. The function
-    asserts that the solver leaves no process and no shared memory.
+    The witness fails if another process of the test, except a sub-reaper, runs during
+    its solve. The function asserts that the solver leaves no process and no shared
+    memory.
     """
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)

@@ -106,8 +106,8 @@ def cluster(tmp_path, forks):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Return a function that runs a command line on the toy problem in a folder that
-    contains only a suite; it returns the exit code, stdout and stderr.
+    """Return a function that runs a command line on the toy problem in a folder with a
+    suite; it returns the exit code, stdout and stderr.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))

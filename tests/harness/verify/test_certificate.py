@@ -103,7 +103,7 @@ def _noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def _wrong_active_set(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Exchange the multipliers of some rows with those of random rows."""
+    """Replace the multipliers of some rows by those of random rows."""
     z = s.z.copy()
     swapped = rng.random(z.size) < max(size, 1.5 / z.size)
     z[swapped] = rng.permutation(z)[swapped]
