@@ -1,4 +1,4 @@
-"""Limits of user input: messages of one line state the admissible values."""
+"""Limits on user input: one-line error messages that state the admissible values."""
 
 import json
 import os
@@ -32,8 +32,8 @@ def record(run_id="a", **changes):
 
 @pytest.fixture
 def journal(tmp_path):
-    """Write lines, records or changed fields of a record to a journal; return its
-    folder.
+    """Return a function that writes lines, records or changed fields of a record to a
+    journal; it returns the result folder.
     """
 
     def journal(*entries):
@@ -52,7 +52,9 @@ def journal(tmp_path):
 
 @pytest.fixture
 def refused(capsys, monkeypatch, tmp_path):
-    """Run a command that must exit with code 2; return its message of one line."""
+    """Return a function that runs a command, asserts exit code 2 and one line of error
+    output, and returns this line.
+    """
     monkeypatch.chdir(tmp_path)
     registries = Registries()
 
@@ -106,14 +108,14 @@ def test_a_journal_line_with_an_impossible_value_is_named(journal, changed, expe
 
 
 @pytest.mark.parametrize("value", ["NaN", "Infinity", "1e400", "9" * 5000, "[" * 9000])
-def test_numbers_outside_json_or_the_range_of_readers_are_refused(journal, value):
+def test_values_that_json_or_its_readers_cannot_represent_are_refused(journal, value):
     line = record().to_json().replace('"gap": null', f'"gap": {value}')
 
     with pytest.raises(InputError, match="line 1: "):
         read_journal(journal(line))
 
 
-def test_numbers_outside_the_range_of_readers_are_not_written():
+def test_numbers_that_readers_refuse_are_written_as_null():
     row = json.loads(record(counts={"n": 2**63}, gap=float("inf")).to_json())
 
     assert row["counts"] == {"n": None}
@@ -190,7 +192,7 @@ def test_equal_tables_of_a_journal_are_shared_but_1_and_true_differ(journal):
         ("a = 1e", "line 1, column"),
     ],
 )
-def test_deeply_nested_toml_is_refused(text, expected):
+def test_deeply_nested_or_malformed_toml_is_refused(text, expected):
     with pytest.raises(InputError, match=expected):
         toml(text)
 
@@ -279,7 +281,7 @@ def test_a_grid_beyond_the_limit_is_refused_with_the_way_to_raise_the_limit(tmp_
         "bodies:a\0b.toml/dual", "y" * 100_000 + "/dual", "beam-ring/" + "z" * 100_000,
     ],
 )  # fmt: skip
-def test_cases_that_cannot_be_are_refused_by_name_and_briefly(name):
+def test_impossible_cases_are_refused_with_a_short_message(name):
     with pytest.raises(InputError) as e:
         parse(name, PROBLEMS)
     assert len(str(e.value)) < 600

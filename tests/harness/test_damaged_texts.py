@@ -1,7 +1,7 @@
 """Damaged or unusual input is accepted or refused without a traceback or a hang.
 
-The input comprises texts of all readers, files of result folders, names, options,
-command lines and arguments from Python. Data files are tested in
+The inputs are suites, descriptions of bodies, names of cases, files of result folders,
+solver options, command lines and arguments from Python. Files with QPs are tested in
 `tests/harness/files/test_hostile_files.py`.
 """
 
@@ -205,7 +205,7 @@ def test_a_damaged_name_of_a_case_is_read_or_refused(count):
 
 
 def lines(count, chance):
-    """Return journal lines with unusual values, each with a distinct run_id."""
+    """Yield journal lines with unusual values, from records with distinct run_ids."""
     sound = [json.loads(r.to_json()) for r in synthetic_results.records(3, 4, 2)]
     for i in range(count):
         row = chance.choice(sound) | {"run_id": f"{i:012x}"}
@@ -280,14 +280,14 @@ def test_a_damaged_suite_of_a_folder_is_refused_or_reported_and_merged(tmp_path,
 
 
 def in_lines(table):
-    """Write a table as TOML, with one line for each entry."""
+    """Return a table as TOML, with one line for each key of the table."""
     return as_toml({f"{key}_": value for key, value in table.items()}).replace(
         "_ = ", " = "
     )
 
 
 def without_none(data):
-    """Remove values that TOML cannot represent."""
+    """Return the data without None, which TOML cannot represent."""
     match data:
         case dict():
             return {k: without_none(v) for k, v in data.items() if v is not None}
@@ -381,7 +381,7 @@ ODD = (
     frozenset({"x"}), frozenset(), range(3), str, InputError, np.float64(0.5),
     np.int64(2), np.bool_(True), np.str_("x"), Decimal(1), Fraction(1, 3), ...,
 )  # fmt: skip
-#: functions, with valid arguments by position and by name
+#: functions, with positional and keyword arguments of valid types
 ENTRIES = (
     (mb.build, ["obstacle/dim=1/n=4/primal"], {"plugins": ()}),
     (mb.load, ["run"], {"warn": len}),
@@ -437,7 +437,7 @@ def test_odd_arguments_from_python_are_taken_or_refused(tmp_path, monkeypatch, c
 
 
 @COUNTS
-def test_damaged_values_on_the_command_line_are_taken_or_refused_in_a_line(
+def test_damaged_values_on_the_command_line_are_refused_in_one_line(
     tmp_path, monkeypatch, capsys, count
 ):
     monkeypatch.chdir(tmp_path)

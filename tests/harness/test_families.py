@@ -63,7 +63,7 @@ def test_a_family_that_inherits_is_not_wrapped():
     assert as_family(as_family(Bare())).name == "bare"
 
 
-def test_the_repr_of_a_case_contains_its_family():
+def test_a_case_has_its_name_parameters_and_family():
     family = Doubled()
     case = parse("doubled/n=3/only", {"doubled": family})
     finer = assemble(family, family.refined(case.params), case.form)

@@ -1,4 +1,4 @@
-"""Histories of the in-house solvers."""
+"""Histories of the SMALBE presets."""
 
 from dataclasses import replace
 
@@ -34,7 +34,7 @@ def test_a_history_records_every_iteration(manufactured, name, shape):
         assert (np.diff(h[growing]) >= 0).all()
     assert h["outer"][-1] < s.counts["outer"]
     assert h["products"][-1] <= s.counts["P_products"]
-    within = np.diff(h["outer"]) == 0  # for constant multipliers, the cost decreases
+    within = np.diff(h["outer"]) == 0  # at constant multipliers, cost does not grow
     assert np.diff(h["cost"])[within].max(initial=0) <= 1e-12 * abs(h["cost"]).max()
     at_bound = (s.x <= qp.lb) | (s.x >= qp.ub)
     assert h["active"][-1] == at_bound.sum()

@@ -15,7 +15,10 @@ from mortarbench.harness.plugin import as_family
 
 @dataclass(frozen=True)
 class Ring:
-    """Family whose default layers depend on Nh, and step on steps, as in beam-ring."""
+    """Family in which defaults derive from other keys, as in beam-ring.
+
+    The default of layers is 2·Nh, and the default of step is the value of steps.
+    """
 
     name: str = "ring"
     defaults: Mapping = field(

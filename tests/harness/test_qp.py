@@ -15,7 +15,7 @@ UPPER = np.array([[2.0, 1.0], [0.0, 2.0]])
 
 
 @pytest.mark.parametrize("kind", [np.asarray, csc_matrix, csr_array, coo_array, list])
-def test_matrices_of_every_type_define_the_same_qp(kind):
+def test_dense_and_sparse_matrices_define_the_same_qp(kind):
     P, G = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[1.0, 1.0], [0.0, 2.0]])
     as_kind = (lambda M: M.tolist()) if kind is list else kind
     qp = QP.from_arrays(as_kind(P), [1, 2], as_kind(G), [3, 4], as_kind(G[:1]), [5])
@@ -43,7 +43,7 @@ def test_a_scalar_bounds_every_variable_and_a_vector_is_one_row():
     assert (qp.G.tolist(), qp.h.tolist()) == ([[1, 2]], [3])
 
 
-def test_columns_and_rows_are_vectors():
+def test_single_columns_and_rows_become_vectors():
     qp = QP.from_arrays(I2, [[1.0], [2.0]], lb=np.zeros((1, 2)))
 
     assert (qp.q.tolist(), qp.lb.tolist()) == ([1, 2], [0, 0])

@@ -90,7 +90,7 @@ def test_an_integer_option_of_a_float_field_becomes_a_float():
     assert isinstance(alpha, float)
 
 
-def test_a_field_that_is_none_accepts_anything():
+def test_an_option_whose_default_is_none_accepts_a_value_of_its_type():
     assert resolve(spec("method", seed=7), SOLVERS).seed == 7
 
 
@@ -247,7 +247,7 @@ def test_a_plugin_that_fails_to_import_leaves_no_module(tmp_path):
     assert not [name for name in sys.modules if name.startswith("plugin_half")]
 
 
-def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
+def test_a_plugin_that_is_missing_or_not_a_python_file_is_refused(tmp_path):
     text = tmp_path / "plug.txt"
     text.write_text(PLUGIN)
 
@@ -261,7 +261,7 @@ def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Install a package that has only metadata and offers an entry point."""
+    """Return a function that installs a package with only metadata and entry points."""
 
     def install(metadata, offers):
         folder = tmp_path / "installed" / metadata
@@ -303,7 +303,7 @@ def test_entry_points_in_an_archive_are_found(tmp_path, monkeypatch):
         entry_point_plugins()
 
 
-def test_entry_points_for_others_are_not_loaded(install):
+def test_entry_points_of_other_groups_are_not_loaded(install):
     install("its-1.0.dist-info", "[console_scripts]\nmortarbench = no_such_module:X\n")
 
     assert not entry_point_plugins().solvers
@@ -315,7 +315,7 @@ def test_a_name_that_exists_cannot_be_taken_by_a_plugin():
         merged("solver", {"a": 1}, {"a": 2})
 
 
-# two versions of plug-ins, and plug-ins with neighbours
+# two versions of plug-ins, and plug-ins with neighbour modules
 
 WITH_NEIGHBOURS = """
 import helper
@@ -335,7 +335,7 @@ SOLVERS = {"mine": Mine()}
 
 
 def version(folder, number):
-    """Write a plug-in with neighbours that contain a version."""
+    """Write a plug-in and neighbour modules that contain a version; return its path."""
     (folder / "tools").mkdir(parents=True)
     (folder / "mine.py").write_text(WITH_NEIGHBOURS)
     (folder / "helper.py").write_text("from .constants import VERSION")
@@ -347,7 +347,7 @@ def version(folder, number):
 
 
 def test_two_versions_of_a_plugin_import_separate_neighbour_modules(tmp_path):
-    """Import statements may run at the start or in a call."""
+    """Neighbours are imported when the plug-in is loaded, or later in a call."""
     files = {n: version(tmp_path / f"v{n}", n) for n in (1, 2)}
     solvers = {}
     for number, file in files.items():
@@ -396,7 +396,7 @@ SOLVERS = {"mine": Mine()}
 
 
 def test_former_package_names_remain_valid_in_plugins(tmp_path):
-    """Test also imports in calls; a neighbour with the same name has precedence."""
+    """Also test imports in calls. A neighbour `solvers` replaces the former package."""
     (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
     (tmp_path / "plug.py").write_text(OF_OLD)
     of_user = sys.modules.get("harness")
@@ -467,7 +467,7 @@ def test_a_label_precedes_the_path_of_a_plugin(text, path, label, name):
     assert PluginFile.of(str(file.resolved())) == file.resolved()
 
 
-def test_a_labelled_adapter_of_many_backends_is_one(tmp_path):
+def test_a_labelled_plugin_may_contain_an_adapter_of_several_backends(tmp_path):
     file = tmp_path / "many.py"
     file.write_text(
         PLUGIN.replace("tries: int = 3", "backend: str = ''").replace(

@@ -39,8 +39,8 @@ FLAT = Cones([[3, 7], [5, 0], [2, 6]], [0.0, 1.0, 1e-8])
 SETS = [BOX, BALLS, Discs(BALLS.index, BALLS.radius), CONES, FLAT]
 NAMES = ["box", "balls", "discs", "cones", "flat cones"]
 names = pytest.mark.parametrize("one", SETS, ids=NAMES)
-#: rounding errors of projections onto an unbounded set, for points with components up
-#: to 16
+#: bound on the rounding error of a projection onto an unbounded set, for points with
+#: components up to 16
 ROUNDING = {Cones: 16 * 2.0**-52}
 
 
@@ -61,7 +61,7 @@ def test_the_projection_is_the_nearest_point(one):
 
 @names
 def test_the_removed_part_of_a_projection_is_normal(one):
-    """By Moreau, z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
+    """By Moreau's theorem, z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
     for v in points(100):
         x = one.project(v)
         z = v - x
@@ -89,13 +89,13 @@ def test_the_support_function_bounds_the_work_on_every_member(one):
 
 @names
 def test_inadmissible_vectors_have_unbounded_work(one):
-    """σ(e) = ∞ for each unit vector e of a component that is not admissible."""
+    """σ(z) = ∞ for each vector z = ±eⱼ whose admissible part is zero."""
     e = np.eye(N)
     for z in (*e, *-e):
         if not one.admissible(z).any():
             reached = max(z @ one.project(1e9 * z + x) for x in points(5))
             assert reached > 1e8
-    for z in points(50):  # the inadmissible part of any z is a direction of the set
+    for z in points(50):  # the inadmissible part of z is a recession direction
         rest = z - one.admissible(z)
         far = one.project(1e9 * rest)
         assert far == pytest.approx(1e9 * rest + one.project(0 * z), abs=1e-5)
@@ -107,7 +107,7 @@ def test_the_hull_is_the_smallest_box_around_a_set(one):
     for j in range(N):
         for bound, sign in ((lower[j], -1), (upper[j], 1)):
             far = one.project(sign * 1e9 * np.eye(N)[j])[j]
-            if isinstance(one, Cones) and np.isinf(bound):  # not orthogonal to e_j
+            if isinstance(one, Cones) and np.isinf(bound):  # t shrinks by μ²/(1 + μ²)
                 assert sign * far >= 1e9 * 1e-16
             else:
                 assert far == pytest.approx(max(min(bound, 1e9), -1e9))
@@ -276,7 +276,7 @@ def test_the_first_set_is_the_box_of_the_bounds():
     assert not given.lb.flags.writeable
 
 
-def test_bounds_are_exchanged_and_other_sets_kept():
+def test_bounds_are_replaced_and_other_sets_are_kept():
     qp = qp_with(FREE, BALLS)
     bounded = replace(qp, lb=np.where(np.arange(N) == 0, 0.0, -INF))
     assert bounded.lb[0] == 0
@@ -309,7 +309,7 @@ def test_sets_that_do_not_fit_are_refused(sets, message):
         qp_with(*sets)
 
 
-def test_a_box_beside_bounds_is_refused():
+def test_a_box_among_the_sets_of_from_arrays_is_refused():
     arrays = dict(P=np.eye(N), q=np.ones(N))
     with pytest.raises(
         InputError, match="expected a tuple of convex sets in addition to"
@@ -321,7 +321,8 @@ def test_a_box_beside_bounds_is_refused():
 def with_solution(seed, radius=None):
     """Return a QP with bounds, rows and balls, and its strictly complementary solution.
 
-    Balls 0, 2, … are active with z = c·x; balls 1, 3, … are inactive.
+    Balls 0, 2, … are active, with z = c·x and c > 0 if the radius is positive; balls
+    1, 3, … are inactive.
     """
     rng = np.random.default_rng(seed)
     k, d, m = 5, int(rng.integers(1, 4)), 2
@@ -410,7 +411,7 @@ def test_units_change_no_residual_of_sets(seed, factor):
     assert after == pytest.approx(before, rel=1e-6)
 
 
-def test_any_vector_is_normal_to_a_point():
+def test_any_vector_is_normal_to_a_ball_of_radius_zero():
     qp, s = with_solution(3, radius=np.zeros(5))
     z = s.z_box.copy()
     z[qp.sets[1].index] = RNG.standard_normal(qp.sets[1].index.shape)
@@ -429,8 +430,8 @@ def test_points_over_other_sets_are_compared_with_a_proven_optimum():
     assert 1e-10 < errors[1] < 1e-5
 
 
-def test_a_ball_without_a_point_beyond_a_row_is_infeasible():
-    """On ‖x‖ ≤ 1, x₁ + x₂ ≤ √2; the enclosing box already contradicts x₁ + x₂ ≥ 3."""
+def test_a_row_that_no_point_of_a_ball_satisfies_is_infeasible():
+    """On the unit disc, x₁ + x₂ ≤ √2; its bounding box contradicts x₁ + x₂ ≥ 3."""
     balls = Balls(np.array([[0, 1]]), np.ones(1))
     qp = QP(
         P=np.eye(2), q=np.zeros(2), A=np.zeros((0, 2)), b=np.zeros(0),
@@ -445,7 +446,7 @@ def test_a_ball_without_a_point_beyond_a_row_is_infeasible():
 
 @dataclass(frozen=True)
 class Careless:
-    """Solver that accepts every QP."""
+    """Solver that declines no QP, without a declaration of sets."""
 
     def declines(self, qp):
         return None

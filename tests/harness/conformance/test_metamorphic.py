@@ -64,7 +64,7 @@ every_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
 def random_point(qp):
-    """Return a random point with multipliers of any sign, including absent bounds."""
+    """Return a random point with multipliers of any sign, also for absent bounds."""
     rng = generator()
     x, y, z, z_box = (rng.standard_normal(v.size) for v in (qp.q, qp.b, qp.h, qp.q))
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
@@ -92,7 +92,7 @@ def lagrangian(qp, s):
 )  # fmt: skip
 @every_shape
 def test_the_map_back_recovers_the_solution(manufactured, transform, shape, dense):
-    """The solution of the changed QP is mapped to the planted minimiser."""
+    """The solution of the changed QP is mapped to the minimiser, if it is unique."""
     qp, expected = manufactured(shape, dense=dense)
     new = TRANSFORMS[transform](qp)
     s = PIQP().prepare(new.qp, 1e-11)()
@@ -237,7 +237,7 @@ def test_powers_of_two_are_exact(manufactured, transform):
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_the_structure_of_a_dual_is_that_of_the_changed_dual(form, transform):
-    """P' = B'K'⁺B'ᵀ, with K' on the components that are not fixed."""
+    """P' = B'K'⁺B'ᵀ, with K' restricted to the components that are not fixed."""
     new = TRANSFORMS[transform](strings(form)).qp
     K, B = new.structure.K.toarray(), new.structure.B.toarray()
     free = np.setdiff1d(np.arange(len(K)), new.structure.fixed)

@@ -410,7 +410,7 @@ def test_distances_are_those_of_the_energy_norm():
 
 
 @pytest.mark.parametrize("serialised", [True, False])
-def test_a_qp_has_the_digest_that_a_run_writes_down(serialised, truths, tmp_path):
+def test_a_qp_has_the_digest_that_a_run_stores(serialised, truths, tmp_path):
     for case, _ in truths.values():
         written = save_qp(tmp_path / "qp.npz", case.qp, {}, serialised=serialised)
         assert qp_digest(case.qp, serialised=serialised) == written
@@ -463,12 +463,12 @@ def test_the_table_compares_primal_with_dual_and_each_solver_with_smalbe(
     assert rows["c", 1e-4]["primal_dual"] is None  # only dual forms
     assert rows["b", 1e-4]["from_ours"] == pytest.approx(1e-3, rel=1e-3)
     assert rows["b", 1e-6]["from_ours"] < 1e-8
-    assert rows["smalbe", 1e-4]["from_ours"] is None  # alone
+    assert rows["smalbe", 1e-4]["from_ours"] is None  # not compared with itself
     # pairs of answers at the same tolerance
     assert verdict["counts"]["pairs"] == 10 + 3
 
 
-@pytest.mark.slow  # slow solve; HiGHS and a manual candidate are quick
+@pytest.mark.slow  # slow solve; the tests of HiGHS and of a constructed point are quick
 def test_proxqp_without_its_gap_check_is_refuted(tmp_path, cli):
     text = "obstacle/n=16/primal"
     case = built(text)
@@ -709,7 +709,7 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
 
 
 @pytest.mark.parametrize("budget", ["-1", "nan"])
-def test_a_negative_time_for_finer_meshes_is_refused(cli, tmp_path, budget):
+def test_an_invalid_time_for_finer_meshes_is_refused(cli, tmp_path, budget):
     code, _, complaint = cli(tmp_path, "--budget", budget)
 
     assert code == 2

@@ -104,7 +104,7 @@ def true_error(dim, n, folder):
         pytest.param(2, 15, marks=pytest.mark.slow),
     ],
 )
-def test_the_estimate_is_the_true_error_of_string_and_membrane(tmp_path, dim, n):
+def test_the_estimate_approximates_the_error_of_string_and_membrane(tmp_path, dim, n):
     (found,) = meshes(tmp_path, f"obstacle/dim={dim}/n={n}/primal")
     error, norm = true_error(dim, n, tmp_path / "references")
 
@@ -155,7 +155,7 @@ def test_energies_of_mechanics_are_those_of_the_case(name):
         assert case.mechanics.energy(point.u) == pytest.approx(energy, rel=1e-11)
 
 
-def test_a_solution_in_the_space_has_no_error_that_could_be_seen(tmp_path):
+def test_a_solution_in_the_element_space_has_only_rounding_errors(tmp_path):
     (found,) = meshes(tmp_path, "contact-patch/primal")
 
     assert found.kind == "rounding"
@@ -283,7 +283,7 @@ def test_a_family_whose_finer_mesh_is_not_nested_gets_one_line(tmp_path):
     assert "could not be built" not in str(found)
 
 
-def test_forms_of_one_physical_case_are_one_line_of_the_file(tmp_path):
+def test_forms_of_one_physical_case_have_one_entry_in_the_file(tmp_path):
     names = ("obstacle/n=4/primal", "obstacle/n=4/dual-bounds", "obstacle/n=6/primal")
     found = meshes(tmp_path, *names)
 
@@ -311,8 +311,8 @@ def test_an_unavailable_error_has_a_reason(tmp_path):
 
 
 def test_a_mesh_whose_solve_would_exceed_the_budget_is_skipped(tmp_path):
-    """The first mesh takes a twentieth of a second, the next one eight
-    times as long.
+    """The first mesh takes at least 0.05 s; the expected time of the next mesh exceeds
+    the rest of the budget.
     """
     obstacle = PROBLEMS["obstacle"]
 
@@ -425,7 +425,7 @@ PUNCH = "bodies:suites/crossval/punch.toml"
 def test_the_error_of_a_mesh_from_gmsh_is_its_distance_to_a_far_finer_one(
     tmp_path, monkeypatch
 ):
-    """Four halvings approximate the limit; their error is a tenth of the
+    """Four halvings approximate the limit; their error is about a tenth of the
     coarse error.
     """
     monkeypatch.chdir(ROOT)
@@ -507,8 +507,8 @@ def test_trilinear_interpolation_of_hexahedra_does_not_depend_on_numbering():
         prolongation(coarse, grid((4, 1, 6)))
 
 
-def test_the_error_of_a_mesh_in_space_falls_with_its_cells(tmp_path):
-    """Singularities at the clamped edges reduce the rate below that of h."""
+def test_the_error_of_a_mesh_in_3d_falls_with_the_cell_size(tmp_path):
+    """Singularities at the clamped edges reduce the rate below first order."""
     found = meshes(tmp_path, "cube-wall/n=1/dual-bounds", "cube-wall/n=2/dual-bounds")
     errors = [one.change for one in found]
 

@@ -17,8 +17,8 @@ def test_a_disc_on_two_ranks_is_refused():
 
 
 def test_every_split_of_a_disc_is_detected():
-    """For random owners of components, a rank refuses if and only if a disc
-    is split.
+    """For random owners of components, some rank refuses if and only if a disc is
+    split.
     """
     rng, ranks = np.random.default_rng(0), single_process()
     seen = set()

@@ -64,7 +64,7 @@ def test_the_factor_of_a_difference_has_the_eigenvalues_that_are_known(share):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_eigenvalues_below_their_least_value_are_raised_to_it(seed):
-    """M has known eigenvalues λ relative to L₀L₀ᵀ, two of them negative by rounding."""
+    """M has known eigenvalues relative to L₀L₀ᵀ; two are negative, as by rounding."""
     rng, share = np.random.default_rng(seed), 1e-3
     L_0 = np.tril(rng.standard_normal((5, 5))) + 3 * np.eye(5)
     Q = np.linalg.qr(rng.standard_normal((5, 5)))[0]
@@ -142,8 +142,8 @@ def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(size):
 
 
 def laplacians(size, cells=4):
-    """Return the rows (k,) and A_p of each rank, for a chain of springs
-    with fixed ends.
+    """Return the number of rows, and the rows (k,) and A_p of each rank, for a chain of
+    springs with fixed ends.
     """
     nodes = np.arange(size * cells + 1)
     parts = []
@@ -204,8 +204,8 @@ def test_the_factor_of_a_chain_of_springs_is_that_of_the_whole(changing):
 
 @pytest.mark.parametrize("where", ["inner", "changing", "shared"])
 def test_dependent_rows_of_one_rank_are_refused_on_all(where):
-    """All ranks raise the error, wherever the rows are; otherwise some would wait for
-    ever.
+    """All ranks raise the error, wherever the rows are; otherwise, some would wait
+    forever.
     """
 
     def work(ranks):

@@ -155,8 +155,8 @@ def test_a_factor_with_a_border_solves(last):
 @pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("shift", [0.5, 1e-3, 1e-14])
 def test_changes_of_the_border_are_changes_of_the_matrix(shift):
-    """All entries of A in the two rows of the border are subtracted, so that only the
-    shift remains.
+    """The products of the columns `held` are subtracted from A, and in row 4 of A, only
+    the shift remains.
     """
     rng = np.random.default_rng(SEED)
     free, held = rng.standard_normal((6, 12)), np.zeros((6, 4))

@@ -86,7 +86,7 @@ def test_the_digest_ignores_load_memory_and_time(quiet, path):
         ("source.dirty", True),
     ],
 )
-def test_the_digest_changes_with_everything_that_affects_times(quiet, path, value):
+def test_the_digest_changes_with_values_that_affect_times(quiet, path, value):
     assert digest(changed(quiet, path, value)) != digest(quiet)
 
 
@@ -96,7 +96,7 @@ def test_the_digest_has_12_hex_digits_and_ignores_the_order_of_keys(quiet):
     assert re.fullmatch(r"[0-9a-f]{12}", digest(quiet))
 
 
-def test_two_captures_in_a_row_have_one_digest_through_json():
+def test_consecutive_captures_have_equal_digests_also_after_json():
     first, second = capture(), json.loads(json.dumps(capture()))
     assert digest(first) == digest(second)
 
@@ -113,7 +113,7 @@ def test_a_capture_contains_no_host_name_and_no_absolute_path(monkeypatch):
     assert str(Path.home()) not in text
 
 
-def test_plugins_are_named_by_their_content(tmp_path):
+def test_plugins_are_recorded_by_name_and_digest_of_their_content(tmp_path):
     (tmp_path / "other").mkdir()
     file, namesake = tmp_path / "a.py", tmp_path / "other" / "a.py"
     file.write_text("x = 1")
@@ -126,7 +126,7 @@ def test_plugins_are_named_by_their_content(tmp_path):
     namesake.write_text("y = 3")
 
     assert plain["plugins"] == {"a.py": sha256(b"x = 1").hexdigest()[:12]}
-    assert both["plugins"] == plain["plugins"]  # an empty namesake adds no plug-in
+    assert both["plugins"] == plain["plugins"]  # an empty namesake changes no digest
     assert changed_one["plugins"] != plain["plugins"]
     assert capture([file, namesake])["plugins"] != changed_one["plugins"]
     assert digest(changed_one) != digest(plain)
@@ -253,7 +253,7 @@ def test_each_problem_comes_with_advice(quiet, path, value, remedy):
         ({"one_pair": 0.3}, "noise floor"),
     ],
 )
-def test_an_unreliable_clock_is_a_warning(quiet, change, name):
+def test_an_unreliable_clock_causes_a_warning(quiet, change, name):
     (check,) = warnings(quiet, replace(QUIET_NOISE, **change))
 
     assert check.name == name
@@ -321,7 +321,7 @@ def test_a_perfect_clock_shows_no_noise_between_equal_arms():
 
 
 def test_a_steady_drift_affects_both_arms_equally():
-    readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
+    readings = (0.5 * k**2 + 100 * k for k in count())  # longer by 1 % of the first
     noise = noise_floor(30_000.0, clock=lambda: next(readings))
     assert noise.one_pair > 0.003  # error if all pairs had the same order
     assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of this error

@@ -1,6 +1,6 @@
-"""Files on full disks, of killed writers, and changed by other programs.
+"""Files on full disks, files of killed writers, and files changed by other programs.
 
-The fixture `full` imitates a full disk by a file size limit. As at the end of a disk,
+The context manager `full` imitates a full disk by a file size limit. As on a full disk,
 the kernel first writes fewer bytes than requested, then raises an error.
 """
 
@@ -70,7 +70,7 @@ def fault(run_id, **changes):
     return Fault(run_id=run_id, **({**told, "tried_again": False} | changes))
 
 
-def test_a_file_is_replaced_whole_and_readable_by_all(tmp_path):
+def test_a_file_is_replaced_whole_and_has_the_usual_permissions(tmp_path):
     path = tmp_path / "new" / "file"
     for content in (b"old", b"newer"):
         replace_file(path, content)
@@ -328,8 +328,8 @@ def first_page(folder, _formats, *, factor=10.0, pool_forms=False):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line on the toy problem in an empty folder; return
-    code, out, err.
+    """Return a function that runs a command line on the toy problem in a folder that
+    contains only a suite; it returns the exit code, stdout and stderr.
     """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "toy.toml").write_text(SUITE)
@@ -377,7 +377,7 @@ def test_a_run_and_its_report_state_measurements_prevented_by_faults(
     assert told not in (tmp_path / "d" / "said").read_text()
 
 
-def test_a_terminated_run_says_so_and_exits_with_143(cli, monkeypatch):
+def test_a_terminated_run_exits_with_143_and_restores_the_handler(cli, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
 
     def measured(*_, **__):

@@ -31,7 +31,7 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.damaged_files import MSH_41, QPS, fuzz, msh_22, tiny_qp
 
-ADDRESS_SPACE = 2**29  #: largest number of bytes that a refusal may need
+ADDRESS_SPACE = 2**29  #: additional bytes of address space for a refusal
 
 
 def build(path):
@@ -42,7 +42,7 @@ def build(path):
 
 @pytest.fixture
 def cheaply():
-    """Limit the address space that this process may add to `ADDRESS_SPACE`."""
+    """Limit the additional address space of this process to `ADDRESS_SPACE`."""
     _, hard = before = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
@@ -177,14 +177,14 @@ def zeros(path, mib, method=zipfile.ZIP_DEFLATED):
 
 
 def mat_element(declared, content):
-    """Write a version 5 file with one compressed variable."""
+    """Return a .mat file of version 5 with one compressed variable."""
     text = b"MATLAB 5.0".ljust(124) + struct.pack("<H", 0x100) + b"IM"
     body = zlib.compress(struct.pack("<II", 14, declared) + content, 1)
     return text + struct.pack("<II", 15, len(body)) + body
 
 
 def parquet_of_one_value(path, count):
-    """Write a Parquet file of long lists of one value, which occupy few bytes."""
+    """Write a Parquet file with long lists of zeros, which occupy few bytes."""
     table = pa.table({
         name: pa.array([np.zeros(count)], pa.list_(pa.float64()))
         for name in ("P", "q", "G", "h", "A", "b", "lb", "ub")
@@ -193,7 +193,10 @@ def parquet_of_one_value(path, count):
 
 
 def declared(name, values):
-    """Return a writer of a tiny QP with replaced arrays; None omits an array."""
+    """Return a test parameter with a writer of a tiny QP with replaced arrays.
+
+    The value None omits an array.
+    """
 
     def write(path):
         save_qp(path, tiny_qp(), {})
@@ -207,7 +210,7 @@ def declared(name, values):
 
 
 def header_only(text):
-    """Write an npz file in which q has the given header and eight bytes of data."""
+    """Return a writer of an npz file; q has the given header, and data of 8 bytes."""
     head = text.encode().ljust(117) + b"\n"
     member = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(8)
 
@@ -278,7 +281,7 @@ def test_an_archive_that_expands_is_refused_before_it_is_read(
 
 
 @pytest.mark.parametrize("name", ["a.qps.gz", "a.mat.gz"])
-def test_a_gzip_file_that_expands_is_refused_while_it_is_counted(
+def test_a_gzip_file_that_expands_is_refused_while_its_size_is_counted(
     tmp_path, monkeypatch, cheaply, name
 ):
     """The file expands to a gigabyte of zeros in several gzip members."""
@@ -407,7 +410,7 @@ def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, 
 
 
 def test_entries_in_any_order_are_added_up(tmp_path):
-    """The diagonal entry is 2 = 1.5 + 0.5, and the last row comes first."""
+    """P[0, 0] = 2 is stored as 0.5 + 1.5, after the entry of row 1."""
     parts = {
         "P_data": np.array([1.0, 0.5, 1.5, 2.0]), "P_indices": np.array([1, 0, 0, 1]),
         "P_indptr": np.array([0, 3, 4]), "P_shape": np.array([2, 2]),
@@ -499,7 +502,7 @@ def test_the_limit_can_be_raised_and_is_checked(tmp_path, monkeypatch):
 
 def test_a_file_above_the_limit_is_not_even_digested(tmp_path):
     with (tmp_path / "a.qps").open("wb") as file:
-        file.truncate(2**40)  # holes
+        file.truncate(2**40)  # a sparse file
 
     with pytest.raises(InputError, match="the file would take 1048576 MiB"):
         build(tmp_path / "a.qps")
@@ -531,7 +534,7 @@ def test_a_hostile_qps_text_is_refused_with_its_line(tmp_path, old, new, message
     assert len(str(caught.value)) < 700
 
 
-def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path):
+def test_many_sections_of_constraints_are_read_without_a_hang(tmp_path):
     rows = "".join(f" G R{i}\n" for i in range(20000))
     sections = "QSECTION\n" * 20000
     (tmp_path / "a.qps").write_text(f"ROWS\n{rows}{sections}")

@@ -58,7 +58,7 @@ BUILT = []
 
 
 def diagonal(arrays):
-    """Return the product with the diagonal matrix of an array."""
+    """Return a function that multiplies by the diagonal matrix of the array d."""
     BUILT.append(1)
     d = arrays["d"]
     return lambda x: d[:, None] * x if x.ndim == 2 else d * x
@@ -101,7 +101,7 @@ def test_an_exported_operator_is_written_as_a_matrix(operator_qp, tmp_path):
     np.testing.assert_array_equal(csr_array(qp.P).toarray(), np.diag([1.0, 2.0]))
 
 
-def test_building_an_operator_counts_in_every_preparation(operator_qp):
+def test_an_operator_is_built_anew_before_every_preparation(operator_qp):
     built_before_prepare = []
 
     class Looks:
@@ -118,7 +118,7 @@ def test_building_an_operator_counts_in_every_preparation(operator_qp):
     assert built_before_prepare == [1, 2]
 
 
-def test_an_operator_too_large_as_a_matrix_is_written_as_one_only(
+def test_an_operator_too_large_for_a_matrix_is_written_only_as_arrays(
     tmp_path, monkeypatch
 ):
     monkeypatch.setenv("MORTARBENCH_MOST_MIB", "1")

@@ -70,7 +70,9 @@ def test_sizes_count_the_blocks_of_every_kind():
 
 
 def test_digests_distinguish_sets():
-    """A different radius, block, class or order defines a different problem."""
+    """A different radius, index, class or order within a block defines a different
+    problem; the order of the sets does not.
+    """
     discs, cones = mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]), mb.Cones([[0, 5]], [0.5])
     one = qp_digest(qp_over(discs, cones))
     assert qp_digest(qp_over(cones, discs)) == one

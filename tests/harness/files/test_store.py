@@ -64,7 +64,7 @@ def test_every_vector_its_name_and_its_shape_are_part_of_the_digest(tmp_path, so
         moved(solution, z=np.array([0.0])),
         moved(solution, x=solution.z_box, z_box=solution.x),
         moved(solution, x=np.array([[1.0], [np.nan]])),
-        moved(solution, z=np.array([0])),  # the bytes of 0.0
+        moved(solution, z=np.array([0])),  # same bytes as 0.0
     ]
 
     assert len({save_solution(tmp_path, s) for s in variants}) == len(variants)

@@ -90,7 +90,12 @@ def watched(monkeypatch):
 
 @pytest.fixture(scope="module")
 def beside_a_witness(tmp_path_factory):
-    """Measure a solver together with a worker that searches for leftover processes."""
+    """Return a function that measures a solver and then a witness.
+
+    The witness fails if another process of the test, except a sub-reaper, runs during
+    its solve. The function asserts that the solver leaves no process and no shared
+    memory.
+    """
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
@@ -361,7 +366,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
         bench("honest", command=["no-such-python"])
 
 
-def test_a_plug_in_that_crashes_on_import_affects_no_other_solver(bench):
+def test_a_plug_in_that_crashes_on_import_yields_the_verdict_crashed(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
     assert record.verdict is Verdict.CRASHED
@@ -412,7 +417,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     assert bench("honest").verdict is Verdict.VERIFIED
 
 
-#: program that reports a measurement that ended early, and measures again
+#: program that measures a hanging solver repeatedly, and prints the results
 RUNS = f"""
 import sys
 from pathlib import Path
@@ -456,7 +461,7 @@ def test_scratch_folders_of_killed_processes_are_removed_at_the_next_start(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scratch_folder_deleted_before_its_lock_is_created_again(
+def test_a_scratch_folder_deleted_before_it_is_locked_is_replaced(
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -47,7 +47,7 @@ def test_different_params_or_code_are_stored_as_different_cases(get):
 
 
 def test_one_of_many_concurrent_callers_builds(get):
-    # locks belong to open files, so threads suffice
+    # file locks belong to open files, so threads compete for them like processes
     with ThreadPoolExecutor(8) as pool:
         entries = list(pool.map(lambda _: get(name(n=1), slowly=0.1), range(8)))
 

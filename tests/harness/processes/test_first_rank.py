@@ -35,7 +35,7 @@ def test_the_rank_that_ended_first_is_named_however_it_ended(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("burners", [0, 2])
-def test_a_hundred_dying_ranks_are_named_on_a_busy_machine(tmp_path, burners):
+def test_the_first_of_four_dying_ranks_is_named_in_a_hundred_trials(tmp_path, burners):
     command = [sys.executable, "-S", "-c", BURNS]
     busy = [subprocess.Popen(command, stdin=subprocess.PIPE) for _ in range(burners)]
     try:

@@ -16,8 +16,8 @@ from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import soon
 
-#: program that sends requests to forked workers, prints each result, and is then
-#: killed. It runs in a separate process, since only a process with one thread forks
+#: program that sends requests to forked workers, prints the results, and kills
+#: itself. It runs in a separate process, since only a process with one thread forks
 #: safely
 PARENT = '''
 import atexit, json, os, signal, subprocess, sys, threading, time
@@ -132,9 +132,7 @@ def results(folder):
     return json.loads(done.stdout)
 
 
-def test_a_fork_has_the_state_of_a_started_worker_and_none_of_its_parent(
-    results, folder
-):
+def test_a_fork_has_the_state_of_a_worker_started_by_a_command(results, folder):
     (_, _, first), (_, _, second) = results["tell"]
     opened = list(first["open"].values())
 

@@ -64,7 +64,7 @@ def measured(tmp_path, monkeypatch):
 
 
 def processes_of(mark):
-    """List the other processes with the mark of a test in their environment."""
+    """List the IDs of other processes whose environment has the mark of a test."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -227,7 +227,7 @@ def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
 
 
 def journal_lines(folder):
-    """Return the lines of a journal."""
+    """Return the lines of the journal in a result folder."""
     files = sorted((folder / "journal").glob("*.jsonl"))
     return [line for file in files for line in file.read_text().splitlines()]
 
@@ -240,7 +240,7 @@ def is_rank(process):
 
 
 def names_stage(message, stage):
-    """Return True if a message has the prefix of the stage, or needs no prefix."""
+    """Return True if a message has the prefix of its stage; some stages have none."""
     if stage == "emission":
         return message.startswith("emission: ")
     return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

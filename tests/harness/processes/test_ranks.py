@@ -39,7 +39,7 @@ LANCZOS = 8  #: largest number of products with F before the solve
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
 def rank_results(request):
-    """Return results of several ranks on vectors and on two duals."""
+    """Return results of several ranks on vectors, on factors and on all `CASES`."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
@@ -131,7 +131,7 @@ def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
         "bodies/parts=12/dual",
     ],
 )
-def test_bodies_in_space_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_path):
+def test_bodies_in_3d_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_path):
     if name.startswith("bodies"):
         description = solid_blocks(tmp_path, TETRAHEDRA)
         name = name.replace("bodies", f"bodies:{description}")
@@ -154,8 +154,8 @@ def test_bodies_in_space_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_p
         "hertz-sphere/n=1/against=sphere/Q=0.3/feti=2/dual",
     ],
 )
-def test_friction_in_space_has_the_same_displacement_on_all_numbers_of_ranks(name):
-    """At this tolerance gradients approach rounding, and the last steps may differ."""
+def test_friction_in_3d_has_the_same_displacement_on_all_numbers_of_ranks(name):
+    """At this tolerance, gradients are near their rounding errors; steps may differ."""
     whole = mb.solve(name.replace("/feti=2", ""), "smalbe", tol=TOL).record.quantities
     for ranks in (1, 2, 4):
         answer = mb.solve(name, "smalbe", tol=TOL, ranks=ranks)
@@ -177,7 +177,7 @@ def test_friction_in_space_has_the_same_displacement_on_all_numbers_of_ranks(nam
         "hertz-sphere/n=1/against=sphere/Q=0.3/feti=2/dual",
     ],
 )
-def test_friction_in_space_takes_the_same_steps_on_all_numbers_of_ranks(name):
+def test_friction_in_3d_takes_the_same_steps_on_all_numbers_of_ranks(name):
     """Steps coincide as long as gradients exceed their rounding errors."""
     alone, *several = (mb.solve(name, "smalbe", tol=1e-6, ranks=n) for n in (1, 2, 4))
     for answer in several:
@@ -218,7 +218,7 @@ def test_friction_on_metis_parts_has_the_same_displacement_on_ranks(tmp_path):
             assert answer.record.quantities[state] == alone.record.quantities[state]
 
 
-@pytest.mark.slow  # by default, a case of `CASES` has dependent rows on ranks
+@pytest.mark.slow  # a fast test has dependent rows on ranks, in a case of `CASES`
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
     """Node-to-segment rows do not resist rolling, so the equality rows are
@@ -259,7 +259,7 @@ def test_the_same_number_of_ranks_gives_the_same_bits(answers):
     assert np.array_equal(first.solution.x, again.solution.x)
 
 
-def test_journal_lines_of_one_rank_are_as_they_were(answers):
+def test_journal_lines_of_one_rank_have_no_fields_of_ranks(answers):
     *_, alone = answers
     line = json.loads(alone.record.to_json())
     assert not {"ranks", "rank_seconds", "rank_counts"} & line.keys()
@@ -346,7 +346,10 @@ def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path)
 def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
     tmp_path, monkeypatch
 ):
-    """Test suites and single solves; the ranks use the original family."""
+    """Test a suite and a single solve; the family of this process cannot build a case.
+
+    The ranks have their own, working family.
+    """
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
         SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
@@ -409,8 +412,8 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-#: first of two load steps; a single process emits its QP, so a rank that has its share
-#: is preparing or solving
+#: suite with the first of two load steps. A single process emits the QP, so a rank that
+#: has its share is preparing or solving
 LARGE = (
     SUITE.replace(
         "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"
@@ -454,7 +457,7 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
 
 
 def processes(mark):
-    """List the other processes of a test, with their commands."""
+    """List other processes of a test: IDs, commands and environments."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -475,7 +478,7 @@ def resident_mib(pid):
 
 
 def busy_rank(mark):
-    """Return [rank 1] when it has its share of the QP, and [] before."""
+    """Return the ID of rank 1 in a list; before rank 1 has its share of the QP, []."""
     return [
         pid
         for pid, command, environment in processes(mark)

@@ -21,7 +21,7 @@ from tests.support.waiting import soon
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
 CASE = "string/n=10/primal"
-#: program that solves in several threads, in a separate session, and prints the results
+#: program that builds, solves and runs in several threads, and prints the results
 THREADS = """
 import gc, json, os, sys, tempfile
 from pathlib import Path
@@ -107,7 +107,7 @@ def assert_all_right(found, count):
 
 
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_threads_that_build_solve_and_run_at_the_same_time_take_turns(tmp_path, times):
+def test_concurrent_builds_solves_and_runs_in_threads_are_correct(tmp_path, times):
     found = of_threads(tmp_path, 3, times, "solve", "build", "run")
     assert_all_right(found, 3 * times)
 
@@ -151,7 +151,7 @@ def test_closing_twice_does_not_close_another_file(worker, tmp_path):
 
 
 def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
-    """Test from the start of a worker to its end, including stops of other workers."""
+    """Test two workers from start to end; each pauses while the other works."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
     def refuse(*what):
@@ -168,8 +168,8 @@ def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
     assert soon(lambda: not reaper.is_alive(pid))
 
 
-def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
-    """The process may have the reused ID of a process of a worker."""
+def test_a_process_that_is_not_a_descendant_is_never_signalled(monkeypatch):
+    """A list of descendants may contain an ID that another process has reused."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
@@ -260,7 +260,7 @@ def env(tmp_path):
         (signal.SIGINT, 130),
     ],
 )
-def test_a_terminated_solve_cleans_up_and_says_so(tmp_path, number, code):
+def test_a_terminated_solve_cleans_up_and_prints_one_line(tmp_path, number, code):
     plugin = tmp_path / "hangs.py"
     plugin.write_text(HANGS)
     solve = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Times of dualisation exclude effects of first calls, because a case is
+"""Times of dualisation exclude effects of first calls, since the first dual case is
 built twice.
 """
 
@@ -16,7 +16,7 @@ from mortarbench.harness.processes.case_worker import CaseWorker
 
 @dataclass(frozen=True)
 class Slow(Family):
-    """Family whose first dual case takes longer because of first calls."""
+    """Family that reports ten times the time for its first dual case."""
 
     name: str = "slow"
     forms: tuple = ("primal", "dual")

@@ -46,8 +46,8 @@ def blank_figures():
 
 @pytest.fixture(scope="module")
 def folder_of_run(tmp_path_factory, svg_only):
-    """Create a folder with files of every type, without one measurement of
-    its suite.
+    """Create a folder with files of every type, whose journal contains only the
+    measurements by `smalbe`.
     """
     folder = tmp_path_factory.mktemp("whole") / "run"
     suite = folder.with_name("s.toml")
@@ -71,7 +71,7 @@ def folder_of_run(tmp_path_factory, svg_only):
 
 
 def kinds_of_files(folder):
-    """Return a path for each type of file (folder and ending), and one report."""
+    """Return one path for each folder and ending, and one path in the report."""
     paths = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
@@ -129,7 +129,7 @@ def empty(path, _outside):
     path.write_bytes(b"")
 
 
-#: files as large as the limit, which every command reads for seconds
+#: large files, which every command reads for seconds
 LARGE = (sparse, with_zeros, below_the_limit)
 KINDS = (
     *(pytest.param(kind, marks=pytest.mark.slow) for kind in LARGE),
@@ -193,7 +193,7 @@ def try_commands(folder_of_run, tmp_path, name, kind, read):
 
 
 def but_slow(*kinds):
-    """Return the types of files; tests of some are slow."""
+    """Return `KINDS`; tests of the given types are also slow."""
     return [
         pytest.param(kind, marks=pytest.mark.slow) if kind in kinds else kind
         for kind in KINDS
@@ -249,7 +249,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
 
 @pytest.fixture
 def folder_copy(folder_of_run, tmp_path):
-    """Copy a folder, and remove the copy by rm, since pytest's removal is recursive."""
+    """Copy a folder; rm removes the copy, since pytest exceeds the recursion limit."""
     folder = tmp_path / "run"
     shutil.copytree(folder_of_run, folder)
     yield folder

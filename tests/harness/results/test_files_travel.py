@@ -55,7 +55,7 @@ def measured(tmp_path_factory):
 
 @pytest.fixture
 def here(measured, tmp_path, monkeypatch):
-    """Change to an empty directory that contains only the result folder."""
+    """Change to a directory that contains only the result folder."""
     shutil.copytree(measured / "run", tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -240,7 +240,7 @@ def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch
     )
 
 
-def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
+def test_copies_of_a_folder_have_a_common_size_limit(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(copies, "MAX_FOLDER_MIB", 2)
     sources = []

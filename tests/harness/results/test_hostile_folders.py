@@ -74,8 +74,8 @@ def command(capsys, monkeypatch, tmp_path):
 
 
 def everything(folder):
-    """Return the names and contents of all files in a folder, without
-    following links.
+    """Return the paths in a folder with the contents of files; links to folders are not
+    followed.
     """
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() else None

@@ -140,7 +140,7 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
 
 
 def test_a_line_of_the_first_schema_is_read_with_its_meaning(tmp_path):
-    """Its residuals have other scales; residuals and verdict are kept."""
+    """Residuals of schema 1 have other scales; residuals and verdict are unchanged."""
     row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
     for name in ("decided_by", "optimum_error"):
         del row[name]
@@ -156,7 +156,7 @@ def test_a_line_of_the_first_schema_is_read_with_its_meaning(tmp_path):
     assert json.loads(old.to_json())["schema"] == 1
 
 
-def test_a_measurement_has_the_same_name_as_in_older_folders():
+def test_the_run_id_of_a_measurement_is_that_of_older_folders():
     """With another run_id, a continued run would repeat all measurements."""
     box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(
@@ -205,7 +205,7 @@ def test_a_journal_that_is_deleted_while_it_is_written_loses_nothing(tmp_path):
     assert len(told) == 2
 
 
-def test_a_record_that_the_disk_takes_in_part_only_is_not_in_the_journal(tmp_path):
+def test_a_partially_written_record_is_not_in_the_journal(tmp_path):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     file = tmp_path / "journal" / "here.jsonl"
     with Journal(tmp_path, "here") as journal:

@@ -64,7 +64,10 @@ def finished(registries, tmp_path_factory):
 
 @pytest.fixture
 def cli(registries, capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; return its code, stdout and stderr."""
+    """Return a function that runs a command line in the folder of the test.
+
+    The function returns the exit code, stdout and stderr.
+    """
     monkeypatch.chdir(tmp_path)
 
     def cli(*argv, registries=registries):
@@ -107,7 +110,7 @@ def test_the_point_and_the_times_are_compared_with_the_stored_ones(cli, stored):
 
     assert told["distance"] == 0
     assert ratio == pytest.approx(told["now"]["solve_seconds"] / middle)
-    assert least + greatest == pytest.approx(2)  # two repeats about their median
+    assert least + greatest == pytest.approx(2)  # symmetric about the median
 
 
 def test_the_ratio_of_times_names_its_times(cli, stored):

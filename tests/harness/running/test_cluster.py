@@ -56,7 +56,7 @@ class Cluster:
         self._forks = forks
         self.starts = folder / "starts"
         self.starts.touch()
-        # locks of CPUs; another test cluster has a separate folder
+        # folder of the CPU locks; other test clusters use other folders
         locks = folder / "locks"
         locks.mkdir(exist_ok=True)
         self._env = os.environ | {
@@ -88,7 +88,7 @@ class Cluster:
         return self._forks.dask(arguments, self._env, serves)
 
     def started_solvers(self):
-        """Return the processes that started a slow solve, in order."""
+        """Return the IDs of processes that started a slow solve, in order of starts."""
         return [int(line.split()[0]) for line in self.starts.read_text().splitlines()]
 
     def close(self):
@@ -106,8 +106,8 @@ def cluster(tmp_path, forks):
 
 @pytest.fixture
 def cli(capsys, monkeypatch, tmp_path):
-    """Run a command line on the toy problem in an empty folder; return
-    code, out, err.
+    """Return a function that runs a command line on the toy problem in a folder with a
+    suite; it returns the exit code, stdout and stderr.
     """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
@@ -148,13 +148,13 @@ def partial_blocks(folder):
 
 
 def node_of(solver):
-    """Return the Dask worker of a solver process, which is its sub-reaper's parent."""
+    """Return the ID of the Dask worker of a solver: the parent of its sub-reaper."""
     reaper = parent(solver)
     return None if reaper is None else parent(reaper)
 
 
 def parent(process):
-    """Return the parent of a process; None if the process has ended."""
+    """Return the ID of the parent of a process; None if the process has ended."""
     with suppress(OSError):
         return int(
             Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1]
@@ -178,7 +178,7 @@ def all_cpus():
     os.sched_setaffinity(0, before)
 
 
-@pytest.mark.usefixtures("all_cpus")  # each node needs a CPU
+@pytest.mark.usefixtures("all_cpus")  # each Dask worker needs its own CPU
 def test_two_workers_measure_the_same_as_one_although_one_is_killed(
     cli, cluster, tmp_path
 ):
@@ -261,7 +261,7 @@ def test_an_address_without_a_scheduler_is_reported_in_one_line(cli, monkeypatch
 
 
 def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
-    """Test also --fresh, which deletes the content of a folder."""
+    """Test the option --fresh, which deletes earlier results before a run."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
@@ -340,7 +340,7 @@ def descendants(process):
 @pytest.mark.slow
 def test_a_finished_run_leaves_nothing_on_the_nodes(cli, cluster):
     worker = cluster.join()
-    assert soon(lambda: descendants(worker.pid))  # processes that would outlive the run
+    assert soon(lambda: descendants(worker.pid))  # the fork server, which outlives runs
     before, idle = set(descendants(worker.pid)), []
 
     def look():
@@ -351,7 +351,7 @@ def test_a_finished_run_leaves_nothing_on_the_nodes(cli, cluster):
         run = ("run", "toy.toml", "--out", "d", "--case", "well/depth=2/dual")
         assert cli(*run, "--dask", cluster.address)[0] == 0
 
-    assert len(idle) >= 2  # a solver and the generator
+    assert len(idle) >= 2  # a solver and the case worker
     assert soon(lambda: set(descendants(worker.pid)) == before)
 
 
@@ -480,7 +480,10 @@ def test_a_block_that_kills_every_worker_is_abandoned_and_others_are_measured(
 
 @pytest.fixture
 def meet():
-    """Pass the environment of a node to `Nodes`; record stored files and warnings."""
+    """Return a function that adds a node with a changed environment to `Nodes`.
+
+    The function returns the stored environments and the warnings.
+    """
     from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []

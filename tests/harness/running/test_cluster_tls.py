@@ -26,7 +26,7 @@ forms = ["dual"]
 
 
 def certificates(folder):
-    """Create an authority and a certificate; return entries of Dask's configuration."""
+    """Create a CA and a certificate; return entries of Dask's configuration."""
     names = {n: str(folder / n) for n in ("ca.key", "ca.crt", "our.key", "our.crt")}
 
     def openssl(*arguments):
@@ -86,7 +86,7 @@ def test_a_suite_is_measured_over_tls_with_dask_s_own_configuration(
     try:
         cluster.join()
         assert cluster.address.startswith("tls://")
-        # this process read its environment when it imported Dask
+        # Dask read the environment of this process when it was imported
         told = {f"distributed.comm.tls.{k}": v for k, v in credentials.items()}
         with dask.config.set(told):
             code = main(registries, [

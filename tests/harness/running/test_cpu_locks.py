@@ -1,4 +1,4 @@
-"""Locks of CPUs in a shared folder, in which other users cannot create them."""
+"""CPU locks in a folder that only the user of the Dask workers can access."""
 
 import os
 import tempfile
@@ -57,7 +57,7 @@ def open_to_all(path, elsewhere):
 
 
 @pytest.mark.parametrize("plant", [link_elsewhere, file_instead, open_to_all])
-def test_a_lock_folder_that_others_can_write_is_refused(shared, plant):
+def test_a_lock_folder_that_is_not_private_is_refused(shared, plant):
     elsewhere = shared / "elsewhere"
     elsewhere.mkdir(mode=0o700)
     plant(ours(shared), elsewhere)

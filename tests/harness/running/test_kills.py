@@ -63,7 +63,7 @@ except InputError as e:
 except KeyboardInterrupt:
     sys.exit(130)
 """
-#: exit codes of a run by signal, before its first line or later
+#: possible exit codes of a run by signal, which may arrive at any time
 ASKED = {
     signal.SIGINT: (130, -signal.SIGINT, 1, 0),
     signal.SIGTERM: (143, -signal.SIGTERM, 0),
@@ -79,7 +79,7 @@ def start(suite, out):
 
 
 def end_of(run):
-    """Return the exit code of a run and its last line."""
+    """Return the exit code of a run and the last line of its stderr."""
     said = run.communicate()[1].splitlines()
     return run.returncode, said[-1] if said else ""
 
@@ -99,7 +99,7 @@ def family(process):
 
 
 def kill_one(run, rng, out):
-    """Kill the run or one of its processes."""
+    """Kill the run or one of its child processes."""
     if rng.random() < 0.5 and (young := children(run.pid)[1:]):
         with suppress(ProcessLookupError):
             os.kill(rng.choice(young), signal.SIGKILL)
@@ -109,14 +109,14 @@ def kill_one(run, rng, out):
 
 
 def ask_to_end(run, rng, out):
-    """Send the signal of Ctrl-C or of a batch system."""
+    """Send SIGINT, as Ctrl-C does, or SIGTERM, as a batch system does."""
     number = rng.choice(list(ASKED))
     run.send_signal(number)
     assert end_of(run)[0] in ASKED[number]
 
 
 def fill_by_limit(run, rng, out):
-    """Set a file size limit of zero for all processes of the run."""
+    """Set a file size limit of zero for all processes of the run; check its end."""
     for process in family(run.pid):  # new child processes inherit the limit
         with suppress(ProcessLookupError, PermissionError):
             hard = resource.prlimit(process, resource.RLIMIT_FSIZE)[1]
@@ -125,7 +125,7 @@ def fill_by_limit(run, rng, out):
 
 
 def fill_by_files(run, rng, out):
-    """Fill the file system of the folder."""
+    """Fill the file system of the folder; check the end of the run."""
     filler = out.parent / "filler"
     try:
         with suppress(OSError), filler.open("wb", buffering=0) as file:
@@ -137,7 +137,7 @@ def fill_by_files(run, rng, out):
 
 
 def assert_told(run):
-    """Assert that a run on a full disk ended with one line, or had nothing to write."""
+    """Assert that a run on a full disk ended with code 0, or with 2 and a remedy."""
     code, said = end_of(run)
     assert code in (0, 2), (code, said)
     if code == 2:
@@ -145,7 +145,7 @@ def assert_told(run):
 
 
 def disturb(suite, out, events, rng, longest):
-    """Apply all `events` to runs at random times, then let one run finish."""
+    """Apply all `events` to runs at random times, then let a run finish."""
     run = start(suite, out)
     for event in events:
         with suppress(subprocess.TimeoutExpired):
@@ -183,7 +183,7 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     changed = [r for r in got if r.verdict != verdicts[r.run_id]]
     assert len(changed) <= 3 * events.count(
         kill_one
-    )  # measurements of a killed worker: at most a sequence
+    )  # a killed worker affects at most the three steps of a sequence
     for record in changed:
         assert record.message.endswith("SIGKILL"), record
     assert not list(out.glob(".scratch/*"))
@@ -198,22 +198,22 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     ],
     ids=["few", "all"],
 )
-def test_a_run_disturbed_a_few_times_ends_as_an_undisturbed_one(tmp_path, events):
+def test_a_run_disturbed_a_few_times_completes_all_measurements(tmp_path, events):
     check(tmp_path, [*events], seed=161803, repeats=1)
 
 
 @pytest.mark.slow
-def test_a_disturbed_run_with_four_repeats_ends_as_an_undisturbed_one(tmp_path):
+def test_a_disturbed_run_with_four_repeats_completes_all_measurements(tmp_path):
     check(tmp_path, [kill_one] * 2 + [ask_to_end] + [fill_by_limit] * 2, seed=161803)
 
 
 @pytest.mark.slow
-def test_a_run_killed_fifty_times_ends_as_an_undisturbed_one(tmp_path):
+def test_a_run_killed_fifty_times_completes_all_measurements(tmp_path):
     check(tmp_path, [kill_one] * 50, seed=141421)
 
 
 @pytest.mark.slow
-def test_twenty_kills_and_eight_full_disks_lose_no_measurement_or_verdict(tmp_path):
+def test_twenty_kills_and_eight_full_disks_lose_no_measurement(tmp_path):
     check(tmp_path, [kill_one] * 20 + [fill_by_limit] * 8, seed=271828)
 
 
@@ -230,7 +230,8 @@ def test_a_run_terminated_twenty_times_continues(tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """Create a folder on a file system of 8 MiB; return it with a function to fill it.
+    """Mount a file system of 8 MiB on the folder `disk`; return the parent folder, and
+    a function that fills the file system.
 
     For users who may not mount file systems, a file size limit is used instead.
     """

@@ -30,8 +30,8 @@ def test_the_interval_of_two_pairs_has_one_degree_of_freedom():
 
 
 def test_welchs_interval_of_equally_scattered_samples_is_students():
-    """Logarithms 0, 2 and 10, 12: both means have variance 1, so there are
-    2 degrees.
+    """For the logarithms 0, 2 and 10, 12, both means have variance 1, and the number of
+    degrees of freedom is 2.
     """
     ratio = unpaired_ratio(np.exp([0.0, 2.0]), np.exp([10.0, 12.0]))
 

@@ -86,7 +86,7 @@ def suite(*solvers, cases=({},), **changes):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite in worker processes; return the watcher of its progress."""
+    """Return a function that runs a suite and returns the watcher of its progress."""
 
     def measure(
         suite,
@@ -158,7 +158,7 @@ OUTCOMES = {
 }  # fmt: skip
 
 
-#: solvers that exhaust a limit for seconds; only the slow test includes them
+#: solvers that take seconds to exhaust a limit; only the slow test includes them
 EXHAUSTING = {"printsendlessly", "forksahoarder"}
 
 
@@ -214,12 +214,12 @@ def test_the_answer_to_another_problem_is_wrong(measure, tmp_path):
     assert verdicts == [Verdict.VERIFIED, Verdict.WRONG]
 
 
-def test_a_record_contains_phases_and_the_place_of_measurement(measure, tmp_path):
+def test_a_record_contains_times_of_phases_threads_and_cpu(measure, tmp_path):
     measure(suite("honest", "sleeps", repeats=5))
     records = read_journal(tmp_path)
 
     slow = next(r for r in records if r.solver == "sleeps")
-    # a measurement that waited for its CPU is not repeated; at least one of five did
+    # a solve that waited for its CPU is not timed in a loop; at least one of five did
     # not wait
     quick = max(
         (r for r in records if r.solver == "honest"), key=lambda r: r.inner_loops
@@ -412,7 +412,7 @@ def test_a_refusal_is_recorded_once_per_tolerance(measure, tmp_path):
     assert measure(two).records == []
 
 
-def test_a_block_is_every_solver_once_in_an_order_that_changes(measure, tmp_path):
+def test_a_block_has_every_solver_once_in_an_order_that_changes(measure, tmp_path):
     names = ("honest", "warm", "zero", "mutatesbyforce")
     measure(suite(*names, repeats=6))
     records = read_journal(tmp_path)
@@ -767,11 +767,11 @@ def test_on_any_full_disk_a_run_ends_in_one_line_and_can_continue(
 
 
 @pytest.mark.parametrize("size", [600, 4000])
-def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
+def test_a_full_disk_in_the_case_worker_or_worker_yields_no_verdict(
     measure, tmp_path, size
 ):
-    """A point needs more than 600 bytes and a case more than 4000; other files need
-    less.
+    """A file of a point is larger than 600 bytes, and a file of a case is larger than
+    4000 bytes.
     """
     whole = suite("honest", "prints")
     if size == 600:
@@ -873,7 +873,7 @@ def family(process):
 
 @pytest.fixture
 def own_interpreters(monkeypatch):
-    """Start processes by their commands, since forks show no command in /proc."""
+    """Start processes by commands, since forks have no own command in /proc."""
     monkeypatch.setattr(supervisor, "subprocess", subprocess)
 
 
@@ -886,7 +886,7 @@ def kill_worker(solver):
                 os.kill(process, signal.SIGKILL)
 
 
-def test_a_worker_killed_between_two_steps_of_a_sequence_loses_none(
+def test_a_worker_killed_between_two_steps_of_a_sequence_loses_no_step(
     measure, tmp_path, own_interpreters
 ):
     measure(three_steps("chains"), after=1, act=lambda: kill_worker("chains"))

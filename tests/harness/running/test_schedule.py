@@ -39,8 +39,8 @@ class Quiet:
 
 
 def schedule_of(**changes):
-    """Return a schedule of one case, three repeats and solvers a and b,
-    with changes.
+    """Return a schedule of one case, three repeats and solvers a and b; `changes`
+    replaces fields of its suite.
     """
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
@@ -55,7 +55,7 @@ def schedule_of(**changes):
 
 
 def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Execute a suite with times of 1, 2 and 4 s and some noise."""
+    """Return records of a suite in which a, b and c take 1, 2 and 4 s, with noise."""
     rng = np.random.default_rng(seed)
     schedule = schedule_of(**changes)
     made = []

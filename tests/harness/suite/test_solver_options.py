@@ -155,7 +155,7 @@ def test_a_null_arm_has_the_options_of_its_twin():
         ),
     ],
 )  # fmt: skip
-def test_a_contradictory_sweep_is_refused(texts, message):
+def test_an_invalid_sweep_is_refused(texts, message):
     with pytest.raises(InputError) as e:
         labels(*texts)
 

@@ -330,7 +330,7 @@ def test_a_pattern_without_a_match_is_refused_with_the_cases(narrowed):
     )
 
 
-def test_limits_change_the_suite_as_run_and_nothing_else_does(narrowed):
+def test_only_limits_change_the_text_of_a_suite(narrowed):
     before = narrowed()
     after = narrowed(time_limit=2.5, memory_limit=100, repeats=1, cases=["*/dual"])
 
@@ -369,7 +369,7 @@ def test_a_limit_of_the_suite_cannot_be_set_as_a_solver_option(load, head):
         (dict(memory_limit=-1.0), "--memory-limit = -1.0; expected a positive number"),
     ],
 )
-def test_a_contradictory_override_is_refused(narrowed, changes, message):
+def test_an_invalid_override_is_refused(narrowed, changes, message):
     with pytest.raises(InputError, match=message):
         narrowed(**changes)
 
@@ -433,7 +433,7 @@ def test_files_of_a_suite_are_searched_here_and_then_beside_the_suite(
 
 
 def folder_of_files(folder, monkeypatch, *, here=True):
-    """Write a suite and some files, and change to its folder or to another folder."""
+    """Write some files, and change to `folder` or to its subfolder `elsewhere`."""
     (folder / "set" / "more.qps").mkdir(parents=True)
     (folder / "elsewhere").mkdir()
     for name in ("b.qps", "a.qps", "c[1].qps", "d.txt", "more.qps/e.qps"):
@@ -560,7 +560,7 @@ def test_a_pattern_keeps_all_steps_of_a_sequence_or_none():
         ("null_arm = 'smalb'", "unknown null_arm 'smalb'.*smalbe"),
     ],
 )
-def test_a_contradictory_schedule_is_refused(tmp_path, line, message):
+def test_an_invalid_schedule_is_refused(tmp_path, line, message):
     file = tmp_path / "s.toml"
     file.write_text(
         f"name = 's'\nsolvers = ['smalbe']\n{line}\n[[problems]]\nfamily = 'obstacle'\n"
@@ -632,7 +632,7 @@ def test_a_wrong_growing_series_is_refused(load, keys, message):
         load(MINIMAL + keys)
 
 
-def test_the_suite_of_the_crossover_reaches_a_million_dofs_in_plane_and_space():
+def test_the_suite_of_the_crossover_reaches_a_million_dofs_in_2d_and_3d():
     suite = load_suite(
         ROOT / "suites/crossover.toml", problems.PROBLEMS, solvers.SOLVERS
     )

@@ -18,7 +18,7 @@ from tests.support.supported_by_contact import disc_between_plates
 
 
 def moved(B, c, u, *, R=None, softness=None, closed=None):
-    """Move u inside Bu ≤ c; default: no motions, unit softness, no closed rows."""
+    """Move u to Bu ≤ c; defaults: no rigid motions, unit softness, no closed rows."""
     B, c, u = (np.array(v, dtype=Real) for v in (B, c, u))
     m, n = B.shape
     exact = Exact(
@@ -104,7 +104,7 @@ def test_a_motion_floats_relative_to_the_best_supported_one(size, supported, uni
 
 
 def near(multipliers, w, G, load, discs):
-    """Return the nearest multipliers with Gᵀλ = load, for a single motion."""
+    """Return the λ with Gᵀλ = load nearest to `multipliers`, for a single motion."""
     multipliers, w, G, load = (
         np.array(v, dtype=Real) for v in (multipliers, w, G, load)
     )
@@ -139,7 +139,7 @@ def test_motions_that_change_no_gap_are_removed():
     assert np.abs(free.T @ found).max() <= 1e-18
 
 
-def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypatch):
+def test_iterations_for_many_rows_agree_with_a_factorisation(monkeypatch):
     """Only contact supports the disc; the nodes move by about a millimetre."""
     mechanics = disc_between_plates().mechanics
     rng = np.random.default_rng(161803)

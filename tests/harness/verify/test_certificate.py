@@ -1,4 +1,4 @@
-"""Certificates: no error exceeds its bound, for many types of wrong answers."""
+"""Certificates: no error exceeds its bound, for several types of wrong answers."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Known:
 
     @property
     def slack(self) -> float:
-        """Bound of the error of the reference."""
+        """Bound on ‖u − u*‖_K of the reference."""
         return self.exact.bound * self.exact.norm
 
 
@@ -103,7 +103,7 @@ def _noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def _wrong_active_set(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Move multipliers from rows in contact to other rows."""
+    """Replace the multipliers of some rows by those of random rows."""
     z = s.z.copy()
     swapped = rng.random(z.size) < max(size, 1.5 / z.size)
     z[swapped] = rng.permutation(z)[swapped]
@@ -233,7 +233,7 @@ def test_bounds_of_solver_answers_are_sharp(names):
         pytest.param(("cube-wall/n=3", "hertz-sphere/n=1"), marks=pytest.mark.slow),
     ],
 )
-def test_bounds_in_space_are_sharp(names):
+def test_bounds_in_3d_are_sharp(names):
     labels = ("smalbe", "clarabel", "piqp", "osqp")
     cases = forms_of(names)
     found = [e for case in cases for e in effectivities(*case, labels)]
@@ -260,7 +260,7 @@ def test_bounds_of_all_solvers_are_sharp(name):
         "obstacle/n=10/dual-bounds",
     ],
 )
-def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
+def test_smalbe_at_tol_1e_8_reaches_six_digits_in_energy_norm(name):
     case = parse(name, PROBLEMS).build(reference_solution)
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
     assert certify(case.mechanics, case.mechanics.to_primal(s)).bound <= 1e-6
@@ -281,10 +281,8 @@ def test_answers_that_overflow_have_no_certificate_or_a_valid_one(name, size):
 
 
 @pytest.mark.parametrize("name", marked(*QUICK))
-def test_a_huge_error_is_not_measured_relative_to_itself(name):
-    """An error of ten times the solution is relative to the solution, not
-    the answer.
-    """
+def test_a_huge_error_is_relative_to_the_solution(name):
+    """The answer −10u* has the relative error 11, since errors are relative to ‖u*‖."""
     problem = known(name)
     s = problem.solution()
     found = certify(problem.mechanics, replace(s, x=-10 * s.x, z=0 * s.z))

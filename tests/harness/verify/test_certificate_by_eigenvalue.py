@@ -25,20 +25,20 @@ from tests.harness.verify.test_verdicts_over_discs_and_cones import (
     ExactProblem,
 )
 
-#: traps that keep the eigenvalues above one; rows are removed
+#: traps that need no rows and leave the eigenvalues of P at one or above
 KEPT = [t for t in TRAPS if t not in ("singular", "weak", "touching", "units")]
 
 
 class WithoutRows:
-    """A QP over sets without rows, its solution, and a bound of the
-    eigenvalues of P.
+    """A QP over sets without rows, its solution, and a lower bound on the eigenvalues
+    of P.
     """
 
     def __init__(self, traps, seed, ill=False):
         planted = ExactProblem(traps, seed)
         qp, s = planted.qp, planted.solution
         P = qp.P
-        if ill:  # condition numbers up to 1e9, with the same least eigenvalue
+        if ill:  # condition numbers up to 1e9, with the same lower bound
             M = (P - np.eye(len(P))) * 2.0**20
             P = M + np.eye(len(P))
         self.least = 1.0
@@ -59,9 +59,9 @@ class WithoutRows:
 
 
 def exceeded(seed, tries, each=100):
-    """Test bounds at points of all types; return failures, and ratios bound/error.
+    """Return failures of bounds, the number of bounds, and the median of bound/error.
 
-    The ratios are returned only for well-conditioned P, since bounds may otherwise be
+    The median is over QPs with well-conditioned P only, since bounds may otherwise be
     too large by the square root of the condition number.
     """
     rng = np.random.default_rng(seed)
@@ -104,7 +104,7 @@ def test_none_of_ten_thousand_attacked_bounds_is_exceeded():
 
 
 @pytest.mark.parametrize("trap", ["", *KEPT])
-def test_the_bound_of_a_solution_is_rounding(trap):
+def test_the_bound_of_a_solution_is_at_the_level_of_rounding(trap):
     for seed in range(10):
         planted = WithoutRows({trap}, seed)
         found = certify_by_eigenvalue(planted.qp, planted.solution, planted.least)
@@ -127,7 +127,7 @@ def test_an_interior_point_is_bounded_without_its_multipliers():
 
 @pytest.mark.parametrize("stiffness", [0.25, 4.0, 2.0**20])
 def test_the_bound_of_an_exact_solution_is_the_rounding_of_its_products(stiffness):
-    """min ½d‖x‖² − dx₁ at (1, 0) has r = 0 and terms 2d‖x‖ + ‖q‖ = 3d; √μ = √d."""
+    """For min ½d‖x‖² − dx₁ at (1, 0), r = 0 has terms 2d‖x‖ + ‖q‖ = 3d, and √μ = √d."""
     qp = mb.QP.from_arrays(stiffness * np.eye(2), [-stiffness, 0])
     x, none = np.array([1.0, 0]), np.zeros(0)
     s = Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=0 * x)
@@ -140,7 +140,7 @@ def test_the_bound_of_an_exact_solution_is_the_rounding_of_its_products(stiffnes
 
 
 class Scaled:
-    """The map x ↦ 2x, with a proven bound of its eigenvalues."""
+    """The map x ↦ 2x, with a lower bound on its eigenvalues."""
 
     least_eigenvalue = 1.5
 
@@ -176,7 +176,7 @@ def test_a_case_without_mechanics_is_certified_by_its_operator(offers):
     assert isinstance(P, LinearOperator)
 
 
-def test_rows_are_refused():
+def test_rows_and_nan_are_refused():
     planted = ExactProblem({"touching"}, 1)
     with pytest.raises(UncertifiableError, match="the QP has rows; expected bounds"):
         certify_by_eigenvalue(planted.qp, planted.solution, 1.0)

@@ -35,7 +35,7 @@ from tests.support.incline import block_on_incline
 
 pytestmark = pytest.mark.together
 INCLINE = "a block that friction alone holds"
-#: problems with friction, each with the same problem without friction
+#: problem with friction → the same problem without friction
 CASES = {
     "beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7": (
         "beam-ring/Nr=3/Nh=2/steps=2"
@@ -202,7 +202,7 @@ def attacked(name: str, count: int) -> tuple[list[str], list[float]]:
 
 
 def sharp(cases: Sequence[str], count: int) -> None:
-    """Test the cases, and equal cases without friction for comparison."""
+    """Test bounds; compare their sharpness with that of cases without friction."""
     rough, smooth = [], []
     for name in cases:
         told, found = attacked(name, count)
@@ -232,7 +232,7 @@ def test_no_disturbed_solution_of_a_body_held_by_friction_exceeds_its_bound():
     "name",
     [IN_SPACE[0], IN_SPACE[5], pytest.param(IN_SPACE[4], marks=pytest.mark.slow)],
 )
-def test_no_disturbed_solution_in_space_exceeds_its_bound(name):
+def test_no_disturbed_solution_in_3d_exceeds_its_bound(name):
     faults, effectivities = attacked(name, 15)
 
     assert faults == []
@@ -240,7 +240,7 @@ def test_no_disturbed_solution_in_space_exceeds_its_bound(name):
 
 
 @pytest.mark.slow
-def test_none_of_ten_thousand_errors_in_space_exceeds_its_bound():
+def test_none_of_ten_thousand_errors_in_3d_exceeds_its_bound():
     sharp = []
     for name in IN_SPACE:
         faults, effectivities = attacked(name, PERTURBATIONS // len(IN_SPACE) + 1)
@@ -252,7 +252,7 @@ def test_none_of_ten_thousand_errors_in_space_exceeds_its_bound():
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
-def test_vectors_in_space_stick_and_slip_obliquely(count):
+def test_friction_vectors_in_3d_stick_and_slip_obliquely(count):
     found = set()
     for name in IN_SPACE[:count]:
         exact = known(name).exact
@@ -328,7 +328,7 @@ def test_errors_of_solver_answers_are_bounded_in_every_form(name):
 
 @pytest.mark.parametrize("far", [-1.0, 1.0])
 def test_a_body_may_have_slid_by_its_displacement_in_either_direction(far, monkeypatch):
-    """A block sticks on an incline; the errors of the pair are not included."""
+    """Bounds on rigid motions of a sticking block include its displacement."""
     problem, seen = known(INCLINE), []
     mechanics, reach = problem.mechanics, certificate._reach
 

@@ -180,7 +180,7 @@ def errors_of(
 
 
 @pytest.mark.parametrize("name", marked(*QUICK))
-def test_no_answer_is_further_from_the_stored_problem_than_its_bound(name):
+def test_no_answer_is_further_from_the_solution_than_its_bound(name):
     told, _ = attack(name, 7)
     assert told == []
 
@@ -227,7 +227,7 @@ def test_a_free_plate_on_a_disc_rests_on_no_row_at_the_end_of_the_arc(
     case = disc_between_plates(9, form=form, contact=contact, basis=basis)
     s = SOLVERS[solver].prepare(case.qp, 1e-8)()
     at = case.mechanics.to_primal(s)
-    far = case.mechanics.primal.h > 0.05  # 15 cm
+    far = case.mechanics.primal.h > 0.05  # rows with a large initial gap
 
     assert s.status is Status.SOLVED
     assert certify(case.mechanics, at).bound <= 1e-6
@@ -280,8 +280,8 @@ def test_products_of_a_stored_matrix_with_rigid_motions_are_exact():
         assert error <= Fraction(1, 2**80) * sum(map(abs, terms))
 
 
-def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
-    """|B_i v| ≤ φ_i‖v‖ for every v without rigid motion, with equality for one v."""
+def test_the_compliance_of_a_row_is_attained_by_a_deformation():
+    """The bound |B_i v| ≤ φ_i‖v‖ is attained by v = K⁺B_iᵀ."""
     mechanics = disc_between_plates().mechanics
     split = Undivided(mechanics)
     for i in (0, 3):
@@ -310,8 +310,8 @@ def test_the_bound_for_rounding_satisfies_its_inequality():
     assert charge(0, 0, 1.0) == np.inf  # rounding outweighs the contact forces
 
 
-def test_an_initially_closed_gap_prevents_scaling():
-    """If u = 0 penetrates (c < 0), no θu with θ < 1 is used."""
+def test_an_initial_penetration_prevents_scaling():
+    """If u = 0 penetrates (c < 0), scaling by θ < 1 does not make u admissible."""
     mechanics = named("obstacle/dim=1/n=16").mechanics
     primal = mechanics.primal
     blocked = replace(primal, h=np.full_like(primal.h, -1.0), G=0 * primal.G)
@@ -451,7 +451,7 @@ def test_the_relative_error_for_a_zero_solution_is_zero_or_infinite():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("vector", ["x", "z"])
-def test_one_nan_in_a_point_prevents_certification(vector, value):
+def test_one_nan_or_inf_in_a_point_prevents_certification(vector, value):
     mechanics, u, lam, _ = known("contact-patch/lower=3/upper=2/ratio=1e-3")
     s = answer(u, lam)
     getattr(s, vector)[1] = value

@@ -57,8 +57,8 @@ OTHERS = (
     "obstacle/n=8", "obstacle/n=8/feti=4", "membranes/S=2/n=3",
     "beam-ring/Nr=2/Nh=2/steps=1/feti=3",
 )  # fmt: skip
-#: linear cases, for which other solvers take very long. All but the first are soft in
-#: bending or have nearly rigid internal motions
+#: linear cases, for which solvers other than `feti` take very long. All but the first
+#: are soft in bending or have nearly rigid internal motions
 PLATES = (
     "plate/Sx=12/Sy=1/n=2", "plate/Sx=40/Sy=1/n=1",
     "plate/Sx=20/Sy=1/n=1/width=20/height=0.05",
@@ -102,7 +102,7 @@ def known(name: str) -> tuple[Case, ExactSolution]:
 
 
 def certified(name: str, answers) -> Found:
-    """Certify labelled answers."""
+    """Certify labelled answers; compare the errors with their bounds."""
     case, exact = known(name)
     found = Found([], [], [])
     for label, s in answers:
@@ -209,7 +209,7 @@ def test_no_error_exceeds_the_bound_of_two_ranks(count, names):
 
 
 @pytest.mark.parametrize("name", PLATES[1:3])
-def test_the_energy_error_of_a_zero_displacement_equals_its_error(name):
+def test_the_stretch_of_a_zero_displacement_is_that_of_the_solution(name):
     """The energies in K and K_T differ most for soft displacements like the
     solution.
     """
@@ -240,7 +240,7 @@ def test_an_answer_that_moves_bodies_with_their_supports_strains_the_stored_matr
 
 @pytest.mark.parametrize("name", ["contact-patch", "hertz-cylinder/n=3/m=2"])
 def test_the_solution_for_the_stored_matrix_is_the_reference(name):
-    """One body is softer by 1e-9, so it moves far compared with its deformation."""
+    """The ratio of stiffnesses is 1e-9, so a body moves far relative to its strain."""
     case, exact = known(f"{name}/ratio=1e-9")
     point = reference_point(case.mechanics, reference_solution)
 

@@ -1,4 +1,4 @@
-"""Claims of infeasibility are verified if and only if they are true."""
+"""Claims of infeasibility are verified if they are true by more than rounding."""
 
 from dataclasses import replace
 from itertools import count
@@ -124,8 +124,8 @@ def test_qps_with_planted_solutions_are_not_proven_infeasible(shape):
 
 @pytest.mark.parametrize("z", [(1, 1 + 1e-9), (1e-30, 1e-30), (1e200, 1e200)])
 def test_the_ray_of_a_solver_is_corrected_before_its_check(z):
-    """For free variables, (1, 1 + 1e-9) yields c = ∓1e-9, so the ray must
-    be corrected.
+    """All variables are free, so Gᵀz must vanish; the entries for z = (1, 1 + 1e-9) are
+    ∓1e-9.
     """
     assert margin(infeasible(), z=z) == 1
 
@@ -212,7 +212,7 @@ def test_a_correct_claim_counts_despite_a_small_violation_of_its_point():
 
 
 def search(seeds):
-    """Count the proofs; assert that no proof is false and that no proof is missing.
+    """Return the number of proofs; assert that none is false and that none is missing.
 
     A proof is required if the QP stays infeasible when right-hand sides and bounds are
     relaxed by 1e-11 of their size.

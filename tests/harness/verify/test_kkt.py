@@ -91,7 +91,7 @@ def test_a_box_multiplier_pushing_outwards_fails(sign):
     at = 0.0 if sign > 0 else 1.0
     r = kkt_residuals(replace(qp, q=np.array([-sign - at])), point(at, z_box=sign))
 
-    assert r.complementarity > 0.3  # sign·slack to the other bound
+    assert r.complementarity > 0.3  # the force acts on a bound with slack
 
 
 def test_a_positive_multiplier_on_a_slack_row_is_not_complementary():
@@ -200,7 +200,7 @@ def test_a_planted_solution_has_no_residual_and_a_moved_one_has(manufactured, se
 
 @pytest.mark.parametrize("seed", [271828, 314159])
 def test_units_of_objective_variables_and_rows_do_not_matter(manufactured, seed):
-    """Residuals do not change with objective × 2²⁰, x in units of 2⁻⁷, scaled rows."""
+    """Residuals are equal for objective × 2²⁰, x in units of 2⁻⁷ and scaled rows."""
     qp, s = manufactured("everything", seed=seed, dense=True)
     s = replace(s, x=s.x + 1e-3, y=s.y * 1.01, z=s.z - 1e-3, z_box=s.z_box * 0.99)
     o, u = 2.0**20, 2.0**-7
@@ -286,10 +286,10 @@ def test_verdicts_for_an_operator_do_not_depend_on_units(manufactured, unit):
     assert found == pytest.approx(kkt_residuals(operator_in(1.0), moved), rel=1e-9)
 
 
-def test_an_operator_without_diagonal_has_the_other_residuals_of_its_matrix(
+def test_an_operator_without_diagonal_has_similar_residuals_to_its_matrix(
     manufactured,
 ):
-    """Lengths depend on Pᵢᵢ, so that they differ if the operator has no diagonal."""
+    """Lengths depend on Pᵢᵢ, so primal and dual residuals differ without a diagonal."""
     qp, s = manufactured("everything", seed=314159, dense=True)
     moved = replace(s, x=s.x + 1e-3)
     one = kkt_residuals(qp, moved)

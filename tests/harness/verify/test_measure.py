@@ -18,7 +18,7 @@ from tests.support import ADVERSARIES
 
 PLUGIN = load_plugin(ADVERSARIES)
 
-#: line references to this file in messages
+#: references to lines of the plug-in in messages, by the code of the line
 AT = {
     code: f" ({ADVERSARIES.name}:{line})"
     for line, text in enumerate(ADVERSARIES.read_text().splitlines(), start=1)
@@ -214,7 +214,7 @@ def test_the_peak_excludes_earlier_measurements(qp):
     assert after < before + 50
 
 
-def test_subclasses_of_plain_types_become_plain(qp):
+def test_numpy_integers_become_python_integers(qp):
     s = measure(PLUGIN.solvers["numpyscalars"], qp, 1e-6).solution
 
     assert s.status is Status.SOLVED
@@ -342,7 +342,7 @@ class ReadsEntries:
 
 @pytest.fixture
 def by_products():
-    """Return ½xᵀPx − Σx with P = diag(1, 2, 4) as an operator."""
+    """Return the QP min ½xᵀPx − Σxᵢ with P = diag(1, 2, 4) as an operator."""
     free = np.full(3, np.inf)
     makers = {"matrix": lambda arrays: lambda x: arrays["P"] @ x}
     arrays = {"P": np.diag([1.0, 2.0, 4.0])}
@@ -401,8 +401,8 @@ def test_an_impossible_count_is_refused_and_shown_if_short(qp, iterations, shown
 
 
 def test_processes_of_runs_import_no_unused_modules():
-    """Processes start tens of times in a run, so imports such as statistics
-    are costly.
+    """Processes start tens of times in a run, so imports such as `scipy.stats` are
+    costly.
     """
     needless = {
         "scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.spatial",

@@ -15,9 +15,9 @@ SEARCHED = (50, pytest.param(200, marks=pytest.mark.slow))
 def solved_qp(seed, *, definite=True):
     """Return a QP with redundant and degenerate rows, and its exact solution x.
 
-    The QP has dependent equality rows, active inequality rows with and without a
-    multiplier, duplicated rows, bounds on either side, fixed variables and free
-    variables.
+    Depending on the seed, the QP has dependent equality rows, active inequality rows
+    with and without a multiplier, duplicated rows, bounds on either side, fixed
+    variables and free variables.
     """
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 30))
@@ -72,9 +72,9 @@ def test_signs_of_computed_multipliers_are_those_of_their_bounds():
 
 @pytest.mark.parametrize("count", SEARCHED)
 def test_a_point_beside_the_solution_has_no_multipliers(count):
-    """With an error of 100·tol in every component, a residual above 10·tol remains.
+    """With an error of 100·tol·max|xᵢ| in every component, a residual exceeds 10·tol.
 
-    P is strictly convex, so no multipliers have smaller residuals.
+    The QP is strictly convex, so no multipliers verify this point.
     """
     left = []
     for seed in range(count):
@@ -86,8 +86,8 @@ def test_a_point_beside_the_solution_has_no_multipliers(count):
     assert min(left) > 10 * TOL
 
 
-def test_the_force_of_a_nearly_active_row_is_limited_by_its_slack():
-    """For min ½x² − x, x ≤ ½, at x = ½ − δ, the multiplier ½ has the cost ½δ."""
+def test_a_nearly_active_row_has_a_force_and_a_small_residual():
+    """For min ½x² − x, x ≤ ½, at x = ½ − δ, the multiplier ½ leaves a gap of ½δ."""
     delta = 1e-9
     qp = QP.from_arrays([[1.0]], [-1.0], G=[[1.0]], h=[0.5])
     s = with_multipliers(qp, np.array([0.5 - delta]))
@@ -114,7 +114,7 @@ def test_a_row_with_the_wrong_sign_has_zero_force():
 
 def test_a_vertex_of_a_linear_program_with_more_rows_than_it_needs_is_proven():
     """For min −x₁ − x₂ over x ≤ 1, x₁ + x₂ ≤ 2, 2x₁ + x₂ ≤ 3, four rows
-    meet at (1, 1).
+    and two bounds meet at (1, 1).
     """
     G = np.array([[1, 0], [0, 1], [1, 1], [2, 1]])
     qp = QP.from_arrays(np.zeros((2, 2)), [-1, -1], G, [1, 1, 2, 3], ub=1)

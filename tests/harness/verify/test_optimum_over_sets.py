@@ -138,7 +138,7 @@ class AttackOverSets(Attack):
 
 
 def search(seed, tries, each=40):
-    """Attack QPs with up to two traps; return wrong verdicts.
+    """Attack QPs with up to two traps; return wrong verdicts and counts.
 
     If no optimum is proven, residuals decide the verdict. They permit a violation of a
     ball relative to the shifts of its variables by other variables.

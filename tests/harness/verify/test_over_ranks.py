@@ -171,7 +171,7 @@ def test_condition_numbers_by_ranks_are_those_of_one_process(found, case):
 
 
 def test_an_exact_solution_is_recovered_across_subdomains(found):
-    """In the patch test, stress is uniaxial, and no rank has an entire body."""
+    """In the patch test, the stress is uniaxial; each body has several subdomains."""
     answer = found(PATCH)[-2]["by_ranks"]["quantities"]
     # plane strain, ν = 0.3: σ_z = −0.3p, and σ_vM = √(1 − ν + ν²)·p
     exact = (1 - 0.3 + 0.3**2) ** 0.5 * 1e6

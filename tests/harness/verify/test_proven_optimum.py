@@ -1,4 +1,4 @@
-"""Verdicts by proven optima: no wrong answer is verified, no right one is refuted."""
+"""Verdicts by proven optima, tested with wrong and right answers."""
 
 from dataclasses import replace
 from fractions import Fraction
@@ -66,7 +66,7 @@ PAID = replace(LONG, q=np.array([0.0, 1, -1]))  # x₁ = 1, ½, since x₂ = x�
 UNITS = qp_of([1, 1e16], [-1, 0], lb=[-INF, 1e-8])  # (1, 1e-8), f* = 0
 
 
-# comments: objective at the point, and f*
+# comments state the objective at the point, and f*
 @pytest.mark.parametrize(
     ("qp", "s"),
     [
@@ -161,7 +161,7 @@ SHORT = at([0.5, 0.5])  # f = −½
 
 
 def test_residuals_refute_no_point_between_nearly_parallel_rows():
-    """A reference with the same error proves nothing, unlike rational arithmetic."""
+    """Rational arithmetic proves f* = 0 from a reference point with the same error."""
     assert kkt_residuals(NEARLY, BETWEEN).worst <= 1e-9
     optimum = proven_optimum(NEARLY, lambda _: BETWEEN)
 
@@ -248,7 +248,7 @@ def test_if_the_reference_fails_residuals_decide():
     assert decided(qp, s, kkt_residuals(qp, s), TOL, proves(fails)) is None
 
 
-def test_a_false_reference_proves_nothing():
+def test_a_false_reference_does_not_change_the_optimum():
     for qp, s, value in (
         (FAR, at([1, 1], [0]), -0.75), (COSTLY, at([0, 0], z_box=[-1e9, 0]), -0.5),
     ):  # fmt: skip
@@ -439,7 +439,7 @@ def vectors(n):
 
 
 def test_a_remote_reference_point_hides_no_error():
-    """Terms are 1e24 at a solution 1e10 along the free direction x₁ = −x₃,
+    """Terms are 1e24 at a solution that is 1e10 away along the free direction x₁ = −x₃;
     f* = 2⁻²⁰.
     """
     planted = hard(frozenset({"cancelled", "duplicates", "redundant"}), 194299169)
@@ -652,7 +652,7 @@ class Attack:
         return max(off, self.violation(s.x, at)) > 100 * TOL
 
     def rounded(self):
-        """Return the solution with errors of one or two units in the last place."""
+        """Return the solution with errors of at most two units in the last place."""
 
         def off(v):
             return v * (1 + 2.0**-52 * self.rng.integers(-2, 3, v.size))
@@ -715,7 +715,7 @@ class Attack:
         return unit * step
 
     def fitted(self, s):
-        """Return the multipliers of active constraints that best balance
+        """Return `s` with the multipliers of active constraints that best balance
         the gradient.
         """
         qp, x = self.qp, s.x
@@ -750,10 +750,10 @@ class Attack:
 
 
 def search(seed, tries, way, each=40):
-    """Attack QPs with up to three traps; return wrong verdicts.
+    """Attack QPs with up to three traps; return wrong verdicts and a count.
 
-    If the optimum is proven, f* has three correct digits even if its terms cancel; with
-    idle variables, this is not always true.
+    In the variant "as it is", a verified point must have three correct digits of f*,
+    even if terms cancel. In all variants, its errors must be small relative to terms.
     """
     rng = np.random.default_rng(seed)
     wrong, refuted, verified = [], [], 0
@@ -832,7 +832,7 @@ def test_other_costs_do_not_hide_a_violated_row(cost, bend, tol, count):
 @pytest.mark.parametrize("count", [0, 400])
 @pytest.mark.parametrize("tol", [1e-8, 1e-4])
 def test_an_operator_without_diagonal_hides_no_force(tol, count):
-    """min ½x₂² + 3e5x₁ + x₂, x₁ = 0 has x* = (0, −1)."""
+    """min ½‖x‖² + 3e5x₁ + x₂, x₁ = 0 has x* = (0, −1)."""
     q, row, bends, right = idle_beside([3e5, 1], [1, 0], [1, 1], [0, -1], count=count)
     qp = replace(qp_of(bends, q, A=[row], b=[0]), P=Products(np.diag(bends)))
 

@@ -210,7 +210,7 @@ class SerialComm:
 
 
 def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
-    """Evaluate a point of `QP_`, whose row is replaced by the bound ¼."""
+    """Evaluate a point of `QP_` on one rank; the bound x₁ ≤ ¼ replaces the row of G."""
     ranks = Ranks(SerialComm())
 
     def slices(v):
@@ -238,7 +238,7 @@ def test_ranks_compute_the_objective_and_zero_residuals_of_a_solution():
     assert values.pop("objective") == pytest.approx((1 / 16 + 9 / 16) / 2 - 1)
     assert max(values.values()) <= 1e-15
     assert found.pop("notes") == []
-    assert set(found.values()) == {None}  # no value is available
+    assert set(found.values()) == {None}  # all other results are missing
 
 
 def test_ranks_return_no_results_for_a_point_that_is_not_finite():
@@ -256,7 +256,7 @@ def test_ranks_return_physical_results_as_plain_numbers():
     assert found["recover_seconds"] >= 0
 
 
-def test_results_that_fail_on_ranks_are_none_with_a_one_line_note():
+def test_results_that_fail_on_ranks_are_empty_with_a_one_line_note():
     found = on_one_rank(quantities=lambda: fault(None))
 
     assert found["quantities"] == {}
