@@ -140,7 +140,7 @@ def test_the_boundary_has_the_exact_height():
     )
 
 
-def test_over_the_hemisphere_the_exact_height_is_harmonic_and_leaves_it_smoothly():
+def test_outside_contact_the_exact_height_over_the_hemisphere_is_harmonic():
     rng = np.random.default_rng(20090)
     x, h = rng.uniform(-2, 2, (400, 2)), 1e-4
     laplacian = sum(

@@ -61,8 +61,8 @@ def test_an_elastic_bar_has_saint_venant_s_stiffness():
 
 @pytest.mark.parametrize("twist", [1e4, 1e8])
 def test_the_stress_function_of_a_plastic_bar_is_the_distance_to_the_boundary(twist):
-    """v is the distance from the boundary, with |∇v| = 1 except at the ridges and the
-    volume ⅙."""
+    """v is the distance from the boundary: |∇v| = 1 except at the ridges, and the
+    integral of v is ⅙."""
     n = 31
     case, s = solved(Torsion(), n=n, twist=twist)
     h, roof = 1 / (n + 1), case.qp.ub
