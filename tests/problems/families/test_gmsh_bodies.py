@@ -595,7 +595,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
     ],
 )  # fmt: skip
 def test_a_load_only_on_supports_is_refused(described, load, supports, message):
-    """A load is rejected if supports fix all displacements in its direction."""
+    """A load is rejected if supports fix all its nodes in one of its directions."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")

@@ -32,8 +32,8 @@ def test_the_journal_bearing_has_its_published_optimum(points, optimum):
 
 
 def test_the_film_is_symmetric_and_has_pressure_where_it_narrows():
-    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −ε sin ξ is negative for ξ < π only, which
-    makes v positive there."""
+    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the coefficient −ε sin ξ of v in the cost is negative
+    for ξ < π only, which makes v positive there."""
     n = 31
     _, s = solved(JournalBearing(), n=n, eccentricity=0.6)
     v = s.x.reshape(n, n)
