@@ -19,7 +19,7 @@ from tests.support.textbook import kernels
 from tests.support.textbook.model import Model
 from tests.support.textbook.mprgp import Directions, Point, Rules, mprgp, split
 
-MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
+MIXED = Rules(expansion="mixed", proportioning="cg")  # allows every type of step
 
 
 def run_textbook(A, b, lower, upper, x, *, tau, tol, rules, B, M, **options):

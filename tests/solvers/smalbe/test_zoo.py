@@ -155,10 +155,10 @@ def test_the_residual_of_a_dual_with_bounds_alone_is_within_the_tolerance(step, 
 @pytest.mark.parametrize("tol", [1e-6, 1e-8])
 @pytest.mark.parametrize("seed", [76, 106])
 def test_lost_conjugacy_costs_at_most_a_fifth_more_than_the_presets(seed, tol):
-    """The bodies have moduli six orders of magnitude apart; n = 148, 125.
+    """The bodies have moduli six orders of magnitude apart; n = 148 and n = 125.
 
-    With directions conjugate to the last one only, the solves took 147 and 111 products
-    instead of 72 and 69.
+    If directions are conjugate to the last one only, the solves take 147 and 111
+    products instead of 72 and 69.
     """
     assert ratio(generated_case(seed).qp, tol) <= 1.2
 
