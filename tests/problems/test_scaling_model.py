@@ -18,7 +18,8 @@ from mortarbench.problems.experiments.scaling_model import (
 )
 from tests.support import ROOT
 
-#: cores → √m times the time per product of a prototype in ms, for m = 1, 2, 4, 8
+#: cores → √m times the time per product of a prototype in ms, for clusters of side
+#: m = 1, 2, 4 and 8, as far as available
 PROTOTYPE = {
     128: (15,), 1024: (18, 21), 10240: (92, 27, 29), 102400: (1835, 168, 41.5, 41.1),
 }  # fmt: skip
@@ -55,8 +56,8 @@ def test_the_page_contains_the_predictions_of_the_code():
 
 
 def test_the_entries_of_a_coarse_factor_follow_the_measured_law():
-    """There are 8 × 8 × 8 subdomains, each coupled with its 26 neighbours by 6 × 6
-    blocks."""
+    """There are 8 × 8 × 8 subdomains, each coupled with all adjacent ones, of which
+    there are at most 26, by 6 × 6 blocks."""
     S = 8
     line = sparse.diags_array(
         [np.ones(S - 1), np.ones(S), np.ones(S - 1)], offsets=[-1, 0, 1]

@@ -84,7 +84,8 @@ ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
 #: largest error in x of all other solvers: interior-point methods stop at a gap of
 #: tol, which permits an angle of √tol between x and z of a disc
 OTHER_ERROR = 5e-4
-RESIDUAL = {"ecos": 3e-7}  #: residuals exceed 1e-7 for 7 of 500 QPs, without a claim
+#: for 7 of 500 QPs, residuals exceed 1e-7, and the solver reports a failure
+RESIDUAL = {"ecos": 3e-7}
 
 
 def check_solution(name, seed, tol=1e-8):
@@ -114,8 +115,8 @@ def test_500_planted_solutions_are_reached(name):
 
 @pytest.mark.parametrize("name", ["clarabel", "scs", "qoco"])
 def test_a_sequence_changes_radii_and_right_hand_sides(name):
-    """Each QP is solved by updating the solver of its predecessor; the fourth one
-    requires a new solver.
+    """Each QP is solved by updating the solver of its predecessor; the last two QPs
+    require new solvers.
     """
     qp, _ = conic_qp(1)
     discs, cones = qp.sets[1:]
@@ -138,7 +139,9 @@ def test_a_sequence_changes_radii_and_right_hand_sides(name):
 
 
 def test_a_warm_start_is_a_point_of_the_cones():
-    """SCS starts from x, slack and multipliers, which are exact at the solution."""
+    """SCS starts from x, slacks and multipliers; computed from the solution, they
+    satisfy the KKT conditions.
+    """
     for seed in range(10):
         qp, best = conic_qp(seed)
         form = to_cone(qp)
@@ -190,7 +193,7 @@ def degenerate():
     )  # fmt: skip
 
 
-#: error in x at tol 1e-6 and 1e-8, of the order of √tol for interior-point methods
+#: largest error in x at tol 1e-6 and 1e-8, at most 5√tol for interior-point methods
 DEGENERATE = {
     "clarabel": (5e-3, 5e-4),
     "cvxpy:CLARABEL": (5e-3, 5e-4),
@@ -212,8 +215,8 @@ def test_the_degenerate_cone_has_half_of_the_accurate_digits(name):
 
 
 def turned(angle):
-    """Return min ½‖x − c‖² over ‖(x₁, x₂)‖ ≤ 1 and ‖(x₄, x₅)‖ ≤ ½x₃, with c at a large
-    distance in direction `angle`.
+    """Return min ½‖x − c‖² over ‖(x₁, x₂)‖ ≤ 1 and ‖(x₄, x₅)‖ ≤ ½x₃, with c outside
+    both sets in the direction `angle`.
     """
     none = csr_array((0, 5))
     direction = np.array([np.cos(angle), np.sin(angle)])

@@ -98,7 +98,7 @@ def test_a_disc_of_one_variable_is_a_bound_with_the_same_counts(name):
 
 @pytest.mark.parametrize("name", ON_CONES)
 def test_the_degenerate_cone_is_solved_to_half_of_the_digits(name):
-    """The multiplier is zero on the boundary of the cone, at x = (4, 4, 0)."""
+    """The multiplier is zero, although x = (4, 4, 0) is on the boundary of the cone."""
     qp = QP.from_arrays(np.eye(3), [-4, -4, 0], sets=(Cones([[0, 1, 2]], [1.0]),))
     s = solve(name, qp)
     assert s.status is Status.SOLVED
@@ -171,8 +171,8 @@ def test_the_history_counts_discs_that_slip():
     assert gradient[-1] < 1e-8 * gradient[0]
 
 
-#: number of products of prototypes until the natural map is 1e-8, for ν = 0.3, by Q/μP
-#: and number of discs
+#: number of products of prototypes until the natural map is at most 1e-8, for ν = 0.3,
+#: by Q/μP and number of discs
 PRODUCTS = {
     "projected-gradient": {
         0.3: {88: 31, 376: 45, 820: 62, 1468: 74},

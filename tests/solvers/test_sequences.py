@@ -48,8 +48,8 @@ def test_every_step_is_solved_and_warm_is_cheaper(load_steps, form, name):
     assert products(warm) < 0.9 * products(cold)
 
 
-def test_half_the_products_again_and_the_support_block_factorised_once(load_steps):
-    """All products are counted, including the 36 columns of F_EE."""
+def test_a_warm_sequence_halves_products_and_factorises_supports_once(load_steps):
+    """All products are counted, including the 38 factorised columns."""
     prepare = SMALBE().chain(1e-8)
     warm = [prepare(qp)().counts for qp in load_steps["dual"]]
     cold = [SMALBE().prepare(qp, 1e-8)().counts for qp in load_steps["dual"]]
@@ -117,8 +117,8 @@ def test_every_product_of_a_sequence_is_counted(load_steps, name):
 
 
 def test_warm_multipliers_and_ritz_pairs_save_products(load_steps):
-    """Without elimination, a step takes 46 products from a cold start and 31 from a
-    warm one.
+    """Without elimination, a step takes on average 44 products from a cold start and 29
+    from a warm one.
     """
     solver = replace(SMALBE(), eliminate="never")
     prepare = solver.chain(1e-8)
@@ -184,8 +184,8 @@ def test_a_block_that_changes_is_not_factorised_again(load_steps):
                    ("dual-bounds", 1e-4)])],
 )  # fmt: skip
 def test_qtqp_starts_each_load_step_from_the_last(load_steps, form, tol):
-    """Answers are verified as from a cold start, with at most nine tenths of the
-    iterations.
+    """Answers meet the same tolerance as from cold starts, with at most nine tenths of
+    the iterations.
     """
     solver = SOLVERS["qtqp"]
     prepare = solver.chain(tol)

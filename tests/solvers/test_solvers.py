@@ -65,8 +65,8 @@ def solve(name, qp, tol=1e-9):
 
 @pytest.fixture
 def membrane():
-    """Return a discrete membrane over a flat obstacle, fixed at one side and pulled at
-    another one.
+    """Return a discrete membrane that is fixed at one side, loaded at a second side and
+    supported by an obstacle at a third side.
     """
     k = 45
     end = np.eye(k)[:, [0, -1]].sum(axis=1)
@@ -118,7 +118,8 @@ def test_accuracy_does_not_depend_on_the_units(manufactured, name, energy, lengt
 @pytest.mark.parametrize("tol", [1e-3, 1e-6])
 @pytest.mark.parametrize("name", SPARSE)
 def test_a_membrane_in_contact_is_solved_to_the_tolerance(membrane, name, tol):
-    # at 1e-3 ProxQP's default first guess passes its own test with negative multipliers
+    # at 1e-3, ProxQP's default initial guess has negative multipliers but passes its
+    # stopping criterion
     solution = solve(name, membrane, tol)
     assert solution.status is Status.SOLVED
     assert kkt_residuals(membrane, solution).worst <= 10 * tol
@@ -291,7 +292,7 @@ def test_a_rebuilt_session_starts_from_the_last_point(manufactured, name):
     qp, _ = manufactured("everything", n=40)
     other = replace(
         qp, P=qp.P * (1 + 1e-9)
-    )  # nearly equal, but P requires a new session
+    )  # nearly equal, but a change of P requires a new session
     prepare = SOLVERS[name].chain(1e-6)
     first, again = prepare(qp)(), prepare(other)()
     assert again.iterations < first.iterations

@@ -31,8 +31,8 @@ PAIRS = [
 FEW = ("discs", "cones", "discs and cones")
 
 #: Interior-point methods end off the central path: z and x differ in direction by the
-#: square root of the gap. These are the largest errors in x at their smallest
-#: tolerance, about twice the largest of 1250 QPs.
+#: square root of the gap. These limits on the error in x at the smallest tolerance are
+#: about twice the largest error on 1250 QPs.
 ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
 
 
@@ -46,8 +46,10 @@ def only_own_garbage():
 
 
 def faults(name, shape, seeds):
-    """List the seeds for which the error of f exceeds 1e-8 or the error of x exceeds
-    1e-6.
+    """List the wrong answers and the declined QPs.
+
+    An answer is wrong if it is not verified, or if the error of f exceeds 1e-8 or the
+    error of x exceeds its limit: 1e-6, or the value in `ENDS_OFF_PATH`.
 
     The error of f is relative to |qᵀx*|, since f* may cancel: for one seed, terms of
     size 4 cancel to 0.001. If an error is too large at `TOL`, the smaller error at

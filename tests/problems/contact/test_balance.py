@@ -1,4 +1,4 @@
-"""Check of unbalanced loads, compared with statics and with a linear program."""
+"""Check for unbalanced loads, compared with statics and with a linear program."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ def blocks(*, fixed, forces, gap=0.0):
 
     The lower block covers (−2, −1) … (2, 0).
 
-    fixed : (body, side or corner, "x" or "xy")
-    forces : (body, corner, [x, y]) in N/m
+    fixed : tuples (body, side or corner, "x", "y" or "xy")
+    forces : tuples (body, corner, [x, y]), with forces in N/m
     """
     lower = rectangle((-2.0, -1.0), (4.0, 1.0), (8, 2))
     upper = rectangle((-1.0, gap), (2.0, 1.0), (6, 3))
@@ -89,7 +89,8 @@ def test_an_unbalanced_load_is_refused_by_name(fixed, forces, message):
 
 
 def test_bodies_that_can_only_move_together_are_all_named():
-    """The lower block is pushed up against the upper block, which has no support."""
+    """The lower block is pushed up against the upper block, and neither block has a
+    support in y."""
     fixed = [("lower", "left", "x"), ("upper", "left", "x")]
     forces = [("lower", "bottom left", [0, 4]), ("lower", "bottom right", [0, 4])]
     with pytest.raises(InputError) as e:
@@ -120,9 +121,9 @@ def test_supported_bodies_need_no_contact():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_loads_are_refused_if_and_only_if_a_linear_program_has_a_free_motion(seed):
-    """The linear program maximises fᵀr over rigid motions r with B_D r = 0 and B r ≤ 0
-    whose components are at most 1 in magnitude."""
+def test_loads_are_refused_if_and_only_if_they_do_work_on_a_free_motion(seed):
+    """A linear program maximises fᵀr over rigid motions r with B_D r = 0 and B r ≤ 0
+    whose coefficients in the basis R are at most 1 in magnitude."""
     rng = np.random.default_rng(seed)
     places = ("left", "bottom", "top", "right", "top left", "bottom right")
     fixed = [

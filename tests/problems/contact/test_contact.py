@@ -154,8 +154,7 @@ def test_a_master_of_one_segment_has_an_inside_and_two_ends():
 
 
 def test_segments_of_zero_length_have_no_effect():
-    """Each node of the roof is duplicated; forces act on one of the two nodes at a
-    point."""
+    """Each node of the roof is duplicated, and the entries of both copies are added."""
     slave = np.array([[0.2, 0.5], [0.6, 1.1], [1.0, 1.2], [1.0, 1.2], [2.5, 0.0]])
     once = rows(slave, ROOF)
     twice = rows(slave, np.repeat(ROOF, 2, axis=0))
@@ -179,12 +178,12 @@ def test_a_master_that_folds_back_onto_itself_has_finite_rows():
     [(MASTER[:1], "master: 1 node"), (MASTER[[0, 0]], "master: 2 node"),
      (MASTER * np.nan, "master: node 1 is at")],
 )  # fmt: skip
-def test_a_master_without_a_segment_or_a_place_is_refused(master, message):
+def test_a_master_without_segments_or_with_nan_coordinates_is_refused(master, message):
     with pytest.raises(InputError, match=message):
         rows(np.array([[1.0, 0.25]]), master)
 
 
-def test_a_slave_far_away_from_the_master_is_refused():
+def test_a_slave_node_at_infinity_is_refused():
     with pytest.raises(InputError, match=r"slave: node 0 is at \[inf, 0.25\]"):
         rows(np.array([[np.inf, 0.25]]), MASTER)
 

@@ -13,7 +13,7 @@ from mortarbench.problems.contact.surface import surface
 
 
 def searched(**drawn):
-    """Return a decorator of a test of drawn examples: by default 10, and 40 if slow."""
+    """Return a decorator that runs a test on 10 drawn examples, and on 40 if slow."""
 
     def decorate(check):
         def test(examples):
@@ -33,8 +33,8 @@ def numbers(shape, low, high):
 
 @st.composite
 def sides(draw):
-    """Draw a wavy slave above a wavy master; the slave may be longer, shorter or
-    lower."""
+    """Draw a wavy slave near a wavy master; the slave may be longer or shorter than the
+    master, and may penetrate it."""
     s, m = draw(st.integers(2, 9)), draw(st.integers(2, 9))
     left, width = draw(st.floats(-0.4, 0.4)), draw(st.floats(0.5, 1.5))
     distance = draw(st.floats(-0.1, 0.4))
@@ -60,7 +60,7 @@ def test_rows_are_invariant_under_translations(side):
         forces = B.toarray().reshape(len(c), len(side[0]), 2)
 
         assert np.isfinite(c).all(), name
-        # if a small part of a segment is covered, entries are large and cancel
+        # if only a small part of a segment is covered, large entries cancel
         size = 1 + np.abs(forces).sum(axis=(1, 2))[:, None]
         assert (abs(forces.sum(axis=1) / size) <= 1e-14).all(), name
 

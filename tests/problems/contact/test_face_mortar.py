@@ -115,7 +115,8 @@ KINDS = [
 
 
 def nodal_areas(points, faces):
-    """Return ∫N at all nodes; N is linear on the triangles about the mean corner."""
+    """Return ∫N at all nodes; on a quadrilateral, N is linear on the four triangles
+    around the mean of its corners."""
     total = np.zeros(len(points))
     for face in faces:
         corners = list(dict.fromkeys(face))
@@ -180,7 +181,7 @@ def test_the_gap_of_parallel_sides_is_their_distance():
     )  # fmt: skip
     rows = face_mortar(points, np.zeros(points.size), slave, master)
     assert_allclose(rows.c, 0.3, atol=1e-14)
-    # moving down by 0.1 leaves a gap of 0.2; c refers to the total displacement
+    # moving the master down by 0.1 leaves a gap of 0.2; c is for the total displacement
     u = np.zeros_like(points)
     u[np.unique(master), 2] = -0.1
     moved = face_mortar(points, u.ravel(), slave, master)
@@ -219,7 +220,7 @@ def test_only_covered_nodes_have_rows_and_half_covered_faces_pass_the_patch_test
         grid((3, 3), 0.0, kind="quad", up=False),
     )
     upper = np.unique(master)
-    # the edge of the side cuts slave faces
+    # the edge of the master cuts slave faces
     points[upper, 0] = 0.30 + 0.4 * points[upper, 0]
     for basis in ("dual", "standard"):
         rows = face_mortar(points, np.zeros(points.size), slave, master, basis=basis)

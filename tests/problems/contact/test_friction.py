@@ -1,4 +1,4 @@
-"""Friction laws and the fixed-point iteration, with results by hand for one node."""
+"""Friction laws and the fixed-point iteration, with hand-computed results."""
 
 from itertools import pairwise
 from types import SimpleNamespace

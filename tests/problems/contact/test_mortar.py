@@ -1,4 +1,4 @@
-"""Mortar integrals: exact values, invariants and rates of convergence."""
+"""Mortar integrals: exact values, invariants, reach and degenerate input."""
 
 import numpy as np
 import pytest
@@ -451,7 +451,7 @@ def test_a_master_deeper_than_the_focus_of_the_normals_is_not_met():
 @pytest.mark.parametrize("across", [-0.1, 0.1])
 @pytest.mark.parametrize("downwards", [True, False])
 def test_a_master_through_the_focus_of_the_normals_is_met_below_it(across, downwards):
-    """The normals of the middle segment are inclined by 22.5° and meet at (0,
+    """The nodal normals of the middle segment are inclined by 22.5° and meet at (0,
     1 + √2)."""
     master = np.array([[across, 9.0], [across, -1.0]])
     s, m = sides([[-2, 1], [-1, 0], [1, 0], [2, 1]],

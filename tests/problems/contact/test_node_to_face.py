@@ -81,7 +81,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
             np.tile(np.abs(plane.T @ motion.ravel()), layers), atol=1e-13,
         )  # fmt: skip
     total = rows.share.reshape(layers, -1).sum(axis=0) / 0.5
-    assert_allclose(total, plane.share, atol=1e-3)  # lengths of straight sides
+    assert_allclose(total, plane.share, atol=1e-3)  # areas per width are lengths
 
 
 def test_the_closest_face_is_that_of_an_exhaustive_search():

@@ -100,8 +100,8 @@ def test_tangents_in_space_are_orthonormal_and_right_handed():
 
 
 def test_slip_over_a_plane_is_the_motion_along_it():
-    """The slip is u_x on the plane y = 0 in two dimensions, and (u_x, u_y) on z = 0 in
-    space."""
+    """The slip is u_x on the plane y = 0 in 2D, and (u_x, u_y) on the plane z = 0 in
+    3D."""
     for mesh, ground in (
         (rectangle((0, 0), (1, 1), (3, 1)), RigidPlane((0.0, 0.0), (0.0, 1.0))),
         (BLOCK, RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))),

@@ -76,7 +76,8 @@ def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
 
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_far_queries_visit_few_chords_each(segments, monkeypatch):
-    """The flanks of the ring are 0.5 m from a beam with segments of 1 mm."""
+    """The feet of the ring are 0.4 m to 0.5 m from a beam with segments of 4 mm or
+    1 mm."""
     visited = []
     distances = search._to_chords
 
@@ -92,8 +93,11 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
 
 @pytest.mark.parametrize("segments", SIZES)
 def test_facing_segments_are_found_among_all_pairs(segments):
-    """A pair faces each other if it has points on the inner side of both end normals,
-    according to the sign of (x − p) × n."""
+    """A slave and a master segment face each other if the master segment has points on
+    the inner side of both end normals of the slave segment.
+
+    The side follows from the sign of (x − p) × n.
+    """
     rng = np.random.default_rng(577215)
     bent = arc(40) + 0.002 * rng.standard_normal((41, 2))
     slave, master = surface(bent, "s"), surface(bent_beam(segments), "m")

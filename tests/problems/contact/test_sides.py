@@ -88,8 +88,8 @@ def test_the_pressure_along_the_side_is_that_of_hertz():
 
 
 def test_a_node_without_a_row_has_no_gap_and_no_pressure():
-    """The upper block is shifted by half its width, so that half of the slave side
-    faces no master."""
+    """The upper block is shifted by almost half its width, so that almost half of the
+    slave side faces no master."""
     bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
     bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
     rows = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))

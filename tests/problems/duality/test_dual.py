@@ -52,7 +52,7 @@ def floating(request):
     return K, inverse
 
 
-def test_the_generalised_inverse_is_one_and_symmetric(floating):
+def test_the_inverse_is_a_symmetric_generalised_inverse(floating):
     K, inverse = floating
     K_plus = inverse(np.eye(K.shape[0]))
 
@@ -144,7 +144,7 @@ def condition(mesh, nodes):
 @pytest.mark.parametrize("mesh", [BEAM, RING], ids=["beam", "ring"])
 def test_well_spread_fixing_nodes_condition_the_stiffness_well(mesh):
     """With distant fixing nodes, the condition number is below that of K on its range;
-    with two neighbouring nodes, it is more than 20 times as large."""
+    with two neighbouring nodes, it is more than 20 times that of K on its range."""
     eigenvalues = np.linalg.eigvalsh(stiffness(mesh, D).toarray())
     effective = eigenvalues[-1] / eigenvalues[3]
     spectral = spectral_fixing_nodes(mesh.cells, len(mesh.points))

@@ -1,4 +1,4 @@
-"""For every gluing, the dual of torn bodies has the solution of the whole body."""
+"""Duals of torn bodies, compared with the solutions of undecomposed bodies."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_the_objective_and_its_constant_are_the_energy(law):
     assert energy == pytest.approx(primal.objective(u) + work, rel=1e-10)
 
 
-def test_bounds_of_friction_are_scaled_as_its_rows():
+def test_bounds_of_friction_are_scaled_like_its_rows():
     primal, friction = posed(3e8)
     pair, new = dual_of(primal, friction, "orthonormal")
     k = friction.bound.size

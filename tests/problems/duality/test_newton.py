@@ -130,8 +130,8 @@ def test_the_equilibrium_does_not_depend_on_the_load_path():
     ],
 )
 def test_no_emitted_qp_has_negative_curvature(path):
-    """All eigenvalues are computed; on two of the paths, some exact tangents are
-    indefinite."""
+    """All eigenvalues are computed; on the path of compressed blocks, some exact
+    tangents are indefinite."""
     path = path()
     for k in range(1, path.steps + 1):
         for step in path.iterations(k):
@@ -432,7 +432,7 @@ def test_full_steps_settle_to_the_tolerance_and_rounding(length, residual, settl
     ]
 
 
-def test_a_load_has_a_number_of_iterations():
+def test_a_load_has_at_most_sixty_iterations():
     message, log = iterated(lambda n: (1.0, 1.0))
     assert len(log["posed"]) == newton.MAX_ITERATIONS
     assert message == "at the load factor 1, 60 iterations left a residual of 1.0e+00"
@@ -562,7 +562,7 @@ def test_contact_stiffness_that_leaves_the_tangent_definite_is_part_of_it():
         K, _, clipped = bent._convex(at, lam, bent.gaps.curvature)
         assert clipped == 0  # cell tangents are unchanged
         difference = (K - plain).toarray()
-        held = path.bodies.B_D.indices  # ρ is the largest diagonal entry
+        held = path.bodies.B_D.indices  # ρ, the largest diagonal entry, changes there
         difference[held, held] = 0
         difference[[i, j], [i, j]] -= expected
         assert abs(difference).max() <= 1e-12 * abs(K).max()
@@ -748,7 +748,7 @@ def test_supports_that_leave_a_rotation_are_refused():
 
 
 def test_paths_are_those_of_the_keys():
-    """The path depends on all keys, and the key `step` selects the load."""
+    """The keys select the path, `step` its load step and `newton` the iteration."""
     case = BeamRing().build(
         "dual",
         BeamRing().complete({

@@ -260,8 +260,8 @@ def test_linearised_to_convergence_it_has_the_reference_values(
 def test_the_load_steps_of_the_paper_are_of_first_order():
     """The tip deflection is compared with that of the converged linearisation.
 
-    Halving the load step halves the error. Three linearisations of a single load step
-    have a smaller error than ten load steps.
+    Halving the load step approximately halves the error. Three linearisations of a
+    single load step have a smaller error than ten load steps.
     """
 
     def tip(**keys):
@@ -309,7 +309,7 @@ def test_values_out_of_range_are_refused_with_the_valid_range(bad, message):
 
 
 def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
-    """Primal and dual solutions, verified at tol 1e-8, agree to 1e-6."""
+    """Energies of primal and dual solutions, verified at tol 1e-8, agree to 1e-6."""
     suite = load_suite(suites_folder() / "demo.toml", PROBLEMS, SOLVERS)
     energies = {}
     for name in (case for case in suite.cases if case.family.name == FAMILY.name):

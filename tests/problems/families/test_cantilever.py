@@ -72,7 +72,7 @@ def test_newton_converges_quadratically(material):
     """In the energy norm, each relative error is at most 30 times the square of its
     predecessor.
 
-    This holds in the last iterations, where the step length is 1.
+    This holds in the last four iterations, where the step length is 1.
     """
     bodies = beam(4.0, 2.0, (16, 4), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": material}, None)

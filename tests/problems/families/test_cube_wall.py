@@ -13,7 +13,7 @@ from mortarbench.reports.export.vtu import write_vtu
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
-#: number of cells per side → numbers of rows and active rows, force on the cube in N,
+#: number of cells per edge → numbers of rows and active rows, force on the cube in N,
 #: energy in J, u_z(1, 1, 1) in m
 DIGITS = {
     4: (20, 15, -32.09439112, -5.0918173385, -2.1165548298e-2),

@@ -167,7 +167,7 @@ def test_the_contact_force_of_hertz_is_the_load():
     assert got["force_error"] == pytest.approx(0, abs=1e-9)
 
 
-def test_stresses_are_cauchys_and_vanish_on_no_side_of_a_body_under_pressure():
+def test_fields_of_bodies_under_pressure_contain_cauchy_stresses():
     case = built("contact-patch", stretch=0.8)
     drawn = case.fields(reference_solution(case.qp))
 
@@ -176,7 +176,7 @@ def test_stresses_are_cauchys_and_vanish_on_no_side_of_a_body_under_pressure():
     assert drawn.displacement[:, 1].min() == pytest.approx(-0.2, abs=1e-9)
 
 
-def test_the_keys_leave_the_names_and_problems_of_linear_elasticity_as_they_are():
+def test_names_contain_the_keys_of_finite_strain_only_if_they_are_set():
     case = parse("beam-ring/Nr=2/Nh=2/steps=1/dual", problems.PROBLEMS)
     finite = parse(
         "beam-ring/Nr=2/Nh=2/steps=1/kinematics=finite/newton=2/dual",

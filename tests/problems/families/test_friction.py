@@ -60,9 +60,9 @@ def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force,
 
 
 @pytest.mark.slow
-def test_an_unreachable_bound_makes_open_rows_stick_as_well():
-    """The expected digits are the limit g → ∞ of the other code, with all rows of the
-    arc."""
+def test_an_unreachable_bound_lets_open_rows_carry_shear():
+    """The expected tip deflection is that of the other code in the limit of infinite
+    bounds, with all rows of the arc."""
     _, _, values = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
 
     assert values["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
@@ -276,7 +276,7 @@ def test_quasi_static_slip_starts_from_the_previous_step():
 
 
 def test_iterates_are_the_tresca_problems_of_the_fixed_point_iteration():
-    """The bound of each iterate is mu times the normal force of its predecessor."""
+    """From the second iterate on, the bound is mu times the preceding normal force."""
     name = f"{SMALL}/friction=coulomb/mu=0.3"
     _, _, first = solved(f"{name}/iterate=1/dual-bounds")
     _, _, smooth = solved(f"{SMALL}/dual-bounds")

@@ -84,8 +84,8 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII format 4.1, with one entity per physical group or unnamed set of
-    cells."""
+    """Return the text of a mesh in ASCII format 4.1, with one entity per physical group
+    or unnamed set of cells."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
@@ -341,7 +341,9 @@ master = "table"
 
 @pytest.fixture
 def sheared_blocks(described):
-    """Return two squares of side 2 in a state of constant pressure and shear stress.
+    """Return a function that writes two squares of side 2 m and returns the case name.
+
+    The squares are in a state of uniform pressure and shear stress.
 
     Poisson's ratio is zero, so that the common side stays straight and every load step
     has the same contact rows. Friction alone supports the upper square horizontally.
@@ -360,7 +362,7 @@ def sheared_blocks(described):
 def test_a_block_held_by_friction_is_loaded_in_steps(
     sheared_blocks, contact, form, step
 ):
-    """After step k of 3, stress and displacement (γy, −εy) are k/3 of their final
+    """After step k of 3, displacements and contact force are k/3 of their final
     values."""
     text = f"{sheared_blocks()}/contact={contact}/steps=3/step={step}/{form}"
     case = build(text)
@@ -593,7 +595,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
     ],
 )  # fmt: skip
 def test_a_load_only_on_supports_is_refused(described, load, supports, message):
-    """A load is rejected if supports fix all displacements in its direction."""
+    """A load is rejected if supports fix all its nodes in one of its directions."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")

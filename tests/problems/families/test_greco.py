@@ -17,7 +17,8 @@ pytestmark = pytest.mark.together
 
 FAMILY = Greco()
 
-#: cells per side → u_x at 0, 1.25, 5, 7.5, 11.25 mm, and normal force at 38.75 mm
+#: cells per side → u_x at x = 0, 1.25, 5, 7.5 and 11.25 mm in 10⁻⁵ m, and normal force
+#: at x = 38.75 mm in N/m
 PROTOTYPE = {
     32: ([2.85944, 2.72168, 2.28500, 1.97963, 1.54056], 1.04823e5),
     128: ([2.86022, 2.72250, 2.28669, 1.98067, 1.54134], 2.62061e4),
@@ -59,7 +60,7 @@ def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
 
 
 def test_forces_are_in_equilibrium():
-    """Friction and the reactions on the right side balance the horizontal load."""
+    """Contact forces and the reactions at the supports balance the load in x and y."""
     case, s = solved(8)
     got, reaction = case.quantities(s), case.mechanics.to_primal(s).y * 5e7 * 0.04
     fx, fy = got["contact_force"]

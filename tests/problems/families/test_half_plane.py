@@ -78,8 +78,8 @@ def test_full_reversal_equals_loading_in_the_opposite_direction():
 
 
 def test_the_kernel_displaces_as_the_integral_of_the_logarithm():
-    """Entries of F are integrals of the logarithm; F is symmetric, and positive
-    definite on an interval shorter than 4."""
+    """Entries of F are integrals of −ln|x − t|; F is symmetric, and positive definite
+    on an interval shorter than 4."""
     elements = Elements(8, 1.5)
     F, h = elements.F, elements.h
 

@@ -136,7 +136,7 @@ def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
 
 
 @pytest.mark.slow
-def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segment():
+def test_refinement_reduces_the_pressure_error_of_mortar_but_not_of_node_to_segment():
     """As in the patch test, the meshes do not match."""
     errors = {
         contact: [
@@ -249,8 +249,8 @@ def test_under_proportional_load_only_the_edge_nodes_slip():
 
 @pytest.mark.slow
 def test_under_proportional_load_shear_tends_to_a_fraction_of_the_pressure():
-    """The exact traction is (Q/P)p; the errors are of about first order in h and in the
-    load step."""
+    """The exact traction is (Q/P)p; halving h and the load step divides each error by
+    more than 1.4."""
     errors = []
     for n in (5, 10, 20):
         got = sheared_result(
@@ -265,8 +265,8 @@ def test_under_proportional_load_shear_tends_to_a_fraction_of_the_pressure():
 
 
 def test_the_tangential_force_rotates_no_body():
-    """The loads on each body have no moment and the resultant ±Q, and supports have no
-    reactions."""
+    """The loads on each body have no moment and the resultant ±Q, and reactions at the
+    supports are negligible."""
     keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
     params = CYLINDER.complete(keys)
     stated = problem(params)

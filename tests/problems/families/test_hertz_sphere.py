@@ -185,7 +185,7 @@ def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     assert abs(divergence).max() <= 1e-8
     sigma = stress(x, nu)
     np.testing.assert_allclose(sigma, sigma.transpose(0, 2, 1), atol=1e-16)
-    # the free surface has no tractions; on any half sphere, their resultant is −1
+    # the free surface has no tractions; tractions on a half sphere balance the force
     flat = stress(x * [1, 1, 0], nu)
     assert abs(flat[:, 2]).max() <= 1e-15
     z, weights = np.polynomial.legendre.leggauss(20)

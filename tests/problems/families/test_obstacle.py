@@ -78,7 +78,8 @@ def test_the_string_is_exact_at_the_nodes_if_contact_ends_at_a_node():
     assert got["max_error"] <= 1e-14
     assert got["obstacle_force"] == pytest.approx(4, rel=1e-12)
     assert got["active"] == 9
-    # error of the interpolant with u″ = 2 over length 1: −½|u − u_h|² + ∫2(u_h − u)
+    # error of the interpolant's energy for u″ = 2 over length 1:
+    # −½∫(u′ − u_h′)² + ∫2(u_h − u)
     h = 0.25
     assert got["energy"] - 1 / 3 == pytest.approx(-4 * h**2 / 24 + 4 * h**2 / 12)
 
@@ -140,7 +141,7 @@ def test_the_boundary_has_the_exact_height():
     )
 
 
-def test_over_the_hemisphere_the_exact_height_is_harmonic_and_leaves_it_smoothly():
+def test_outside_contact_the_exact_height_over_the_hemisphere_is_harmonic():
     rng = np.random.default_rng(20090)
     x, h = rng.uniform(-2, 2, (400, 2)), 1e-4
     laplacian = sum(

@@ -178,6 +178,6 @@ def test_the_displacement_in_space_is_the_exact_linear_one(form):
         (dict(dim=3, kinematics="finite"), "kinematics=finite with dim=3 is not built"),
     ],
 )
-def test_keys_that_space_does_not_have_are_refused(bad, message):
+def test_keys_that_the_dimension_excludes_are_refused(bad, message):
     with pytest.raises(InputError, match=message):
         FAMILY.check({**FAMILY.defaults, **bad})

@@ -1,4 +1,4 @@
-"""The plate in subdomains: published condition numbers, and agreement of the forms."""
+"""The plate in subdomains: condition numbers, and displacements of the dual form."""
 
 from functools import cache
 from typing import Any
@@ -31,7 +31,7 @@ PUBLISHED = [
     ({**CUBES, "n": 2}, 348, (15.7460, 21.79912, 2.0329, 1.9021)),
     ({**CUBES, "n": 4}, 1056, (27.3018, 65.02473, 3.7288, 3.0151)),
 ]
-#: one problem in the plane and one in space
+#: one plane and one three-dimensional problem
 QUICK = [PUBLISHED[0], PUBLISHED[4]]
 
 

@@ -210,8 +210,8 @@ def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, mes
 
 
 def against(problem, rigid):
-    """Return the quantities of a problem with one contact pair, for another rigid
-    body."""
+    """Return the quantities of a problem with one contact pair whose rigid body is
+    replaced."""
     (pair,) = problem.bodies.pairs
     pairs = (ContactPair(pair.slave, pair.master, rigid),)
     changed = replace(

@@ -99,8 +99,8 @@ def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
 
 
 def test_loads_on_faces_are_spread_by_area(tmp_path):
-    """Tractions and total forces are tested on tetrahedra, whose numbers of triangles
-    differ from corner to corner."""
+    """Tractions and total forces are tested on a mesh of tetrahedra, where the number
+    of triangles differs from corner to corner of the loaded face."""
     for load in ("traction = [3e5, -2e5, 1e6]", "force = [3e5, -2e5, 1e6]"):
         toml = TOML.replace("traction = [0, 0, -1e6]", load)
         whole = read_bodies(solid_blocks(tmp_path, TETRAHEDRA, toml), "strain")

@@ -32,8 +32,8 @@ def test_the_journal_bearing_has_its_published_optimum(points, optimum):
 
 
 def test_the_film_is_symmetric_and_has_pressure_where_it_narrows():
-    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the load −ε sin ξ is negative for ξ < π only, which
-    makes v positive there."""
+    """v(ξ, η) = v(ξ, 2b − η) ≥ 0; the coefficient −ε sin ξ of v in the cost is negative
+    for ξ < π only, which makes v positive there."""
     n = 31
     _, s = solved(JournalBearing(), n=n, eccentricity=0.6)
     v = s.x.reshape(n, n)
@@ -61,8 +61,8 @@ def test_an_elastic_bar_has_saint_venant_s_stiffness():
 
 @pytest.mark.parametrize("twist", [1e4, 1e8])
 def test_the_stress_function_of_a_plastic_bar_is_the_distance_to_the_boundary(twist):
-    """v is the distance from the boundary, with |∇v| = 1 except at the ridges and the
-    volume ⅙."""
+    """v is the distance from the boundary: |∇v| = 1 except at the ridges, and the
+    integral of v is ⅙."""
     n = 31
     case, s = solved(Torsion(), n=n, twist=twist)
     h, roof = 1 / (n + 1), case.qp.ub

@@ -72,8 +72,8 @@ def test_st_venant_kirchhoff_in_uniaxial_stress_is_a_cubic(stretch):
 
 
 def mixed(nu):
-    """Return a mesh of a block of quadrilaterals and a half disc with triangles, both
-    distorted, with bodies and materials."""
+    """Return a distorted mesh of a block of quadrilaterals and a half disc with
+    triangles, the body of each cell, and the materials."""
     block = rectangle((0.0, 0.0), (2.0, 1.0), (4, 3))
     disc = half_disc((0.0, 3.0), np.linspace(0, np.pi, 7), np.array([1.0, 0.5]))
     mesh, body = join((block, disc))

@@ -1,3 +1,5 @@
+"""Plane meshes: areas, boundaries, joined bodies and refinement."""
+
 from dataclasses import replace
 
 import numpy as np

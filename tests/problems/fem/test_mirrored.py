@@ -157,7 +157,7 @@ def test_energies_and_forces_are_those_of_the_mirror(bodies, contact, basis, for
     assert here["up"] > bodies.force  # the ring supports the beam
 
 
-#: units of length and of force per thickness: SI; mm, N/mm; m, GN/m; inches, lbf
+#: units of length and of force per thickness: SI; mm, N/mm; m, GN/m; in, lbf/in
 UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
 
 

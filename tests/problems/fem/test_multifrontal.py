@@ -41,7 +41,7 @@ def definite(mesh):
 
 
 def dense(factor):
-    """Return the whole Lᵀ."""
+    """Return the factor Lᵀ as a dense matrix."""
     f, U = factor.fronts, np.zeros((factor.order.size, factor.order.size))
     for s in range(len(f.children)):
         own = np.arange(f.start[s], f.start[s + 1])

@@ -117,7 +117,7 @@ def test_all_six_stresses_of_a_body_in_space_are_exact():
 @pytest.mark.parametrize(
     "inverse", [factorise_clamped, factorise_supported, factorise_floating]
 )
-def test_bodies_in_space_are_supported_by_forces_at_one_corner(inverse):
+def test_inverses_of_bodies_in_space_solve_for_a_force_at_one_corner(inverse):
     """K⁺ is tested for a cube with a clamped side and for a floating cube."""
     fixed = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
     bodies = cube(fixed)

@@ -26,7 +26,7 @@ from tests.support.threads import on_threads, without_lock
 
 pytestmark = pytest.mark.together
 
-#: κ(PFP) of a prototype, and the number of rigid motions of all clusters
+#: case, κ(PFP) of a prototype, and the number of rigid motions of all clusters
 PUBLISHED = [
     ("plate", 10.7836, 48),
     ("plate/cluster=2", 20.8450, 12),
@@ -94,7 +94,7 @@ def dense(local, side):
 
 
 def eliminated(K, C):
-    """Return K̃⁺ and a basis of its kernel by elimination in the null space of C."""
+    """Return K̃⁺ and a basis of ker K ∩ ker C by elimination in the null space of C."""
     Z = null_space(C) if len(C) else np.eye(len(K))
     inside = Z.T @ K @ Z
     size, modes = np.linalg.eigh(inside)

@@ -315,13 +315,13 @@ def test_subdomains_in_a_row_are_cut_into_equal_halves():
     assert np.bincount(rank).tolist() == [6, 6]
 
 
-def test_one_rank_has_all_without_metis(monkeypatch):
+def test_a_single_rank_has_all_subdomains_without_a_call_of_metis(monkeypatch):
     monkeypatch.delattr(over_ranks, "_partitioned")
     ones = np.ones(5, dtype=np.int64)
     assert balanced_partition(chain(5), ones, ones, 1).tolist() == [0] * 5
 
 
-def test_each_of_as_many_ranks_has_one_subdomain():
+def test_as_many_ranks_as_subdomains_have_one_subdomain_each():
     ones = np.ones(5, dtype=np.int64)
     assert sorted(balanced_partition(chain(5), ones, ones, 5).tolist()) == list(
         range(5)
@@ -499,7 +499,8 @@ def test_the_sum_of_parts_is_inverted_rank_by_rank():
 
 
 def test_equal_contact_rows_are_inverted_to_rounding():
-    """One row is repeated, so that only the sum of y over both copies is determined."""
+    """One row is repeated, so that only the sum of the first two unknowns is
+    determined."""
     here = np.ones((1, 3), dtype=bool)
     A = np.array([[2.0, 2, 0], [2, 2, 0], [0, 0, 5]])
 

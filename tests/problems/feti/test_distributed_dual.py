@@ -36,7 +36,8 @@ CASES = (
     "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
     "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
-#: cases of the default tests: each family, each gluing, friction, clusters and space
+#: cases of the default tests: each family of CASES, each gluing, friction, clusters,
+#: and three-dimensional bodies
 QUICK = (*CASES[1:4], CASES[5], *CASES[8:12], DISCS, CASES[16])
 ALL_CASES = [
     pytest.param(case, marks=[pytest.mark.slow] * (case not in QUICK)) for case in CASES
@@ -154,8 +155,8 @@ def test_problems_after_solutions_equal_those_of_one_process(ranks):
 
 
 def test_every_disc_has_one_owner(found):
-    """Together, the ranks store the 16 discs of a single process, with equal indices
-    and radii."""
+    """Together, the ranks store the 16 discs of a single process, with equal indices,
+    and with radii that are equal up to rounding."""
     of = found(DISCS)
     assert of["discs"][0] == of["discs"][1]
     assert len(of["discs"][0]) == 16

@@ -149,8 +149,9 @@ def test_the_largest_blocks_are_implicit_if_memory_is_limited(monkeypatch):
     assert (~explicit).sum() == 1
 
 
-def test_a_single_subdomain_stores_one_triangle_of_its_blocks():
-    """Two membranes of one subdomain each are grouped into one class, or into two."""
+def test_blocks_stored_as_one_triangle_have_the_same_products():
+    """Two membranes of one subdomain each form one class, or two classes; blocks of a
+    class with one subdomain are stored as one triangle."""
     pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
     (kind,) = pair.classes
     other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))

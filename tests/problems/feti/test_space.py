@@ -1,4 +1,4 @@
-"""Bodies of hexahedra in subdomains: undivided solution, and rigid motions."""
+"""Bodies of hexahedra in subdomains: matrices, gluing rows and rigid motions."""
 
 import numpy as np
 import pytest
@@ -90,8 +90,8 @@ def test_a_floating_body_has_six_orthonormal_motions_without_energy():
 @pytest.mark.parametrize("parts", [6, 12])
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
 def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, parts):
-    """With up to 8 copies of a node, B_E v = 0 exactly if v = T u with u = 0 at the
-    supports."""
+    """With three or more copies of some nodes, B_E v = 0 exactly if v = T u with u = 0
+    at the supports."""
     mesh = box()
     fixed = dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3)
     own = torn(mesh, fixed, parts, glue)
@@ -108,7 +108,7 @@ def test_rows_glue_copies_at_faces_edges_and_corners_and_nothing_else(glue, part
     assert (rank == len(B)) == (glue != "redundant")
 
 
-#: number of rigid motions that remain if a face x = 0 is fixed along some axes
+#: number of rigid motions that remain if the face x = 0 is fixed along some axes
 LEFT = {"x": 3, "y": 4, "z": 4, "xy": 1, "xz": 1, "yz": 3, "xyz": 0}
 
 
@@ -130,7 +130,7 @@ def test_a_face_fixed_along_some_axes_allows_the_other_motions(axes):
         assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
 
 
-def test_the_longitudinal_share_is_the_same_of_plane_strain_and_space():
+def test_the_longitudinal_share_is_the_same_in_plane_strain_and_in_space():
     strain = elasticity_matrix(STEEL, "strain")[None]
     space = elasticity_matrix(STEEL, None)[None]
 
@@ -142,8 +142,8 @@ def test_slip_on_an_ill_conditioned_dual_gives_the_same_displacement_in_few_prod
     """Friction rows are nearly dependent on support rows: κ is 4e4, or 6e4 in
     subdomains.
 
-    With spectral steps alone, the tolerance 1e-8 requires 2013 products, or 32 063 for
-    undivided bodies.
+    With spectral steps alone, the tolerance 1e-8 requires 2013 products in subdomains,
+    and 32 063 for undivided bodies.
     """
     name = "contact-patch/dim=3/distort=0.2/ratio=10/friction=coulomb/mu=0.2"
     u, tol = [], 1e-9

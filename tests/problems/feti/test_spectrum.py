@@ -157,7 +157,7 @@ def test_stretched_cells_of_a_ring_leave_the_least_eigenvalue_of_squares(cells) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cells", [4, 8])
-def test_the_condition_number_is_flat_from_16_900_unknowns_on(cells) -> None:
+def test_the_condition_number_is_almost_constant_from_16_900_unknowns_on(cells) -> None:
     small, large = (
         spectrum_of_beam_ring(layers, cells).condition for layers in (24, 96)
     )

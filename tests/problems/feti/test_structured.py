@@ -1,4 +1,4 @@
-"""Blocks of structured grids have the numbers of the torn undivided mesh."""
+"""Blocks of structured grids, compared with torn undivided meshes; shape factors."""
 
 import numpy as np
 import pytest

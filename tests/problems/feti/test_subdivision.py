@@ -110,7 +110,7 @@ def test_copies_of_a_node_are_counted_in_the_order_of_their_subdomains(known):
         assert nodes.copy[whole.node == n].tolist() == list(range(multiplicity[n]))
 
 
-def test_nodes_with_as_many_copies_are_counted_from_the_first(known):
+def test_nodes_of_equal_multiplicity_are_counted_from_the_first(known):
     of, _, _, whole = known
     multiplicity = np.bincount(whole.node)
     several = {

@@ -167,7 +167,7 @@ def test_rounding_of_points_creates_no_classes_but_another_shape_does() -> None:
     label = blocks((6, 2), 2)
     assert decompose(mesh.points, cells, label, of_one).class_of.tolist() == [0, 0, 0]
     moved = mesh.points.copy()
-    moved[6] += 1e-7  # upper right corner of the last block, in the first row
+    moved[6] += 1e-7  # lower right corner of the last block
     assert decompose(moved, cells, label, of_one).class_of.tolist() == [0, 0, 1]
     of_two = np.where(label == 1, 1, 0)
     assert decompose(mesh.points, cells, label, of_two).class_of.tolist() == [0, 1, 0]

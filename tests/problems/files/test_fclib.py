@@ -228,7 +228,7 @@ def changed(**arrays):
         (changed(vectors__q=np.array(b"text")), "vectors/q is not numeric"),
     ],
 )
-def test_problems_that_are_not_convex_are_refused(tmp_path, arrays, message):
+def test_invalid_and_nonconvex_problems_are_refused(tmp_path, arrays, message):
     path = tmp_path / "wrong.hdf5"
     write_datasets(path, arrays)
     with pytest.raises(InputError, match=message) as raised:
@@ -271,7 +271,7 @@ def test_a_stored_solution_that_is_a_dummy_is_named(tmp_path):
 
 def test_arrays_survive_the_round_trip_byte_by_byte(tmp_path):
     write_regular(tmp_path / "boxes.hdf5", seed=1)
-    M, H, f, mu = box_stack(1, mu=2.0)  # all contacts stick, after one problem
+    M, H, f, mu = box_stack(1, mu=2.0)  # all contacts stick after one problem
     write_datasets(
         tmp_path / "global.hdf5",
         global_arrays(M, H, f, mu) | {"guesses/1/r": np.zeros(3)},

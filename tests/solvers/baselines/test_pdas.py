@@ -182,7 +182,7 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
         (dict(P=np.eye(2), q=[5.0, -1], lb=[2.0, 3], ub=[2.0, 3]), [2, 3]),
         # an iterate has more active bounds than the row permits
         (dict(P=np.eye(2), q=[1.0, 1], A=[[1, 1]], b=[4.0], lb=0.0), [2, 2]),
-        # singular P: the row and the bound determine x₂
+        # singular P: x₂ is at its bound, because its gradient is 1
         (dict(P=[[1, 0], [0, 0]], q=[-1.0, 1], lb=[-np.inf, -3]), [1, -3]),
         (dict(P=np.zeros((2, 2)), q=[1.0, 2], A=[[1, 1]], b=[1.0], lb=0.0), [1, 0]),
     ],

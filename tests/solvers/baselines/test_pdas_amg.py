@@ -28,8 +28,8 @@ def test_multigrid_and_factors_find_the_same_displacements(case):
 
 
 def test_steps_in_space_hardly_grow_with_the_size():
-    """With 8 times as many unknowns, each solve takes at most 1.5 times as many CG
-    steps.
+    """With 8 times as many cells, an iteration takes on average less than 1.5 times as
+    many CG steps.
     """
     steps = []
     for n in (5, 10):

@@ -78,7 +78,7 @@ def test_the_lengths_are_those_of_barzilai_and_borwein():
 
 
 def test_the_cost_never_rises_above_the_last_ones():
-    """With a memory of one, the cost decreases in every step."""
+    """With a memory of one, the cost does not increase in any step, up to rounding."""
     qp = random(271828)
     costs = [
         qp.objective(ProjectedGradient(memory=1, max_iter=k).prepare(qp, 1e-12)().x)

@@ -37,8 +37,8 @@ class Operator:
 
 
 def random_qp(seed, kind="dense"):
-    """Draw a QP with lower, upper, two-sided or no bounds and up to three rows, some of
-    them repeated.
+    """Draw a QP with lower, upper, two-sided or no bounds and up to three rows; three
+    rows are linearly dependent.
     """
     rng = np.random.default_rng(seed)
     n, m = int(rng.integers(1, 40)), int(rng.integers(0, 4))
@@ -79,8 +79,8 @@ def test_a_product_is_the_product_and_is_counted(seed, kind):
 @pytest.mark.parametrize("offsets", [(), (1,), (1, 2), (1, 40), (3, 299), (1, 7, 8, 9)])
 @pytest.mark.parametrize("n", [1, 5, 16, 300, 777])
 def test_a_product_by_diagonals_is_the_product(offsets, n):
-    """Each row lacks some diagonal, and entries are unsorted or given in
-    several terms.
+    """Rows near the ends lack some diagonals, and entries may be stored as
+    two terms.
     """
     rng = np.random.default_rng([n, *offsets])
     P = np.diag(rng.standard_normal(n))
@@ -156,8 +156,8 @@ def test_compiled_preparation_agrees_with_the_textbook(seed):
 @pytest.mark.parametrize("k", [1, 2, 3, 5, 6, 12])
 @pytest.mark.parametrize("count", [5, pytest.param(50, marks=pytest.mark.slow)])
 def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(count, k, kind):
-    """The matrices are graded over 16 orders of magnitude, decoupled by zeros, or near
-    the limits of double precision.
+    """Among the matrices, some are graded over 16 orders of magnitude, decoupled by
+    zeros, or scaled by 1e200 or 1e-200.
     """
     rng = np.random.default_rng([k, len(kind)])
     for _ in range(count):
@@ -187,7 +187,7 @@ def test_eigenpairs_of_zero_and_nan_matrices_terminate():
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("seed", seeds(4, 12))
 def test_compiled_steps_agree_with_the_textbook(seed, name, kind):
-    """The types of the first 25 steps agree; later steps of long runs differ by
+    """The types of the first 25 steps agree; later steps may differ because of
     rounding.
     """
     they_agree(random_qp(seed, kind), replace(SOLVERS[name], max_steps=25))
@@ -205,8 +205,8 @@ def test_a_penalty_below_the_tail_is_omitted_as_in_the_textbook(seed):
 def test_steps_with_other_rows_and_preconditioners_agree_with_the_textbook(
     seed, rows, preconditioner, monkeypatch
 ):
-    """Rows are given by a sparse factor, and faces are preconditioned by a matrix M or
-    not at all.
+    """Rows are sparse, dense or absent, and faces are preconditioned by the model, by
+    the diagonal or not at all.
 
     With a large penalty or widely spread eigenvalues, rounding errors would change
     these runs within a few steps.
@@ -275,7 +275,7 @@ def tight_box(seed):
 
 
 def test_steps_beyond_the_box_agree_with_the_textbook():
-    """The spectra are flat, and some expansions end as gradient projections."""
+    """Every type of step occurs, including fallbacks to gradient projections."""
     letters = ""
     for qp in (string(100), *map(tight_box, range(40))):
         runs = []
@@ -299,7 +299,7 @@ def test_steps_beyond_the_box_agree_with_the_textbook():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_products_on_contact_agree_with_the_textbook(contact, name, monkeypatch):
-    """Without a preconditioner, rounding errors may cause a few additional products."""
+    """Without a preconditioner, rounding errors may change the number of products."""
     fast = SOLVERS[name].prepare(contact, 1e-6)()
     monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
     slow = SOLVERS[name].prepare(contact, 1e-6)()
@@ -369,8 +369,8 @@ def test_the_bound_of_residuals_is_above_them_by_rounding(seeds):
 
 
 def disturbed(qp, solution, size, rng):
-    """Return a point at a small or moderate distance from a solution,
-    within its bounds.
+    """Return a random point within the bounds, at a relative distance of about `size`
+    from a solution.
     """
 
     def noise(v):

@@ -30,7 +30,7 @@ def solved(qp, tol=1e-10):
 
 
 def with_solution(seed, n, m, rank):
-    """Draw a KKT point and a QP with this solution, with two-sided, lower
+    """Draw a KKT point and a QP with this solution, with two-sided, one-sided
     or no bounds.
     """
     rng = np.random.default_rng(seed)
@@ -96,8 +96,8 @@ def test_components_with_one_gradient_are_released_together():
 
 
 def test_a_smaller_gradient_waits_for_the_larger_one():
-    """The component with gradient 4 is released first. The components with gradients 1
-    and 0.3 are released after the share has been halved to 0.45.
+    """The components with gradients 4, 1 and 0.3 are released one after another,
+    because each gradient is less than 0.45 times its predecessor.
     """
     s = solved(box_qp(np.eye(3), [-4, -1, -0.3], 0), 1e-8)
 
@@ -107,7 +107,7 @@ def test_a_smaller_gradient_waits_for_the_larger_one():
 
 @pytest.mark.parametrize("gone", [1, 2, 40, 79])
 def test_rows_leave_the_factor_by_rotations_or_a_new_one(gone):
-    """The free minimum of the first `gone` components is −1, below their bound."""
+    """The free minimum of the first `gone` components is −5, below their bound −1."""
     n = 80
     rng = np.random.default_rng(gone)
     W = rng.standard_normal((n, n)) / np.sqrt(n)

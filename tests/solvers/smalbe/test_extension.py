@@ -12,7 +12,7 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 
 
 def bounded(P, q, lb, ub=None, rows=None):
-    """Draw ½xᵀPx + qᵀx with bounds and, optionally, rows with right-hand side 0."""
+    """Return the QP min ½xᵀPx + qᵀx with bounds and, optionally, rows Ax = 0."""
     n = len(q)
     rows = no_rows(n) if rows is None else rows
     return QP(
@@ -149,8 +149,8 @@ RULES = {
 
 @pytest.mark.parametrize("name", RULES)
 def test_no_step_rule_affects_accuracy_or_increases_the_cost(name):
-    """Bad rules cost products. The cost decreases in every step, and the planted
-    solutions are found.
+    """Bad rules may require more products, but the cost does not increase in any step,
+    and the planted solutions are found.
     """
     for seed in range(20):
         qp, x = qp_with_solution(25, seed)

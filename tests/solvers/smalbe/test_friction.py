@@ -81,8 +81,8 @@ def test_compiled_steps_and_textbook_steps_are_the_same(
 
 
 def test_all_slipping_rows_slip_back():
-    """Warm-started steps go from one bound to the opposite one and back: peak, −peak,
-    peak.
+    """Warm-started steps go from one bound to the opposite one and back: the loads are
+    peak, −peak, peak and −peak.
     """
     there, back = (
         emitted(f"half-plane/law=cattaneo/Q={Q}/peak=0.9/dual") for Q in (0.9, -0.9)

@@ -14,7 +14,7 @@ TOLERANCES = (1e-6, 1e-9, 1e-12)
 def hostile(seed):
     """Draw a QP with a known KKT point: ill-conditioned, degenerate, of any scale.
 
-    P is singular or has a condition number up to 1e10, a third of the multipliers of
+    P is singular or has a condition number up to 1e10, about 30 % of the multipliers of
     active bounds are zero, and two rows may differ by only 1e-8. With a smaller
     difference, the rounding of b would make the QP infeasible.
     """

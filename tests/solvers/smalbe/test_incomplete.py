@@ -16,7 +16,7 @@ from tests.support.sparse_qps import laplacian, qp_with_minimum, sparse_matrix
 from tests.support.textbook.incomplete import incomplete_cholesky, incomplete_inverse
 
 FACTORS = replace(SOLVERS["smalbe"], preconditioner="incomplete")
-KEEP = 0.95  #: share of dropped entries that goes to the diagonal
+KEEP = 0.95  #: share of dropped entries that is added to the diagonal
 
 
 def factor(P, keep=True):
@@ -112,9 +112,9 @@ def test_the_factor_agrees_with_the_textbook(seed, kind):
     assert F.shift == 0
 
 
-def test_a_five_point_grid_compensates_a_twentieth_of_dropped_entries():
-    """Row sums of M equal those of P plus the uncompensated share of each
-    dropped entry.
+def test_on_a_five_point_grid_most_of_the_dropped_entries_are_compensated():
+    """The row sums of M differ from those of P by the uncompensated share of the
+    dropped entries.
     """
     P = grid(15)
     M = np.linalg.inv(
@@ -205,7 +205,7 @@ def test_unsuitable_matrices_have_no_incomplete_factor(reason):
 
 
 def test_trilinear_elements_are_scaled_without_a_factor():
-    """The units of neighbouring variables differ by three orders of magnitude; without
+    """The units of variables differ by up to three orders of magnitude; without
     scaling, the solve takes 30 000 products.
     """
     n, rng = 30, np.random.default_rng(1)
@@ -237,8 +237,8 @@ def test_requesting_an_unavailable_factor_is_refused_with_the_reason():
 
 
 def test_sparsity_by_hand():
-    """The matrices are those of a string, of a grid in its natural order, and of a grid
-    with one unit scaled by 1/100.
+    """The matrices are those of a grid in its natural order, of this grid with one
+    diagonal entry scaled by 1/100, and of a string, and two diagonal matrices.
     """
     unit = diags_array(np.r_[np.full(35, 10.0), 1.0])
     scaled = csr_array(unit @ grid(6) @ unit)
@@ -311,7 +311,7 @@ def test_a_search_finds_no_sparse_qp_that_it_does_not_solve(seeds, tol, solver):
 
 @pytest.mark.parametrize("seed", seeds(5, 30))
 @pytest.mark.parametrize("expansion", ["model", "std", "mixed"])
-def test_every_step_is_feasible_and_decreases_the_cost(seed, expansion):
+def test_no_step_increases_the_cost(seed, expansion):
     qp, _ = qp_with_minimum(seed)
     solver = replace(
         SOLVERS["smalbe"],
@@ -357,7 +357,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
     ],
 )
 def test_on_the_named_families_few_products_are_needed(case, most):
-    """PERMON's unmerged branch takes 74 and 105 on the first two."""
+    """PERMON's unmerged branch takes 74 and 105 products on the first two cases."""
     qp = primal(case)
     s = FACTORS.prepare(qp, 1e-6)()
 
@@ -366,7 +366,7 @@ def test_on_the_named_families_few_products_are_needed(case, most):
     assert s.counts["P_products"] <= most
 
 
-def test_half_a_string_takes_a_tenth_of_the_products_of_successive_faces():
+def test_half_a_string_takes_about_a_fifth_of_the_products_of_permon():
     """PERMON's unmerged branch takes 224 products, about one for each
     intermediate face.
     """
@@ -392,8 +392,8 @@ def test_on_large_families_few_products_are_needed(case, most):
 
 
 def test_the_solver_stops_at_the_requested_residual():
-    """Since steps are cheap, the final residual is only slightly below the tolerance:
-    at least one twentieth of the tolerance.
+    """Since steps are cheap, the final residual is not far below the tolerance:
+    it is at least one twentieth of the tolerance.
     """
     for case in ("journal-bearing/n=50/eccentricity=0.9", "torsion/n=50",
                  "journal-bearing/n=50"):  # fmt: skip

@@ -19,7 +19,7 @@ from tests.support.textbook import kernels
 from tests.support.textbook.model import Model
 from tests.support.textbook.mprgp import Directions, Point, Rules, mprgp, split
 
-MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
+MIXED = Rules(expansion="mixed", proportioning="cg")  # allows every type of step
 
 
 def run_textbook(A, b, lower, upper, x, *, tau, tol, rules, B, M, **options):
@@ -129,8 +129,8 @@ def test_without_active_bounds_it_is_conjugate_gradients(minimise):
 
 @pytest.mark.parametrize(("Gamma", "first"), [(1.9, "p"), (2.1, "c")])
 def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first):
-    """‖β‖ = 2 and ‖φ̃‖ = ‖φ‖ = 1, so Γ = 2 is the threshold. The test compares ‖β‖²
-    with Γ²‖φ‖², where Γ² = 4.
+    """‖β‖ = 2 and ‖φ̃‖ = ‖φ‖ = 1, so Γ = 2 is the threshold. The algorithm compares
+    ‖β‖² with Γ²‖φ‖².
     """
     rules = Rules(Gamma, "mixed", "cg")
     run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], rules=rules)
@@ -303,7 +303,7 @@ def test_the_rules_of_permon_take_the_steps_of_permon(
 @pytest.mark.parametrize("rounds", [30, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_model_step_minimises_the_model_over_the_box(rounds):
     """After Newton's method, the KKT conditions of min gᵀs + ½sᵀBs, l ≤ x + s ≤ u, hold
-    exactly.
+    to 1e-7.
     """
     rng = np.random.default_rng(271828)
     for k, tau in rounds * ((5, 0.1), (5, 1e-5), (20, 0.01)):
@@ -430,7 +430,7 @@ def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed)
 
 def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
     """By hand: the CG step is cut at x₁ = 0; the second part ends at the minimum of the
-    model.
+    model, or is extended to the minimum of the cost along the same line.
     """
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     B = Model.of_norm(np.linalg.norm(A, 2), 2)
@@ -496,7 +496,7 @@ def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise)
             assert after.sum() > before.sum()
 
     assert expansions > 5
-    assert products <= 267  # of PERMON's rules
+    assert products <= 267  # number of products with PERMON's rules
 
 
 def test_every_model_step_decreases_the_cost(minimise):
@@ -592,8 +592,8 @@ def ill_conditioned(n):
 
 
 def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns(minimise):
-    """If directions are conjugate to the last one only, rounding errors double the
-    number of steps.
+    """If directions are conjugate to the last one only, rounding errors more than
+    double the number of steps.
     """
     n = 40
     A, x, _ = ill_conditioned(n)
@@ -620,7 +620,7 @@ def test_directions_are_conjugate_and_the_last_ones_are_kept():
 
 
 def test_directions_that_span_the_face_solve_for_another_right_hand_side():
-    """The solve takes no product, and it ends at the first bound on its path."""
+    """The solve takes no product; if it meets a bound, MPRGP continues from there."""
     a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
     p = np.diag(1 / np.sqrt(a))
     known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))

@@ -192,9 +192,8 @@ def test_a_motion_of_fixed_components_only_leaves_a_factor(monkeypatch, border, 
     """On the free components, the rows consist of integers and one row is the sum of
     two others.
 
-    This row differs from the sum only in fixed components, and only by an amount of the
-    order of the rounding errors of G_H G_Hᵀ. A right-hand side G_F v has a solution for
-    any shift.
+    This row differs from the sum only in fixed components. A right-hand side G_F v has
+    a solution for any shift.
     """
     if not border:
         monkeypatch.setattr(module, "MAX_BORDER", 0)

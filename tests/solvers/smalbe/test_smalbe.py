@@ -110,7 +110,9 @@ def test_scaled_repeated_and_zero_rows_of_G_change_no_answer(dual, seed):
 
 
 def test_rows_that_contradict_each_other_by_rounding_end_the_solve():
-    """Two rows differ by 10⁻¹². No penalty reduces ‖Cν‖ to its tolerance."""
+    """The entries of two rows differ by up to 5·10⁻⁹, and their right-hand sides by
+    10⁻¹². No penalty reduces ‖Cν‖ to its tolerance.
+    """
     n = 6
     A = np.vstack([np.ones(n), 1 + 1e-9 * np.arange(n)])
     qp = QP(
@@ -170,8 +172,8 @@ def test_repeated_rows_need_equal_right_hand_sides(off):
 
 
 def test_a_stalled_multiplier_increases_the_penalty():
-    """Because of fixed variables, the free ones have little effect on one row. With
-    constant ρ, more than ten thousand outer iterations were needed.
+    """The free variables have little effect on the rows, since most variables are
+    fixed. With constant ρ, more than ten thousand outer iterations were needed.
     """
     rng = np.random.default_rng(271828)
     W = rng.standard_normal((6, 6))
@@ -509,7 +511,7 @@ def test_every_combination_of_rules_solves(
 )  # fmt: skip
 def test_half_the_products_of_permons_best(Nr, Nh, step, half_of_permons_best):
     """The products of PERMON were measured on these QPs with its best setting at 1e-6
-    and 1e-8; the stopping test is recomputed from the QP.
+    and 1e-8; the stopping criterion is recomputed from the QP.
     """
     family = PROBLEMS["beam-ring"]
     params = family.complete(dict(Nr=Nr, Nh=Nh, step=step))
@@ -577,7 +579,7 @@ def test_an_inner_run_ends_at_eta_at_the_latest(outer_loop, dual):
     assert len(loose) < len(tight)
 
 
-def test_every_combination_of_steps_and_outer_iterations_counts_for_the_limit(dual):
+def test_steps_and_outer_iterations_together_count_for_the_limit(dual):
     s = SMALBE(max_steps=30, rho=1e-3).prepare(dual(271828), 1e-10)()
 
     assert s.status is Status.ITERATION_LIMIT
