@@ -1,6 +1,6 @@
 """A quadratic model of the operator, minimised over a box without its products.
 
-    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
+    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0.
 
 The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
 replaces H on the orthogonal complement. If B ≥ H, then
@@ -166,7 +166,9 @@ def _searched(
     there: Tilted,
     slopes: tuple[float, float],
 ) -> tuple[float, Tilted]:
-    """Return t ≤ 1 and s(y + t dy), with at most a tenth of the slope at t = 0.
+    """Search t ≤ 1 at which the slope is at most a tenth of the slope at t = 0.
+
+    Return t and s(y + t dy).
 
     there : s(y + dy)
     slopes : slopes at t = 0 and at t = 1
