@@ -1,4 +1,4 @@
-"""`make setup` announces and confirms installations, and works in any folder."""
+"""`make setup`: announcement and confirmation of installations, paths with spaces."""
 
 import os
 import pty
