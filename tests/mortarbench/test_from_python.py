@@ -151,9 +151,9 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
 
 
 @pytest.mark.slow
-def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
-    """The script's own `solvers.py` and `msgspec.py` take precedence in the
-    script only.
+def test_modules_of_a_script_do_not_hide_installed_modules_in_workers(tmp_path):
+    """A worker imports a module of the script, but not `solvers.py` and `msgspec.py`
+    from the same folder, which raise an error.
     """
     for name in ("solvers", "msgspec"):
         (tmp_path / f"{name}.py").write_text("raise ImportError('not for workers')\n")
@@ -212,10 +212,8 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
     assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
 
 
-def test_the_series_of_a_solver_object_contains_earlier_load_steps(tmp_path):
-    """The series of load steps requires the solver again, either the object or the
-    plug-in.
-    """
+def test_a_series_of_load_steps_is_written_for_a_solver_of_a_plug_in(tmp_path):
+    """The series requires the solver of the plug-in again, for the first load step."""
     plugin_file = tmp_path / "clara.py"
     plugin_file.write_text(
         "from solvers import SOLVERS as ALL\nSOLVERS = {'clara': ALL['clarabel']}\n"
@@ -422,7 +420,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
 
 
 def test_the_conformance_suite_accepts_a_solver_object():
-    """The solver handles one QP only, so every check is declined or fails."""
+    """The solver handles one QP only, so it declines the check and does not conform."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
 

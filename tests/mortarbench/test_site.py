@@ -82,8 +82,8 @@ def test_every_formula_of_a_page_becomes_mathml(name):
 
 @pytest.mark.parametrize("name", sorted(SOURCES.keys() - UNICODE))
 def test_no_formula_of_a_page_is_plain_text(name):
-    """The sources contain mathematical symbols only as LaTeX, except in code and number
-    signs.
+    """Outside of code, the characters of `FORMULA` occur only in LaTeX. Other symbols,
+    such as superscript digits, may be plain text.
     """
     prose = CODE.sub("", SOURCES[name].read_text("utf-8"))
     prose = unicodedata.normalize("NFD", re.sub(r"\$\$?[^$]+\$\$?", "", prose))
