@@ -170,7 +170,7 @@ def test_each_contact_has_a_csv_table(tmp_path):
     np.testing.assert_array_equal(table[["x_m", "y_m"]], FIELDS.points[SIDE.nodes])
 
 
-def test_a_table_in_space_has_areas_and_no_arc_length(tmp_path):
+def test_a_table_in_3d_has_areas_and_no_arc_length(tmp_path):
     axis = (0.0, 1.0)
     points = np.array([[x, y, z] for z in axis for y in axis for x in axis])
     side = ContactSide(

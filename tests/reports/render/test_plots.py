@@ -119,9 +119,10 @@ def test_horizontal_error_bars_are_horizontal():
 
 
 def test_axes_contain_all_points_and_error_bars_with_a_margin():
-    """The margin is 5 % of a logarithmic axis that spans a decade or more.
+    """The margin is 5 % of the range of the points.
 
-    For points from 0.5 to 4, the axis spans one decade with the points in its middle.
+    A logarithmic axis spans at least a decade; for points from 0.5 to 4, it spans one
+    decade with the points in its middle.
     """
     (panel,) = fitted(figure(TIMES, x=LOG, y=LOG)).panels
 

@@ -355,7 +355,10 @@ def test_the_interval_of_a_full_share_has_positive_width():
 
 
 def test_the_restricted_mean_by_hand():
-    """S = 3/4 from 1 to 3, S = 3/8 from 3 (with two cases at risk) to 4, then S = 0."""
+    """The survival function is 3/4 from 1 to 3, 3/8 from 3 to 4, and 0 afterwards.
+
+    At time 3, two cases are at risk.
+    """
     nan = np.nan
     found = restricted_mean(
         np.array([1, INF, 3, 4.0]), np.array([nan, 2, nan, nan]), 5.0
@@ -419,8 +422,8 @@ def test_six_values_have_the_interval_from_the_least_to_the_largest():
 # ---- growth
 
 
-def test_growth_at_the_practical_limit_is_detected_in_two_percent():
-    """For p at the limit, 2.5 % of the 95 % intervals lie entirely above the limit."""
+def test_growth_at_the_practical_limit_is_rarely_detected():
+    """For p at a limit, 2.5 % of the 95 % intervals lie entirely beyond this limit."""
     rng = np.random.default_rng(23)
     n = np.geomspace(100, 1e5, 6)
     for limit, called in ((1.1, Trend.GROWS), (0.9, Trend.FALLS)):
