@@ -283,7 +283,7 @@ def test_sparse_matrices_of_a_case_are_csc_with_narrow_indices(form):
             assert M.has_canonical_format
 
 
-def test_a_qp_is_the_same_whether_its_case_or_itself_is_solved():
+def test_a_case_and_its_qp_have_the_same_solution():
     case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/primal")
     by_name, by_qp = mb.solve(case, "clarabel"), mb.solve(case.qp, "clarabel")
 
@@ -318,7 +318,7 @@ def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     assert back.sizes == qp.sizes
 
 
-def test_the_parts_in_an_npz_are_those_that_solvers_take(tmp_path):
+def test_matrices_in_an_npz_have_32_bit_indices(tmp_path):
     with np.load(
         mb.export(SMALL.replace("dual", "primal"), tmp_path / "a.npz")
     ) as file:

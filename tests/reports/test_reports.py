@@ -508,7 +508,7 @@ def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):
     assert "factor 1" in picture.caption
 
 
-def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_path):
+def test_the_largest_cases_in_2d_and_3d_are_drawn(measured, square, tmp_path):
     cube = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
     solid = Fields(
         points=cube.points, cells=cube.cells, displacement=0 * cube.points,

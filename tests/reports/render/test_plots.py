@@ -299,7 +299,7 @@ def test_points_of_inconsistent_length_are_refused(broken):
         Series(**{"x": (1, 2, 3), "y": (1, 2, 3), "look": look(0), **broken})
 
 
-def test_formulas_read_as_text():
+def test_formulas_are_shown_as_text():
     assert plain(r"degrees of freedom $n$") == "degrees of freedom n"
     assert plain(r"$\|g^P\|\,/\,\|g^P_0\|$") == "‖gᴾ‖ / ‖gᴾ₀‖"
     assert plain("$n^{3/2}$") == "n³ᐟ²"

@@ -129,7 +129,7 @@ def test_the_order_of_the_solvers_does_not_matter():
 
 
 @pytest.mark.parametrize("cases", [5, 10, 40])
-def test_intervals_of_a_mean_cover_at_their_nominal_rate(cases):
+def test_intervals_of_a_mean_have_nominal_coverage(cases):
     rng = np.random.default_rng(15)
     drawn = weights([str(i) for i in range(cases)])
     low, high = limits(drawn @ rng.normal(3, 1, (cases, 3000)), cases)
@@ -527,7 +527,7 @@ def test_predictions_equal_the_textbook_formula():
     assert ends == pytest.approx(c + p * x[1] + half * np.array([-1, 0, 1]))
 
 
-def test_predictions_cover_a_further_measurement_at_their_rate():
+def test_prediction_intervals_of_a_further_measurement_have_nominal_coverage():
     rng = np.random.default_rng(24)
     n = np.geomspace(100, 1e5, 5)
     hits = []
