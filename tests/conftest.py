@@ -112,7 +112,7 @@ def import_share(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude loaded objects from the collections of garbage before measurements."""
+    """Exclude loaded objects from garbage collections, which precede measurements."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)  # tests create little garbage

@@ -13,7 +13,7 @@ import pytest
 
 from tests.support import ROOT
 
-#: replacements of system programs; each appends its command to the file `calls`
+#: replacements of system programs; apt-get and sudo append their commands to `calls`
 STUBS = {
     "dpkg-query": "exit 1",
     "apt-get": 'echo "apt-get $*" >> "$CALLS"; exit 1',

@@ -81,7 +81,7 @@ def test_problems_are_listed_with_defaults_and_forms(cli):
     assert code == 0
     assert (
         out == "well  Separable quadratics over x ≥ 0.  n=3 depth=1  primal | dual\n"
-    )  # the first of two sentences
+    )  # first sentence of the docstring
 
 
 def test_solvers_are_listed_one_line_each(cli):
@@ -90,7 +90,7 @@ def test_solvers_are_listed_one_line_each(cli):
     assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
     first = " ".join(out.splitlines()[0].split())
     assert first == "exact Solver for P = I and inactive bounds. factor=1.0 reason=None"
-    assert "Lost(" not in out  # the docstring is only the signature by dataclass
+    assert "Lost(" not in out  # dataclass wrote this as the docstring
 
 
 def test_suites_are_listed_with_their_purpose(cli):

@@ -22,7 +22,7 @@ SOURCES = {
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     )
 }
-#: pages with Unicode formulas: generated from docstrings, or the change log
+#: pages with Unicode formulas: generated pages and the change log
 UNICODE = {
     "solvers.md", "solvers-own.md", "solvers-libraries.md", "weaknesses.md",
     "CHANGELOG.md",

@@ -24,7 +24,7 @@ from tests.support import TOY_PROBLEM
 
 TOY = load_plugin(TOY_PROBLEM)
 
-#: correct only in the second version; the versions differ in a neighbouring module
+#: solver that is correct only in the second version; the versions differ in `step`
 MINE = """
 from dataclasses import dataclass
 from harness import Solution, Status

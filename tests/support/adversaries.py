@@ -191,7 +191,7 @@ class PrintsEndlessly(Honest):
 
 
 class AsksForTheMoon(Honest):
-    """Solver that requests more memory than the machine has in one allocation."""
+    """Solver that requests, in one allocation, more memory than the machine has."""
 
     def act(self, qp):
         np.ones(2**40)

@@ -63,7 +63,7 @@ def emitted(name, ranks):
 
 
 def own_subdomains(name, ranks):
-    """Return the local subdomains of this rank for the first problem of a path."""
+    """Return the local subdomains of this rank for the problem of a case."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
@@ -82,7 +82,7 @@ def class_digest(kind, touched):
 
 
 def factorised_in(act):
-    """Return the result of `act()`, and the classes that this rank factorises in it."""
+    """Return the result of `act()`, and digests of the classes that it factorises."""
     factor, names = SubdomainClass.border_factor, []
 
     def recording(kind, touched):

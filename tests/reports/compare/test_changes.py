@@ -61,7 +61,7 @@ def suite(seed, cases=12, repeats=5, scatter=0.05, **slower):
 
 @pytest.fixture
 def changed(tmp_path):
-    """Compare two lists of records."""
+    """Return a function that compares two lists of records."""
 
     def make(before, after, **more):
         one, two = (
@@ -164,7 +164,7 @@ def test_a_wide_interval_is_not_reported_as_unchanged(low, high, word):
 
 
 def test_unresolved_cells_are_counted_separately(changed):
-    """One of two unchanged cells scatters by a factor of ten."""
+    """The times of one of two unchanged cells are scaled by 0.1 and by 10."""
     times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
     before = [record(case=k, repeat=i) for k in times for i in range(2)]
     after = [

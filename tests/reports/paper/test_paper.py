@@ -50,7 +50,7 @@ FIGURES = [
     *(f"figure{i}" for i in range(1, 8)),
     "zoom", "pressure", "verification", "stepping", "fleet", "totals", "certified",
 ]  # fmt: skip
-SORTS = ("figure1", "verification", "fleet")  #: figures of a mesh, curves and solvers
+SORTS = ("figure1", "verification", "fleet")  #: of a mesh, of curves, of solvers
 TWICE = Rounds(most=2, least=2)
 LITTLE = replace(
     QUICK,
@@ -242,7 +242,7 @@ def test_the_dual_has_the_sizes_of_the_papers_formulas(experiment, Nr):
 
 
 def test_figure_2_is_drawn_with_both_rules_for_the_ring(experiment, folder):
-    """Erratum: Nh layers have 313 nodes; 2·Nh layers, as in the text, have 424."""
+    """Erratum: with Nh layers, there are 313 nodes; with 2·Nh, as in the text, 424."""
     nodes = [
         len(experiment.states[s].points) for s in ("example-Nh", "example-2Nh")
     ]  # fmt: skip

@@ -143,7 +143,7 @@ def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate(count):
     hits = []
     for _ in range(count):
         times = rng.lognormal(0, 1, (25, 1)) * rng.lognormal(0, 0.5, (25, 2))
-        anchor = np.full((25, 1), 1e-9)  # makes the shift small, and leads
+        anchor = np.full((25, 1), 1e-9)  # the leader, which makes the shift small
         found = ranking_of(group(np.hstack([anchor, times * [1, 1.5]])))
         draws = found.draws[:, 2] / found.draws[:, 1]
         low, high = limits(draws, 25)
@@ -412,7 +412,7 @@ def test_the_sign_flip_interval_covers_for_heavy_tails(cases):
 
 
 def test_six_values_have_the_interval_from_the_least_to_the_largest():
-    """All signs agree in 2 of 64 patterns; with five of six, the share exceeds 5 %."""
+    """All signs agree in 2 of 64 patterns (3 %), at least five signs in over 5 %."""
     names = [str(i) for i in range(6)]
     values = np.array([0.3, -0.01, 5.0, 1.0, 2.0, 4.0])
     assert symmetric_interval(values, names) == (-0.01, 5.0)

@@ -70,7 +70,10 @@ def moved(
 
 
 def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return x + s, which is in the box up to rounding, moved exactly onto bounds."""
+    """Return x + s, which is in the box up to rounding.
+
+    Components beyond a bound, or within rounding error of it, are set to the bound.
+    """
     to, noise = x + s, ROUNDING * (np.abs(x) + np.abs(s))
     down, up = to - lower <= noise, upper - to <= noise
     return np.where(down, lower, np.where(up, upper, to))

@@ -101,7 +101,10 @@ class Model:
         return self.with_tail(min(max(tau, self.tau), 10 * self.tau))
 
     def with_tail(self, tau: float) -> Model:
-        """Return the model with another τ and the same w + τ where w + τ exceeds τ."""
+        """Return the model with a new τ.
+
+        Directions whose sum w + τ exceeds the new τ keep this sum; others are dropped.
+        """
         w = self.w + self.tau - tau
         return Model(tau, self.U[w > 0], w[w > 0])
 

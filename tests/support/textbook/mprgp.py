@@ -203,7 +203,7 @@ class _Line(NamedTuple):
 
     p: Vector
     Hp: Vector
-    cg: float  #: α_cg, which minimises the cost at x − αp; inf without curvature
+    cg: float  #: α_cg, which minimises the cost at x − αp; inf if pᵀHp ≤ 0
     feasible: float  #: largest feasible α
 
 
