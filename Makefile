@@ -1,13 +1,14 @@
 PYTHON ?= python3
 
-# one thread in every library: what tests and benchmarks measure does not depend on it
+# one thread in every library, as in workers, so that results of tests and benchmarks do
+# not depend on the number of CPUs
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
-# modules are compiled once, not by each of the processes that tests start
+# Python writes bytecode, so that the processes started by tests need not compile modules
 unexport PYTHONDONTWRITEBYTECODE
 BIN := .venv/bin
 
-# that stand for the wildcards of the registry
+# backends that represent the wildcards qpsolvers:* and cvxpy:* of the registry
 BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip \
     cvxpy:CLARABEL cvxpy:HIGHS
 
@@ -16,26 +17,26 @@ BACKENDS := qpsolvers:clarabel qpsolvers:highs qpsolvers:quadprog qpsolvers:sip 
 help:  ## show this help
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile
 
-setup: .venv/.ready  ## make .venv: system packages, Python packages
+setup: .venv/.ready  ## install missing system packages, and Python packages into .venv
 
 .venv/.ready: pyproject.toml constraints.txt tools/extensions.py $(shell find harness problems solvers -name "*.pyx" -o -name "*.pxi" -o -name "*.pxd" -o -name "*.h")
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 
-browser: setup .venv/.browser  ## chromium and its driver, for the tests of the report's page
+browser: setup .venv/.browser  ## install chromium and its driver, for the tests of the report's page
 
 .venv/.browser: .venv/.ready
 	@tools/setup.sh $(PYTHON) browser
 	@touch $@
 
-site: setup .venv/.site  ## the documentation as a site, in out/site; runs its notebooks
+site: setup .venv/.site  ## build the documentation site in out/site; runs its notebooks
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
 .venv/.site: .venv/.ready
 	@tools/setup.sh $(PYTHON) docs
 	@touch $@
 
-demo: setup  ## compare the solvers on the demo suite, anew in out/make-demo
+demo: setup  ## compare solvers on the demo suite; replaces earlier results in out/make-demo
 	@$(BIN)/mortarbench run suites/demo.toml --out out/make-demo --fresh
 
 test: setup browser  ## check, and run the tests on all CPUs
@@ -45,7 +46,7 @@ test: setup browser  ## check, and run the tests on all CPUs
 tests:
 	$(BIN)/pytest -q -n auto --dist loadscope
 
-mutants: setup  ## break chosen modules in small ways; their tests must notice (minutes)
+mutants: setup  ## make small changes to chosen modules; their tests must fail (minutes)
 	@$(BIN)/python tools/mutants.py
 
 bench: setup  ## time our own kernels (pytest-benchmark)
@@ -55,13 +56,13 @@ bench: setup  ## time our own kernels (pytest-benchmark)
 docs: setup  ## write docs/solvers*.md and mortarbench/catalogue.json from the adapters
 	@$(BIN)/python tools/catalogue.py
 
-weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
+weaknesses: setup  ## measure and rewrite docs/weaknesses.md (minutes)
 	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > docs/weaknesses.md
 
-size: setup  ## time and memory up to 1.6 million unknowns (minutes)
+size: setup  ## measure time and memory up to 1.6 million unknowns (minutes)
 	$(BIN)/python benchmarks/size.py
 
-synthetic: setup  ## time and memory of journals and reports up to 100 000 records
+synthetic: setup  ## measure time and memory of journals and reports up to 100 000 records
 	$(BIN)/python benchmarks/synthetic_results.py
 
 check: setup  ## format, lint, types, import contracts

@@ -6,7 +6,7 @@
   discs.
 * ratios: number of products of `smalbe` relative to the best other method except nsgs.
   The numbers are sensitive to small changes of the data. Each problem is therefore
-  solved for ten values of the estimate of ‖P‖ in the first step, and for ten loads;
+  solved for ten values of the first estimate of ‖P‖, and for ten loads;
   estimates and loads deviate by up to 3 %.
 * conic: processor times of `smalbe` and of conic solvers for a verified point.
 * time: errors, error bound, peak memory and processor time of `smalbe` for up to 512²
@@ -133,7 +133,9 @@ def ratios() -> None:
 
 
 def _ratio(logs: NDArray[np.float64]) -> str:
-    """Return the mean and largest ratio of the first column to the least of the others.
+    """Format the ratios of the first column to the least of the others.
+
+    The text contains their geometric mean and their maximum.
 
     logs : logarithms; the last axis contains the columns
     """

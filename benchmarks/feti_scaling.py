@@ -17,8 +17,8 @@ not depend on the search for the active set.
                      onto the kernel of the equality rows, and F is the dual operator
                      of supports and gluing
     kappa_dirichlet  condition number with the Dirichlet preconditioner
-    face             CG steps with this preconditioner to reduce the residual by 1e-6,
-                     where the active contact rows are equations
+    face             CG steps with this preconditioner that reduce the residual by the
+                     factor 1e-6; the active contact rows are equality rows
     face none        CG steps for the same problem without a preconditioner
 
 The script prints a table and, for each positive quantity measured at three or more
@@ -52,7 +52,7 @@ from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for a certified error below 1e-6
+TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for certified errors below 1e-6
 REDUCTION = 1e-6
 #: keys of a case as a function of its size, and sizes of about 10⁴ to 10⁶ displacements
 FAMILIES = {

@@ -66,7 +66,7 @@ class Watch:
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
 
     def overheads(self):
-        """Return the times between records in s, without those of solver and fsync."""
+        """Return times between records, without the times of solver and fsync, in s."""
         seconds = []
         for i in range(1, len(self.at)):
             gap = self.at[i] - self.at[i - 1]
@@ -111,7 +111,7 @@ def overhead(n=500):
 
 
 def growth(n=10_000):
-    """Print memory and number of open files after a tenth, half and the whole run."""
+    """Print memory and number of open files after a tenth, a half and all of a run."""
     with tempfile.TemporaryDirectory() as out:
         watch = measure(Path(out), "honest", repeats=n // 2)
         lines = len(read_journal(Path(out)))

@@ -99,7 +99,7 @@ def speeds() -> Machine:
 
 
 def distinct() -> float:
-    """Return the time in s of local products in which no subdomains share a block."""
+    """Return the time in s of a local product in which no subdomains share a block."""
     n = Distribution(cores=1, cells=CELLS).block
     count = SIDE**3 // MPI.COMM_WORLD.size
     triangles = [np.ones(n * (n + 1) // 2) for _ in range(count)]

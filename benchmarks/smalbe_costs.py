@@ -73,7 +73,7 @@ KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
 #: number of products that are timed together, because a single product is too short
 REPEATS = 20
 
-#: median time by name, and median of the fastest tenth, in s
+#: by name, the median time and the median of the fastest tenth, in s
 Times = dict[str, tuple[float, float]]
 
 
@@ -119,7 +119,7 @@ def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
 
 
 def dense(tol: float = 1e-6) -> None:
-    """Print times to prepare and solve dense duals, and of their products."""
+    """Print times of preparation, solution and products of dense duals."""
     print("form m | products of the solve, of preparing | a product | prepare | solve")
     for form, sizes in DUALS.items():
         for size in sizes:

@@ -27,7 +27,7 @@ TIMES = """() => new Promise((done) =>
 
 
 def read(folder):
-    """Read the journal in a folder; print number of records, CPU time and memory."""
+    """Read the journal in a folder; print number of records, CPU time, peak memory."""
     from mortarbench.harness.results.journal import read_journal
 
     start = process_time()

@@ -52,7 +52,7 @@ def test_search(benchmark, segments):
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])
 def test_cost_per_segment(race, note, method):
-    """Report the exponents of time against the number of segments, per decade."""
+    """Report the growth exponents of the time in the number of segments, by decade."""
 
     def sides(segments):
         theta = np.pi * np.arange(segments + 1) / segments
@@ -72,7 +72,7 @@ def test_cost_per_segment(race, note, method):
 
 
 @pytest.mark.parametrize("cells", [15, 24])
-def test_linearisation_in_space_against_a_factor(race, note, cells):
+def test_linearisation_in_3d_against_a_factorisation(race, note, cells):
     """Linearise contact of two stacked cubes with non-matching meshes.
 
     The lower cube has fewer cells. Times are compared with a sparse factorisation.

@@ -1,4 +1,4 @@
-"""Compare SMALBE with PERMON by products with F, and with other solvers by time."""
+"""Compare SMALBE with PERMON by products with F, and with other solvers by times."""
 
 from dataclasses import replace
 from functools import partial
@@ -160,9 +160,7 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
     ("Nr", "Nh"), [(12, 6), (12, 7), (30, 15), (60, 30), (130, 65)]
 )
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
-    race, note, form, Nr, Nh
-):
+def test_time_of_a_solve_relative_to_its_products(race, note, form, Nr, Nh):
     """Compare the time of a solve with 1.5·T + 100 µs; its products take the time T."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
@@ -238,9 +236,10 @@ ZOO = {
 
 @pytest.mark.parametrize("name", ZOO)
 def test_large_sparse_problems(race, note, name):
-    """Compare solvers at 1e-6, and the time per product of `smalbe` with its parts.
+    """Compare solvers at 1e-6.
 
-    These parts are one product and five vector operations.
+    Also compare the time of `smalbe` per product with the time of one product and five
+    vector operations.
     """
     family = PROBLEMS[name]
     form = family.forms[0]
@@ -298,7 +297,7 @@ def test_sparse_problems_with_bounds(note, name, params):
 
 
 @pytest.mark.parametrize(("Nr", "Nh"), [(6, 3), (12, 6), (12, 7), (24, 12)])
-def test_the_smallest_duals_with_bounds_alone(note, Nr, Nh):
+def test_small_duals_with_bounds_only(note, Nr, Nh):
     """Report processor times at 1e-6, and the ratio of preparing to solving time."""
     qp, tol, solver = dual(Nr, Nh, 5, "dual-bounds"), 1e-6, SOLVERS["smalbe"]
     ready = []

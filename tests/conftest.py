@@ -1,4 +1,4 @@
-"""Shared fixtures and hooks: CPUs and order of pytest's workers, manufactured QPs."""
+"""Shared fixtures, and hooks for CPUs and scheduling of pytest's workers."""
 
 import gc
 import os
@@ -112,7 +112,7 @@ def import_share(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude tests and libraries from garbage collections before measurements."""
+    """Exclude loaded objects from garbage collections, which precede measurements."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 20, 20)  # tests create little garbage

@@ -1,4 +1,4 @@
-"""`make setup` announces and confirms installations, and works in any folder."""
+"""`make setup`: announcement and confirmation of installations, paths with spaces."""
 
 import os
 import pty
@@ -13,7 +13,7 @@ import pytest
 
 from tests.support import ROOT
 
-#: replacements of system programs; each appends its command to the file `calls`
+#: replacements of system programs; apt-get and sudo append their commands to `calls`
 STUBS = {
     "dpkg-query": "exit 1",
     "apt-get": 'echo "apt-get $*" >> "$CALLS"; exit 1',

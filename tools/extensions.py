@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 SCALES = ROOT / "harness" / "verify"
 #: folder of sparse.pxd, which compiled modules of problems and solvers cimport
 MAPS = ROOT / "harness" / "distributed"
-FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: for all modules
+FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: flags of all modules
 #: Further flags by module. Without contraction to fused multiply-adds, results have the
 #: same digits on every machine.
 MODULES = {

@@ -73,8 +73,8 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-#: Changes that are made only if one side is a count, because floats are so rarely equal
-#: that tests would not detect the change.
+#: Changes that are made only if the comparison contains a count or an integer, because
+#: floats are so rarely equal that tests would not detect the change.
 BOUNDARIES: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,

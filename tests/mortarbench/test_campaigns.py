@@ -37,7 +37,7 @@ def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
 
 @pytest.fixture(scope="module", autouse=True)
 def _found():
-    """Replace the description of this machine by a constant."""
+    """Replace the description of this machine with a constant."""
     here = {"machine": {"cpu": "one"}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Registries, "environment", lambda _: here)
@@ -54,7 +54,7 @@ def environment(_found):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite that `suite` creates; the result folder has the name of the suite."""
+    """Return a function that runs a suite created by `suite` in the folder `out`."""
 
     def measure(out="out", **asked):
         file = tmp_path / f"{out}.toml"
@@ -417,7 +417,7 @@ def test_a_report_fails_on_the_requested_conditions_and_says_so(
     assert cli("report", "a", "c", "--format", "csv")[0] == 0  # without --fail-on
 
 
-def test_conditions_that_cannot_be_judged_fail_with_a_separate_line(
+def test_conditions_that_cannot_be_judged_exit_with_2_and_the_reason(
     cli, stored, measure
 ):
     assert cli("report", "a", "--fail-on", "worse")[0] == 2
@@ -522,8 +522,8 @@ def test_a_killed_growing_series_continues_without_duplicates(measure, tmp_path)
 
 
 def check_growth(folder, before, measure, **grown):
-    """Check that three lines were added, and that a second run measures each remaining
-    case once.
+    """Check that three lines were added, and that a second run adds each missing
+    measurement once.
     """
     held = read_journal(folder)
     assert len(held) == before + 3

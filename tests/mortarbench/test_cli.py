@@ -81,7 +81,7 @@ def test_problems_are_listed_with_defaults_and_forms(cli):
     assert code == 0
     assert (
         out == "well  Separable quadratics over x ≥ 0.  n=3 depth=1  primal | dual\n"
-    )  # the first of two sentences
+    )  # first sentence of the docstring
 
 
 def test_solvers_are_listed_one_line_each(cli):
@@ -90,7 +90,7 @@ def test_solvers_are_listed_one_line_each(cli):
     assert [line.split()[0] for line in out.splitlines()] == list(SOLVERS)
     first = " ".join(out.splitlines()[0].split())
     assert first == "exact Solver for P = I and inactive bounds. factor=1.0 reason=None"
-    assert "Lost(" not in out  # the docstring is only the signature by dataclass
+    assert "Lost(" not in out  # dataclass wrote this as the docstring
 
 
 def test_suites_are_listed_with_their_purpose(cli):
@@ -366,7 +366,7 @@ def test_missing_numbers_and_inapplicable_units_are_not_shown(cli):
     assert "J/m" not in dual
 
 
-def test_a_closed_output_pipe_is_no_fault():
+def test_a_closed_output_pipe_is_not_an_error():
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(
@@ -799,7 +799,7 @@ def test_on_a_terminal_a_run_shows_a_bar_with_its_activity(monkeypatch):
 
 @pytest.mark.parametrize("width", [100, 80, 60, 59, 30])
 def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
-    """The cases include long measurements and a continued run."""
+    """The run has completed 1000 measurements, and the running case has a long name."""
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", str(width))
     now = [0.0]
@@ -880,7 +880,10 @@ def test_a_quiet_run_prints_warnings_and_missing_measurements(
 
 
 def test_a_decline_names_the_dual_form_if_available(capsys, tmp_path, monkeypatch):
-    """The hint is printed if the family has a dual form, but not for a QP of a file."""
+    """The hint is printed if the solver accepts the dual form of the case.
+
+    A QP of a file has no dual form.
+    """
     from mortarbench import QP, export
 
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Every command in the documents works, in the order of its page.
+"""Commands in the documents work, in the order of their page.
 
 The commands of a page are in blocks ```sh; those of the README are indented lines. The
 files that these commands need are the blocks after ``<!-- file: NAME -->``. Commands
@@ -209,10 +209,8 @@ def test_every_omitted_command_is_shown_on_a_page():
     assert not set(normal(SHORTER)) & set(normal(ELSEWHERE))
 
 
-def test_a_block_that_shows_a_command_is_one_that_is_run():
-    """No command of this project is in a block whose fence excludes it from
-    the tests.
-    """
+def test_mortarbench_commands_are_only_in_blocks_that_are_run():
+    """No line of a block that the tests skip begins with `mortarbench`."""
     for page in PAGES:
         blocks = re.findall(
             r"^```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.M | re.S

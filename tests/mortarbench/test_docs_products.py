@@ -32,7 +32,7 @@ def test_the_page_has_measured_tables_of_every_kind():
 
 @pytest.mark.parametrize(("case", "head", "shown"), QUICK)
 def test_a_short_count_is_the_one_shown(case, head, shown):
-    """Counts may differ by the rounding of another BLAS."""
+    """Counts may differ slightly, because another BLAS rounds differently."""
     assert products.products(case, head) == pytest.approx(shown, abs=1, rel=0.03)
 
 

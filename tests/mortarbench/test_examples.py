@@ -22,8 +22,8 @@ EXAMPLES = {
         )
     },
 }  # fmt: skip
-#: functions whose examples repeat the run of "smoke", after which they are called in
-#: the tests of the command line and of a script
+#: functions whose examples are slow, since they begin with a run of "smoke"; tests of
+#: the command line and of scripts call these functions in every test run
 LATER = {"load", "replay", "report", "validate"}
 
 
@@ -32,8 +32,8 @@ LATER = {"load", "replay", "report", "validate"}
 )
 @pytest.mark.usefixtures("blank_figures")
 def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsys):
-    """Each example runs in an empty working directory, so that it cannot depend on
-    another one.
+    """The examples of each docstring run in an empty working directory, so that they
+    cannot depend on other docstrings.
     """
     function = EXAMPLES[name]
     monkeypatch.chdir(tmp_path)

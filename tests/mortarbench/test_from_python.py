@@ -151,9 +151,9 @@ def test_a_class_of_a_script_is_copied_with_the_modules_beside_it(tmp_path, thre
 
 
 @pytest.mark.slow
-def test_an_installed_module_of_the_same_name_is_not_used_instead(tmp_path):
-    """The script's own `solvers.py` and `msgspec.py` take precedence in the
-    script only.
+def test_modules_of_a_script_do_not_hide_installed_modules_in_workers(tmp_path):
+    """A worker imports a module of the script, but not `solvers.py` and `msgspec.py`
+    from the same folder, which raise an error.
     """
     for name in ("solvers", "msgspec"):
         (tmp_path / f"{name}.py").write_text("raise ImportError('not for workers')\n")
@@ -212,10 +212,8 @@ def test_a_solver_whose_copy_fails_has_crashed_with_the_reason():
     assert "cannot be rebuilt in a worker process: ValueError" in answer.record.message
 
 
-def test_the_series_of_a_solver_object_contains_earlier_load_steps(tmp_path):
-    """The series of load steps requires the solver again, either the object or the
-    plug-in.
-    """
+def test_a_series_of_load_steps_is_written_for_a_solver_of_a_plug_in(tmp_path):
+    """The series requires the solver of the plug-in again, for the first load step."""
     plugin_file = tmp_path / "clara.py"
     plugin_file.write_text(
         "from solvers import SOLVERS as ALL\nSOLVERS = {'clara': ALL['clarabel']}\n"
@@ -285,7 +283,7 @@ def test_sparse_matrices_of_a_case_are_csc_with_narrow_indices(form):
             assert M.has_canonical_format
 
 
-def test_a_qp_is_the_same_whether_its_case_or_itself_is_solved():
+def test_a_case_and_its_qp_have_the_same_solution():
     case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/primal")
     by_name, by_qp = mb.solve(case, "clarabel"), mb.solve(case.qp, "clarabel")
 
@@ -320,7 +318,7 @@ def test_the_exported_qp_is_the_same_qp(tmp_path, monkeypatch, what, ending):
     assert back.sizes == qp.sizes
 
 
-def test_the_parts_in_an_npz_are_those_that_solvers_take(tmp_path):
+def test_matrices_in_an_npz_have_32_bit_indices(tmp_path):
     with np.load(
         mb.export(SMALL.replace("dual", "primal"), tmp_path / "a.npz")
     ) as file:
@@ -422,7 +420,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
 
 
 def test_the_conformance_suite_accepts_a_solver_object():
-    """The solver handles one QP only, so every check is declined or fails."""
+    """The solver handles one QP only, so it declines the check and does not conform."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
 

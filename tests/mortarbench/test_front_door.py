@@ -89,8 +89,8 @@ def test_an_answer_is_verified_certified_and_printed(answer):
 
 
 def test_an_answer_estimates_the_discretisation_error():
-    """The finite element space contains the solution of the patch test; a cantilever
-    has no finer mesh.
+    """The finite element space contains the solution of the patch test; the cantilever
+    offers no refined mesh.
     """
     patch, beam = (
         mb.solve(name, "clarabel")
@@ -279,8 +279,8 @@ LIGHT = [
 def loaded(tmp_path_factory):
     """Run the commands of `LIGHT` in one process.
 
-    Returns the words of the last line after each command: "loaded" and the libraries
-    that are imported by then.
+    Return the words of the line printed after each command: "loaded" and the libraries
+    of `slow` that are imported by then.
     """
     program = (
         "import json, sys, mortarbench.__main__ as m\n"
@@ -388,7 +388,7 @@ def test_the_remaining_time_assumes_the_present_rate(measured, to_do, seconds, s
 
 
 def in_many_threads(program, folder):
-    """Run a user's program whose libraries use all cores; return its output."""
+    """Run a user's program whose libraries may use eight threads; return its output."""
     many = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "8")
     return subprocess.run(
         [sys.executable, "-c", program], env=os.environ | many,

@@ -1,7 +1,8 @@
 """The notebooks of docs/gallery run unchanged and show what their text states.
 
-Each notebook runs in its own kernel in an empty folder. Of the shortest notebook, only
-the code runs by default, without a kernel.
+Slow tests run four notebooks, each in its own kernel in an empty folder, and the code
+of `own-solver` and `stick-and-slip` without a kernel. By default, only the code of
+`own-steps` runs.
 """
 
 import json
@@ -75,8 +76,8 @@ def test_notebooks_are_stored_without_outputs():
 
 @pytest.mark.slow
 def test_a_first_comparison(execute):
-    """All answers are verified; at one tolerance the errors differ by a factor of ten
-    and are below √tol.
+    """All answers are verified; at each tolerance, the errors on dual forms differ by a
+    factor of at least five, and all errors are below √tol.
     """
     (statuses, spread, worst), shown = execute(
         "first-comparison",
@@ -115,8 +116,9 @@ def run_code(tmp_path, monkeypatch):
 
 
 def test_the_code_of_your_own_steps(run_code):
-    """SSOR saves products, an additional projected step saves some more, and a bad rule
-    costs some.
+    """SSOR saves products; on the string, an additional projected step saves more.
+
+    With the rule that increases the objective, fallbacks replace all expansions.
     """
     found = run_code("own-steps")
     products, counts = found["counts"].P_products, found["counts"]
@@ -134,8 +136,8 @@ def test_the_code_of_your_own_steps(run_code):
 
 @pytest.mark.slow
 def test_the_code_of_your_own_solver(run_code):
-    """The gradient method reduces the error by 1 − 1/κ per step, and some of its claims
-    are refuted.
+    """The gradient method reduces the error by the factor 1 − 1/κ per step, and some of
+    its claims are refuted.
 
     Verdicts do not depend on repeats, so only one of the three repeats is measured.
     """

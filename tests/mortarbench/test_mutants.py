@@ -36,7 +36,7 @@ def changes(code):
         }),
     ],
 )  # fmt: skip
-def test_one_place_is_changed_at_a_time(code, expected):
+def test_each_mutant_has_one_change(code, expected):
     assert changes(code) == expected
 
 

@@ -66,7 +66,7 @@ PLUGIN = PLUGINS / "plug.py"  #: imports `harness`, and a module beside it
 
 
 class There(Registries):
-    """Machine and code that measured a stored folder."""
+    """Registries with the environment in which a stored folder was measured."""
 
     def environment(self):
         stored = json.loads((self.folder / "environment.json").read_text())

@@ -82,7 +82,7 @@ def test_paraview_gets_triangles_pressures_and_a_table_along_each_contact(solved
 
 
 def test_the_refusals_quoted_on_the_page_are_the_actual_messages(solved):
-    """Every message in the table of the page occurs, except for its variable parts."""
+    """The constant parts of the messages occur on the page and in the code."""
     code = "".join(
         path.read_text("utf-8")
         for folder in ("problems/fem", "problems/contact", "problems/models")

@@ -165,8 +165,8 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
 
 
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
-    """The run has verified and refuted answers. Statuses are recomputed and not read
-    from the journal.
+    """The run yields verified, declined and other verdicts, which are recomputed from
+    the claims and residuals of the journal.
     """
     monkeypatch.chdir(tmp_path)
     bench = Registries(

@@ -22,7 +22,7 @@ SOURCES = {
         *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     )
 }
-#: pages with Unicode formulas: generated from docstrings, or the change log
+#: pages with Unicode formulas: generated pages and the change log
 UNICODE = {
     "solvers.md", "solvers-own.md", "solvers-libraries.md", "weaknesses.md",
     "CHANGELOG.md",
@@ -82,8 +82,8 @@ def test_every_formula_of_a_page_becomes_mathml(name):
 
 @pytest.mark.parametrize("name", sorted(SOURCES.keys() - UNICODE))
 def test_no_formula_of_a_page_is_plain_text(name):
-    """The sources contain mathematical symbols only as LaTeX, except in code and number
-    signs.
+    """Outside of code, the characters of `FORMULA` occur only in LaTeX. Other symbols,
+    such as superscript digits, may be plain text.
     """
     prose = CODE.sub("", SOURCES[name].read_text("utf-8"))
     prose = unicodedata.normalize("NFD", re.sub(r"\$\$?[^$]+\$\$?", "", prose))

@@ -24,7 +24,7 @@ from tests.support import TOY_PROBLEM
 
 TOY = load_plugin(TOY_PROBLEM)
 
-#: correct only in the second version; the versions differ in a neighbouring module
+#: solver that is correct only in the second version; the versions differ in `step`
 MINE = """
 from dataclasses import dataclass
 from harness import Solution, Status
@@ -207,8 +207,8 @@ def test_a_new_solver_keeps_its_answer_in_every_equivalent_formulation(starting)
 
 
 def test_a_new_problem_builds_the_named_case(starting):
-    """−u″ = −1, and u = −depth on the contact zone; contact ends at the distance
-    √(2·depth).
+    """−u″ = −1 outside of the contact zone, and u = −depth = −0.05 in the zone; its
+    distance from both ends is √(2·depth).
     """
     starting("new", "problem", "mine")
     name = "mine/n=399/primal"

@@ -17,7 +17,7 @@ from mortarbench.reports.export.csv_tables import frame_csv
 from mortarbench.reports.render.latex import escaped as tex
 from mortarbench.reports.render.markdown import escaped as md
 
-pytestmark = pytest.mark.together  # one report for all of them
+pytestmark = pytest.mark.together  # one report for all names
 
 NAMES = (
     "<b onmouseover=a()>&amp;</b><!--",

@@ -1,7 +1,6 @@
 """The page in a browser: offline, by mouse and keyboard, on phones, in dark mode.
 
-All tests share one Chromium and one page of a small campaign. Tests of hostile names
-use a separate page.
+All tests share one Chromium, and most of them share one page of a small campaign.
 """
 
 import os
@@ -97,7 +96,7 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(tabs):
-    """Open a page; at the end, assert that there were no messages and no requests."""
+    """Open a page; at the end, assert no messages and no requests except for pages."""
     tab, said, asked = tabs
     said.clear()
     asked.clear()
@@ -485,7 +484,7 @@ def test_a_plot_zooms_changes_its_axes_and_names_the_point_under_the_pointer(
 
 @pytest.fixture(scope="session")
 def compared(tmp_path_factory):
-    """Return the page that compares two runs with a long and a very long name."""
+    """Return a page that compares two runs, with names of different lengths."""
     paths = [tmp_path_factory.mktemp(name) for name in ("before", "after")]
     for path in paths:
         with Journal(path, "test") as journal:

@@ -107,7 +107,7 @@ def test_an_unverified_answer_is_never_the_fastest(measured, evidence):
 
 
 def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evidence):
-    """At tol 1e-8 residuals up to 1e-7 are verified, unless an optimum decides."""
+    """At tol 1e-8, residuals up to 1e-7 verify an answer unless an optimum decides."""
     optimum = {"decided_by": "reference", "optimum_error": 2e-8}
     off = {"decided_by": "reference", "optimum_error": 1.0, "verdict": Verdict.WRONG}
     records = [
@@ -375,7 +375,7 @@ def test_hostile_names_do_not_add_elements_to_the_page(hostile_folder):
     text = (hostile_folder / "index.html").read_text("utf-8")
     page = Page()
     page.feed(text)
-    assert page.kinds == ["application/json", "application/gzip", None]  # ours
+    assert page.kinds == ["application/json", "application/gzip", None]  # our scripts
     assert page.tags.count("style") == 1
     assert not {"img", "meta"} & set(page.tags[page.tags.index("body") :])
     assert page.handlers == []
@@ -508,7 +508,7 @@ def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):
     assert "factor 1" in picture.caption
 
 
-def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_path):
+def test_the_largest_cases_in_2d_and_3d_are_drawn(measured, square, tmp_path):
     cube = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
     solid = Fields(
         points=cube.points, cells=cube.cells, displacement=0 * cube.points,

@@ -31,7 +31,7 @@ def sentences(tmp_path, monkeypatch):
 
 
 def asked(source):
-    """Return the names of macros that a module calls, and all of its other words."""
+    """Return the names of macros that a module calls, and all of its other strings."""
     names, strings = set(), set()
     for node in ast.walk(ast.parse(source)):
         match node:

@@ -1,7 +1,8 @@
 """Plug-in with solvers that disturb a run, and one that detects disturbances.
 
-The solvers solve `tiny` of adversaries.py correctly, but have side effects. `witness`
-fails if a process of another solver is not stopped during its solve.
+Most of the solvers solve `tiny` of adversaries.py correctly, but have side effects;
+others do not return an answer. `witness` fails if a process of another solver is not
+stopped during its solve.
 
 If the module is run as a program with the name of a solver and two file descriptors, it
 acts as a worker.
@@ -32,7 +33,7 @@ from mortarbench.harness.processes.worker import serve
 
 
 def processes(of_run):
-    """List the processes that a run has started, directly or indirectly.
+    """Yield the IDs of processes that a run has started, directly or indirectly.
 
     of_run : value of the variable WATCHED in their environment
     """
@@ -230,7 +231,7 @@ class PatchesTheClock(Honest):
 
 
 class Remembers(Honest):
-    """Solver that works for 16 ms once, and then always returns a cached answer."""
+    """Solver that works for 16 ms once per QP, and later returns a cached answer."""
 
     known: ClassVar[dict] = {}
 
@@ -264,7 +265,7 @@ class KillsItself(Honest):
 
 
 class KilledOnceWarmingUp(Honest):
-    """Solver that ends by SIGKILL in the first warm-up, and then creates $KILLED."""
+    """Solver that ends by SIGKILL in the first warm-up, after creating $KILLED."""
 
     def prepare(self, qp, tol):
         killed = Path(os.environ["KILLED"])

@@ -1,6 +1,6 @@
 """Solver of one small QP.
 
-Workers import the module of a solver object; this one loads faster than tests do.
+Workers import the module of a solver object; this one loads faster than a test module.
 """
 
 from dataclasses import dataclass

@@ -191,7 +191,7 @@ class PrintsEndlessly(Honest):
 
 
 class AsksForTheMoon(Honest):
-    """Solver that requests more memory than the machine has in one allocation."""
+    """Solver that requests, in one allocation, more memory than the machine has."""
 
     def act(self, qp):
         np.ones(2**40)
@@ -290,7 +290,7 @@ class SleepsByPower(Honest):
 
 @dataclass(frozen=True)
 class Chains(Honest):
-    """Solver whose iterations are the number of QPs of the sequence so far."""
+    """Solver that reports the number of QPs of the sequence so far as iterations."""
 
     def chain(self, tol):
         seen = []
@@ -345,7 +345,7 @@ class Forks(Honest):
 
 
 def above(process):
-    """Return the parent of a process."""
+    """Return the process ID of the parent of a process."""
     return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
 
 

@@ -15,7 +15,7 @@ class HangError(BaseException):
 
 @contextmanager
 def bounded(seconds=300, mib=1024):
-    """Raise `HangError` after `seconds`; assert that resident memory grew by ≤ `mib`.
+    """Raise `HangError` after `seconds`; assert that the memory peak grew by ≤ `mib`.
 
     The address space is limited to a much larger value, which protects the machine.
     """

@@ -8,10 +8,11 @@ SIDE, MASS, GRAVITY_STEP = 0.2, 3.0, 9.81e-3
 
 
 def box_stack(boxes=3, mu=0.4, seed=5):
-    """Return M (6b,), H (6b, 12b), f (6b,) and μ (4b,): four contacts below each box.
+    """Return M (6b,), H (6b, 12b), f (6b,) and μ (4b,) of b boxes.
 
-    In addition to the velocity due to gravity, boxes have random tangential velocities
-    and spins. The rank of W is half its order.
+    There are four contacts below each box. In addition to the velocity due to gravity,
+    boxes have random tangential velocities and spins. The rank of W = HᵀM⁻¹H is half
+    its order.
     """
     rng = np.random.default_rng(seed)
     inertia = MASS * SIDE**2 / 6

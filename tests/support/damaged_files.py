@@ -68,7 +68,7 @@ def tiny_qp(dense=False):
 
 
 def seeds(folder):
-    """Return intact files of every format by file suffix."""
+    """Return the contents of intact files, as a list for each file suffix."""
     qp, meta = tiny_qp(), {"name": "tiny", "scale": 2.0, "constant": 1.0}
     found = {kind: [] for kind in ("npz", "mat", "parquet", "qps")}
 

@@ -39,7 +39,7 @@ def damaged(text, random):
 
 
 def distorted(data, random):
-    """Return a copy of nested plain data with one to five values replaced."""
+    """Return a copy of nested plain data with up to five values replaced."""
     data = json.loads(json.dumps(data))
     for _ in range(random.choice((1, 1, 2, 5))):
         at = data

@@ -1,7 +1,8 @@
 """Ranks that end in a known order, to test which rank `launch` reports as the first.
 
-``dying_ranks.py COUNT TRIALS SEED`` launches COUNT ranks in each trial. One of
-them is killed, exits, or is killed after printing a line that resembles our messages.
+``dying_ranks.py COUNT TRIALS SEED`` launches COUNT ranks in each trial. One of them
+exits, or is killed, possibly after printing a line that resembles our messages or 64
+MiB of output.
 The other ranks either exit as soon as they notice this, or continue. In some trials,
 the parent process of the first rank is also killed. The program prints, as JSON, the
 trials in which `launch` named a wrong rank.

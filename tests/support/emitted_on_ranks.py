@@ -63,7 +63,7 @@ def emitted(name, ranks):
 
 
 def own_subdomains(name, ranks):
-    """Return the local subdomains of this rank for the first problem of a path."""
+    """Return the local subdomains of this rank for the problem of a case."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
@@ -82,7 +82,7 @@ def class_digest(kind, touched):
 
 
 def factorised_in(act):
-    """Return the result of `act()`, and the classes that this rank factorises in it."""
+    """Return the result of `act()`, and digests of the classes that it factorises."""
     factor, names = SubdomainClass.border_factor, []
 
     def recording(kind, touched):
@@ -147,7 +147,7 @@ def compared(name, everyone):
 
 
 def _discs(everyone, qp):
-    """Return the components of all discs, and the largest difference of radii."""
+    """Return the components of all discs, and the relative error of their radii."""
     discs = sorted(disc for one in everyone for disc in one["discs"])
     known = sorted(
         (i.tolist(), r)
@@ -170,7 +170,7 @@ def _off(found, known):
 
 
 def _bounds_off(found, known):
-    """Return the difference of finite bounds, or inf if infinite bounds differ."""
+    """Return the relative error of finite bounds, or inf if infinite bounds differ."""
     finite = np.isfinite(known)
     if not np.array_equal(found[~finite], known[~finite]):
         return float("inf")

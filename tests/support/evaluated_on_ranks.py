@@ -51,7 +51,7 @@ def evaluated(name, ranks):
 
 
 def beside_one_process(name, found):
-    """Add to each answer its evaluation by a single process that builds the case."""
+    """Yield the results for each answer, with its evaluation by a single process."""
     case = parse(name, PROBLEMS).build(reference_solution)
     for told, whole in found:
         one = {"objective": case.qp.objective(whole.x)}

@@ -61,8 +61,9 @@ def nearly_contradicting(rng):
 
     Rows have integer or real entries or are linear combinations of other rows. The
     right-hand side is chosen such that a planted certificate is violated or satisfied
-    by a small gap. Rows and variables are scaled by powers of ten, single entries are
-    disturbed in their last bits, and bounds are absent, zero, close or huge.
+    by a gap, which is small in most cases. Rows and variables are scaled by powers of
+    ten, single entries are disturbed in their last bits, and bounds are absent, active,
+    close or huge.
     """
     n, m, p = rng.integers(1, 7), rng.integers(0, 4), rng.integers(1, 6)
     draw = rng.choice([

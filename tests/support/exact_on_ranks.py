@@ -22,7 +22,10 @@ SHARP = (1e-7, 0.1)
 
 
 def certified(name, count, ranks):
-    """Return faults, and the ratios of bound to error, on the first rank."""
+    """Return faults, and ratios of bound to error for errors within `SHARP`.
+
+    Both lists are empty on ranks other than the first.
+    """
     problem, build = problem_and_build(f"{name}/dual")
     mechanics = build().mechanics if ranks.rank == 0 else None
     exact = exact_solution(mechanics) if ranks.rank == 0 else None

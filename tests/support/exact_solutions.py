@@ -140,7 +140,7 @@ class ExactSolution:
     def exceeded(self, found: Certificate, s: Solution, u: Any) -> tuple[float, float]:
         """Return the larger relative error of û (n,) and s, and its ratio to the bound.
 
-        The bound of the relative error may be infinite while the bound of the absolute
+        The bound on the relative error may be infinite while the bound on the absolute
         error is finite.
         """
         error = max(self.error(s.x), self.error(u))

@@ -1,4 +1,6 @@
-"""Plug-in with an exact solver, and solvers with false claims, two of them real.
+"""Plug-in with an exact solver, and solvers with false claims.
+
+Two of the solvers with false claims call libraries with their default options.
 
 The plug-in contains two families without mechanics: a membrane, and
 min ½(x + 1)², x ≤ 0.

@@ -1,4 +1,4 @@
-"""Solvers with planted faults, for which checks of conformance fail or warn."""
+"""A sound solver, and solvers with planted faults, for tests of conformance checks."""
 
 import os
 import signal

@@ -109,7 +109,7 @@ class BoundSearch:
         self.own = problem_of(problem, ranks)
 
     def errors(self, found, claimed):
-        """Return errors of û, answer and pair, and whether û is admissible."""
+        """Return the errors of û, answer and pair, and True if û is admissible."""
         own, truth = self.own, self.truth
         parts = self.ranks.comm.gather((own.components, found.u))
         still = None

@@ -8,7 +8,8 @@ requesting process. /proc shows the command line and environment of the fork, se
 proc(5). Only the start of an interpreter is left out; tests of this start launch
 processes in the ordinary way.
 
-If the module is run as a program with a socket and modules to import, it is the server.
+If the module is run as a program with a socket and modules to import, it acts as the
+server.
 """
 
 import atexit

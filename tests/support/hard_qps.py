@@ -123,7 +123,7 @@ def _free_direction(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _redundant(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Add rows that do not bind, scaled by factors from 1e-12 to 1e12."""
+    """Add inactive rows, scaled by factors from 2^-40 to 2^40 (about 1e±12)."""
     size = 2.0 ** rng.integers(-40, 41, 2)
     rows = np.asarray(rng.integers(-3, 4, (2, d.x.size)) * size[:, None], dtype=float)
     return d.inequalities(rows, np.zeros(2), np.abs(rows @ d.x) + np.maximum(1.0, size))

@@ -95,8 +95,8 @@ def refined_solution(M, t):
 def factors(ranks):
     """Factorise a sum of known matrices, and a matrix that is singular on rank 0 only.
 
-    Row i of G has columns on rank i mod P and, if i is divisible by 3, also on the next
-    rank.
+    Row i of G has columns on rank i mod P of the P ranks and, if i is divisible by 3,
+    also on the next rank.
     """
     rng, r, size = np.random.default_rng(3), 24, ranks.size
     i = np.arange(r)

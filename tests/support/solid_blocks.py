@@ -37,7 +37,7 @@ traction = [0, 0, -1e6]
 slave = "foot"
 master = "table"
 """
-#: index of the side of the unit cubes for each boundary that both cubes have
+#: for each boundary of both cubes, the index of the coordinate that is zero on it
 _PLANES = {"left": 0, "front": 1}
 
 

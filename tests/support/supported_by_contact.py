@@ -51,7 +51,7 @@ def disc_between_plates(
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
 ) -> Case:
-    """Press a disc of radius 1 m between a supported plate and a free one.
+    """Press a disc of radius 1 m between a fixed plate and another, free or on rollers.
 
     n : number of cells across the disc
     rollers : True for rollers at the left side of the upper plate

@@ -13,7 +13,7 @@ from typing import Any
 
 import griffe
 
-#: names of one or more arguments, and their description with indented further lines
+#: names of one or more arguments, and their description; its further lines are indented
 _ENTRY = r"\w+(?:, \w+)* : .*\n(?: +.*\n)*"
 _ENTRIES = re.compile(rf"(?:\A|(?<=\n\n))(?:{_ENTRY})+(?=\n|\Z)")
 #: asterisk after a letter, as in u*, which Markdown would interpret as start of

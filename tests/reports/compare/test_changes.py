@@ -1,4 +1,4 @@
-"""Changes between two result folders: only planted changes are reported."""
+"""Changes between two result folders: planted changes are reported, and no others."""
 
 import json
 import re
@@ -61,7 +61,7 @@ def suite(seed, cases=12, repeats=5, scatter=0.05, **slower):
 
 @pytest.fixture
 def changed(tmp_path):
-    """Compare two lists of records."""
+    """Return a function that compares two lists of records."""
 
     def make(before, after, **more):
         one, two = (
@@ -124,7 +124,7 @@ def test_in_reverse_order_a_regression_is_an_improvement(changed):
     "repeats", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 10))]
 )
 def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats):
-    """Of 600 cells, 5 % (30 ± 12 at three standard deviations) may show a change."""
+    """Of 600 cells, 5 % (30 ± 16 at three standard deviations) may show a change."""
     named = cells = 0
     for seed in range(0, 20, 2):
         first = suite(seed, cases=20, repeats=repeats)
@@ -141,7 +141,7 @@ def test_two_runs_of_the_same_code_differ_in_one_cell_of_twenty(changed, repeats
 )
 def test_the_interval_over_cells_has_its_nominal_coverage(cells):
     """Of 400 intervals, 20 should miss the true value; 7 to 33 are within
-    three sigma.
+    three standard deviations, and up to 40 are accepted.
     """
     rng = np.random.default_rng(cells)
     missed = sum(
@@ -164,7 +164,7 @@ def test_a_wide_interval_is_not_reported_as_unchanged(low, high, word):
 
 
 def test_unresolved_cells_are_counted_separately(changed):
-    """One of two unchanged cells scatters by a factor of ten."""
+    """The times of one of two unchanged cells are scaled by 0.1 and by 10."""
     times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
     before = [record(case=k, repeat=i) for k in times for i in range(2)]
     after = [
@@ -529,7 +529,7 @@ def test_a_busy_machine_causes_a_warning(folders):
 
 
 def test_an_additional_plug_in_keeps_times_comparable(folders):
-    """An additional plug-in does not affect times; a change of its content does."""
+    """Times stay comparable with an additional plug-in, but not if one has changed."""
     admm, other = (
         HERE | {"digest": d, "plugins": {"admm.py": sha}}
         for d, sha in (("e2", "aaa"), ("e3", "bbb"))

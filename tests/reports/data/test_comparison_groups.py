@@ -66,7 +66,7 @@ def some_records(record, solvers, cases=6):
 
 
 OVER_CASES = ("means", "ranking", "profiles")
-#: end of the sentence in the sections after the first, which states the reasons
+#: end of the sentence in all sections except the first; the first states the reasons
 ELSEWHERE = "of cases, for the reasons given under “Means over cases”."
 
 

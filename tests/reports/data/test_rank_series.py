@@ -154,7 +154,7 @@ def test_memory_that_is_not_a_number_is_unknown():
     assert rank_memory(series.answers[2]) is None
 
 
-def test_weak_scaling_is_recognised_by_equal_dofs_of_a_rank(manufactured):
+def test_weak_scaling_is_recognised_by_equal_dofs_per_rank(manufactured):
     found = {s.members[0].dofs: s for s in weak_series(manufactured)}
     assert [(m.ranks, m.dofs) for m in found[50_000].members] == [
         (1, 50_000), (2, 100_000), (4, 200_000),

@@ -170,7 +170,7 @@ def test_each_contact_has_a_csv_table(tmp_path):
     np.testing.assert_array_equal(table[["x_m", "y_m"]], FIELDS.points[SIDE.nodes])
 
 
-def test_a_table_in_space_has_areas_and_no_arc_length(tmp_path):
+def test_a_table_in_3d_has_areas_and_no_arc_length(tmp_path):
     axis = (0.0, 1.0)
     points = np.array([[x, y, z] for z in axis for y in axis for x in axis])
     side = ContactSide(
@@ -325,12 +325,12 @@ def test_a_series_contains_all_load_steps_up_to_the_requested_one(solve, tmp_pat
 
     assert code == 0
     assert [float(entry.get("timestep")) for entry in series] == [1, 2, 3]
-    assert tips[0] > tips[1] > tips[2]  # ever lower
+    assert tips[0] > tips[1] > tips[2]  # the tip sinks
 
 
 def test_solids_are_written_by_cell_type_with_forces_in_newtons(tmp_path):
     corners = np.array(list(np.ndindex(2, 2, 2)), dtype=float)
-    tetra = [0, 4, 6, 7, 7, 7, 7, 7]  # in a table of hexahedra
+    tetra = [0, 4, 6, 7, 7, 7, 7, 7]  # as a degenerate hexahedron
     touching = ContactSide(
         name="cube on wall", nodes=np.arange(4), length=np.full(4, 0.25),
         force=np.tile([0.0, 0, 2], (4, 1)), pressure=np.full(4, 8.0), gap=np.zeros(4),

@@ -136,7 +136,7 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
     ],
 )  # fmt: skip
 def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):
-    """For sizes from n to 100n, the guide of slope 3/2 rises by a factor of seven."""
+    """For sizes from n to 100n, the guide of slope 3/2 rises by a factor of about 8."""
     grown = [
         r.replace(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
               form="dual", params={"n": n}, sizes={"variables": n},

@@ -1,4 +1,4 @@
-"""Legibility of figures: hues, ends of axes, titles."""
+"""Legibility of figures: colours, ends of axes, legends, titles."""
 
 import colorsys
 from itertools import combinations, pairwise
@@ -62,7 +62,7 @@ def test_no_two_solvers_of_a_figure_share_a_hue(count, degrees):
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_the_first_eight_colours_differ_for_colour_blind_readers(sight):
-    """A distance of 0.02 in OKLab is about a just noticeable difference."""
+    """A distance of 0.02 in OKLab is about one just noticeable difference."""
     seen = [oklab(np.clip(SIGHTS[sight] @ linear(c), 0, 1)) for c in COLOURS[:8]]
     assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 0.06
 

@@ -215,7 +215,7 @@ def test_forces_of_sticking_and_slipping_nodes_differ_in_colour(bodies):
     ("state", "key"),
     [
         ("sliding without contact", "sliding without contact: orange (2)"),
-        ("open", "open: grey (2)"),  # older results: shares of forces on neighbours
+        ("open", "open: grey (2)"),  # in older results, open nodes may have forces
     ],
 )
 def test_nodes_with_shear_only_do_not_change_the_enlargement(bodies, state, key):
@@ -242,7 +242,7 @@ def test_nodes_with_shear_only_do_not_change_the_enlargement(bodies, state, key)
 def test_sliding_without_contact_is_coloured_up_to_half_edges(
     bodies,
 ):
-    """Two of four nodes slide without contact, in overview and enlargement."""
+    """Two of four nodes slide without contact; both panels show this."""
     pair = side("up on low", [4, 5, 0, 1], [[0, -3], [0, -2], [1, 0], [0, 0]])
     states = np.array(["slip", "stick"] + 2 * ["sliding without contact"])
     rough = replace(pair, shear=pair.gap, friction=states)
@@ -304,7 +304,7 @@ def test_bodies_that_do_not_move_are_drawn_as_they_are(bodies):
     assert automatic_scale(bodies) == 1
 
 
-def test_the_scale_is_that_of_the_displacement(bodies):
+def test_displacements_are_drawn_at_the_requested_scale(bodies):
     there = deformed_figure(bodies, 4.0).panels[0]
     (field, *_) = (m for m in there.marks if isinstance(m, ColourField))
 
@@ -442,7 +442,7 @@ def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure
     assert "#ffffff" not in page
 
 
-def test_bodies_in_space_have_no_tractions_along_a_line(bodies):
+def test_bodies_in_3d_have_no_tractions_along_a_line(bodies):
     def lifted(values):
         return np.column_stack([values, np.arange(float(len(values)))])
 

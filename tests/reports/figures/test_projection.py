@@ -63,7 +63,7 @@ def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
     outlines = np.isnan(faces.values)
 
     assert (face_normals(CUBE.points, facets) @ camera.towards > 0).sum() == 12
-    tiles = (~outlines).sum() / 12  # of the 24 faces
+    tiles = (~outlines).sum() / 12  # per visible face; 24 in all
     # the total length of the pieces of outlines is the length of all face edges
     pieces = faces.corners[outlines]
     assert len(pieces) == 12 * 4 * np.sqrt(tiles)

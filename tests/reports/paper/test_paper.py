@@ -50,7 +50,7 @@ FIGURES = [
     *(f"figure{i}" for i in range(1, 8)),
     "zoom", "pressure", "verification", "stepping", "fleet", "totals", "certified",
 ]  # fmt: skip
-SORTS = ("figure1", "verification", "fleet")  #: figures of a mesh, curves and solvers
+SORTS = ("figure1", "verification", "fleet")  #: of a mesh, of curves, of solvers
 TWICE = Rounds(most=2, least=2)
 LITTLE = replace(
     QUICK,
@@ -92,7 +92,7 @@ def data(experiment, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(data, blank):
-    """Return the page and its tables, with empty figures."""
+    """Return a folder with the page and its tables, with empty figures."""
     path = data.with_name("page")
     shutil.copytree(data, path)
     with blank():
@@ -134,9 +134,10 @@ def record(solver, form, m, seconds, repeat, **changes):
 
 
 def synthetic():
-    """Return records with times of 1e-6·m² s.
+    """Return the records of two suites.
 
-    At the largest size, `lazy` returns a wrong answer after 1 ns.
+    In `paper-fleet`, times are about 1e-6·m² s; at the largest size, `lazy` returns a
+    wrong answer after 1 ns. In `paper-accuracy`, times are 1e-3·tol^-0.1 s.
     """
     fleet = [
         record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
@@ -241,7 +242,7 @@ def test_the_dual_has_the_sizes_of_the_papers_formulas(experiment, Nr):
 
 
 def test_figure_2_is_drawn_with_both_rules_for_the_ring(experiment, folder):
-    """Erratum: Nh layers have 313 nodes; 2·Nh layers, as in the text, have 424."""
+    """Erratum: with Nh layers, there are 313 nodes; with 2·Nh, as in the text, 424."""
     nodes = [
         len(experiment.states[s].points) for s in ("example-Nh", "example-2Nh")
     ]  # fmt: skip
@@ -401,7 +402,7 @@ def test_the_order_of_the_stepping_is_recovered(p, quantity, part):
 
 
 def test_the_papers_stepping_is_of_first_order():
-    """Erratum of the notes: 10 steps leave 7 % of the horizontal contact force."""
+    """The errors of tip displacement and contact force are of order 1/steps."""
     plan = replace(LITTLE, stepped=(6, 3), stepping=(5, 10, 20, 40), relin=(1,))
     rows = list(stepping(plan, reference_solution))
 

@@ -1,4 +1,4 @@
-"""Formulas in prose are complete in every format."""
+"""Formulas in prose are complete in HTML and Markdown."""
 
 import re
 from types import SimpleNamespace

@@ -119,9 +119,10 @@ def test_horizontal_error_bars_are_horizontal():
 
 
 def test_axes_contain_all_points_and_error_bars_with_a_margin():
-    """The margin is 5 % of a logarithmic axis that spans a decade or more.
+    """The margin is 5 % of the range of the points.
 
-    For points from 0.5 to 4, the axis spans one decade with the points in its middle.
+    A logarithmic axis spans at least a decade; for points from 0.5 to 4, it spans one
+    decade with the points in its middle.
     """
     (panel,) = fitted(figure(TIMES, x=LOG, y=LOG)).panels
 
@@ -298,7 +299,7 @@ def test_points_of_inconsistent_length_are_refused(broken):
         Series(**{"x": (1, 2, 3), "y": (1, 2, 3), "look": look(0), **broken})
 
 
-def test_formulas_read_as_text():
+def test_formulas_are_shown_as_text():
     assert plain(r"degrees of freedom $n$") == "degrees of freedom n"
     assert plain(r"$\|g^P\|\,/\,\|g^P_0\|$") == "‖gᴾ‖ / ‖gᴾ₀‖"
     assert plain("$n^{3/2}$") == "n³ᐟ²"

@@ -96,7 +96,7 @@ def test_the_band_contains_the_true_speed_up(runs, least):
         at = cost_model(times, {}, [sent_on(4)]).speed_up(16)
         assert at.low <= at.value <= at.high
         held += at.low <= 2.1 / modelled(16) <= at.high
-    assert held >= least  # 95 % of forty are 38
+    assert held >= least  # 95 % of 10 and of 40 are 9.5 and 38
 
 
 def test_single_runs_have_no_band():
@@ -111,7 +111,7 @@ def test_the_largest_number_of_ranks_at_half_efficiency():
         message_seconds=1e-6, seconds_per_byte=1e-9,
     )  # fmt: skip
     found = cost_model({1: [1.1] * 2, 2: [0.6] * 2}, {}, [free])  # W = 1, C = 0.1
-    # speed-up 1.1/(1/N + 0.1) ≥ N/2 up to N = 12
+    # 1.1/(1/N + 0.1) ≥ N/2 up to N = 12; the largest power of two is 8
     assert found.ranks_at(0.5) == 8
 
 

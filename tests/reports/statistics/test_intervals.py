@@ -56,7 +56,7 @@ def test_counts_that_do_not_grow_have_exponent_zero():
 
 
 @pytest.mark.parametrize("sizes", [3, 6])
-def test_the_interval_of_the_exponent_covers_at_its_nominal_rate(sizes):
+def test_the_interval_of_the_exponent_has_nominal_coverage(sizes):
     rng = np.random.default_rng(1729)
     n = np.geomspace(500, 40_000, sizes)
     fits = [

@@ -129,7 +129,7 @@ def test_the_order_of_the_solvers_does_not_matter():
 
 
 @pytest.mark.parametrize("cases", [5, 10, 40])
-def test_intervals_of_a_mean_cover_at_their_nominal_rate(cases):
+def test_intervals_of_a_mean_have_nominal_coverage(cases):
     rng = np.random.default_rng(15)
     drawn = weights([str(i) for i in range(cases)])
     low, high = limits(drawn @ rng.normal(3, 1, (cases, 3000)), cases)
@@ -143,7 +143,7 @@ def test_a_planted_ratio_is_inside_its_interval_at_the_nominal_rate(count):
     hits = []
     for _ in range(count):
         times = rng.lognormal(0, 1, (25, 1)) * rng.lognormal(0, 0.5, (25, 2))
-        anchor = np.full((25, 1), 1e-9)  # makes the shift small, and leads
+        anchor = np.full((25, 1), 1e-9)  # the leader, which makes the shift small
         found = ranking_of(group(np.hstack([anchor, times * [1, 1.5]])))
         draws = found.draws[:, 2] / found.draws[:, 1]
         low, high = limits(draws, 25)
@@ -355,7 +355,10 @@ def test_the_interval_of_a_full_share_has_positive_width():
 
 
 def test_the_restricted_mean_by_hand():
-    """S = 3/4 from 1 to 3, S = 3/8 from 3 (with two cases at risk) to 4, then S = 0."""
+    """The survival function is 3/4 from 1 to 3, 3/8 from 3 to 4, and 0 afterwards.
+
+    At time 3, two cases are at risk.
+    """
     nan = np.nan
     found = restricted_mean(
         np.array([1, INF, 3, 4.0]), np.array([nan, 2, nan, nan]), 5.0
@@ -409,7 +412,7 @@ def test_the_sign_flip_interval_covers_for_heavy_tails(cases):
 
 
 def test_six_values_have_the_interval_from_the_least_to_the_largest():
-    """All signs agree in 2 of 64 patterns; with five of six, the share exceeds 5 %."""
+    """All signs agree in 2 of 64 patterns (3 %), at least five signs in over 5 %."""
     names = [str(i) for i in range(6)]
     values = np.array([0.3, -0.01, 5.0, 1.0, 2.0, 4.0])
     assert symmetric_interval(values, names) == (-0.01, 5.0)
@@ -419,8 +422,8 @@ def test_six_values_have_the_interval_from_the_least_to_the_largest():
 # ---- growth
 
 
-def test_growth_at_the_practical_limit_is_detected_in_two_percent():
-    """For p at the limit, 2.5 % of the 95 % intervals lie entirely above the limit."""
+def test_growth_at_the_practical_limit_is_rarely_detected():
+    """For p at a limit, 2.5 % of the 95 % intervals lie entirely beyond this limit."""
     rng = np.random.default_rng(23)
     n = np.geomspace(100, 1e5, 6)
     for limit, called in ((1.1, Trend.GROWS), (0.9, Trend.FALLS)):
@@ -524,7 +527,7 @@ def test_predictions_equal_the_textbook_formula():
     assert ends == pytest.approx(c + p * x[1] + half * np.array([-1, 0, 1]))
 
 
-def test_predictions_cover_a_further_measurement_at_their_rate():
+def test_prediction_intervals_of_a_further_measurement_have_nominal_coverage():
     rng = np.random.default_rng(24)
     n = np.geomspace(100, 1e5, 5)
     hits = []

@@ -1,6 +1,7 @@
 """The vector operations of an MPRGP step.
 
-Step lengths are evaluated only for components with finite bounds, few in many duals.
+Steps to bounds are evaluated only for components with finite bounds; many duals have
+few of these.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def lengths(
 ) -> tuple[float, float]:
     """Return the minimising α and the largest feasible α of the step x − αp.
 
-    The minimising α is inf along a direction without curvature.
+    The minimising α is inf along a direction without positive curvature.
     """
     curvature, slope, feasible = inner_products(
         (p, Hp), (g, p), least=_to_bounds(x, p, lower, upper)
@@ -55,8 +56,8 @@ def moved(
 ) -> tuple[Vector, Vector]:  # fmt: skip
     """Return x − αp and its gradient.
 
-    Components that are beyond a bound, or within rounding error of it, are set to the
-    bound. Otherwise the largest feasible step could end just before the face.
+    Components that have moved beyond a bound, or to it within rounding error, are set
+    to the bound. Otherwise the largest feasible step could end just before the face.
     """
     new = x - alpha * p
     at = np.flatnonzero((lower > -np.inf) | (upper < np.inf))
@@ -69,7 +70,10 @@ def moved(
 
 
 def within(x: Vector, s: Vector, lower: Vector, upper: Vector) -> Vector:
-    """Return x + s, which is in the box up to rounding, moved exactly onto bounds."""
+    """Return x + s, which is in the box up to rounding.
+
+    Components beyond a bound, or within rounding error of it, are set to the bound.
+    """
     to, noise = x + s, ROUNDING * (np.abs(x) + np.abs(s))
     down, up = to - lower <= noise, upper - to <= noise
     return np.where(down, lower, np.where(up, upper, to))

@@ -1,6 +1,6 @@
 """A quadratic model of the operator, minimised over a box without its products.
 
-    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0:
+    B = τI + UᵀWU,    U (k, n) orthonormal rows, W = diag(w) > 0.
 
 The rows of U are the directions in which H is large, with eigenvalues w + τ, and τ
 replaces H on the orthogonal complement. If B ≥ H, then
@@ -101,7 +101,10 @@ class Model:
         return self.with_tail(min(max(tau, self.tau), 10 * self.tau))
 
     def with_tail(self, tau: float) -> Model:
-        """Return the model with another τ and the same w + τ where w + τ exceeds τ."""
+        """Return the model with a new τ.
+
+        Directions whose sum w + τ exceeds the new τ keep this sum; others are dropped.
+        """
         w = self.w + self.tau - tau
         return Model(tau, self.U[w > 0], w[w > 0])
 
@@ -166,7 +169,9 @@ def _searched(
     there: Tilted,
     slopes: tuple[float, float],
 ) -> tuple[float, Tilted]:
-    """Return t ≤ 1 and s(y + t dy), with at most a tenth of the slope at t = 0.
+    """Search t ≤ 1 at which the slope is at most a tenth of the slope at t = 0.
+
+    Return t and s(y + t dy).
 
     there : s(y + dy)
     slopes : slopes at t = 0 and at t = 1

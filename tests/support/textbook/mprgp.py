@@ -21,7 +21,7 @@ the least ‖g^P‖ was not halved and the decrease of the cost is within the ro
 of its terms. Rounding then leaves no descent direction that is conjugate to the
 previous ones.
 
-Every step except projcg reduces the cost; with the model τI, the reduction is
+No step except projcg increases the cost; with the model τI, the reduction is
 sufficient for the convergence rate of the book. Expansion never frees a component that
 the half step left at a bound, except in the first expansion by a model with directions.
 Apart from this exception, the active set only grows between two proportioning steps.
@@ -203,7 +203,7 @@ class _Line(NamedTuple):
 
     p: Vector
     Hp: Vector
-    cg: float  #: α_cg, which minimises the cost at x − αp; inf without curvature
+    cg: float  #: α_cg, which minimises the cost at x − αp; inf if pᵀHp ≤ 0
     feasible: float  #: largest feasible α
 
 
@@ -243,8 +243,8 @@ def mprgp(
     bounds : l and u (n,), possibly infinite
     start : a feasible x (n,) and its gradient Hx − b
     B : a model of H; ᾱ = 1/τ is the length of plain gradient projection steps
-    stop : function of point and face that returns whether to stop, called before
-        every step
+    stop : function of point and face that returns True to stop; called before every
+        step
     precondition : function that returns the preconditioner of the CG steps in a face
     watch : observer of each step, called with its letter, the new point and its face
     directions : directions of an earlier run with the same H. If that run ended on the
@@ -406,8 +406,8 @@ def _model_expansion(
 ) -> Step:  # fmt: skip
     """Project the infeasible CG point z onto the box in the metric of the model.
 
-    z is x − α_cg p. In a flat spectrum, where a step changes active sets least, z is
-    the result of further CG steps on the face without bounds. The cost at z is known.
+    z is x − α_cg p. In a flat spectrum (a model without directions), z is the result of
+    further CG steps on the face without bounds. The cost at z is known.
     If B ≥ H, the model bounds the cost at other points,
 
         f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr,

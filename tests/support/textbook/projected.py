@@ -61,12 +61,12 @@ class Projected(projected.Projected):
         """Model H by the Ritz pairs and the rows C.
 
         The penultimate Ritz value plus its residual estimates the norm of 𝒫F𝒫 on the
-        complement of the preceding Ritz vectors. (The last Ritz value is used if the
-        process terminated, and the first one whose residual exceeds its value.) ρQ is
-        used exactly. If the estimate is too small, MPRGP raises τ according to its
-        products. In a flat spectrum, a short process does not even find the first
-        eigenvector, and inaccurate Ritz vectors would slow CG down; then only the norm
-        is used.
+        complement of the preceding Ritz vectors. (If the process terminated, the last
+        Ritz value is used instead; if the residual of an earlier Ritz value exceeds
+        this value, the first such Ritz value is used.) ρQ is used exactly. If the
+        estimate is too small, MPRGP raises τ according to its products. In a flat
+        spectrum, a short process does not even find the first eigenvector, and
+        inaccurate Ritz vectors would slow CG down; then only the norm is used.
         """
         above, U, tail = self.upper_end()
         return model_of(self.rows, tail, above, U, rho)
