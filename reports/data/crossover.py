@@ -61,6 +61,8 @@ class Map:
     #: verified answers of the fastest solver, by dofs
     routes: Mapping[Route, Mapping[int, Outcome]]
     stops: Mapping[Route, Stop]
+    #: kinds of routes that are not in `routes` because all solvers declined every case
+    declined: frozenset[str] = frozenset()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -160,7 +162,7 @@ def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:
     for n, o in sized:
         by_route.setdefault(_route(o), {}).setdefault(n, []).append(o)
     sizes = tuple(sorted({n for n, _ in sized}))
-    routes, stops = {}, {}
+    routes, stops, declined = {}, {}, set()
     for route in sorted(by_route, key=_position):
         fastest = {
             n: min(ends, key=lambda end: end[0])[1]
@@ -168,10 +170,17 @@ def _map(title: str, sized: Sequence[tuple[int, Outcome]]) -> Map:
             if (ends := [(t.value, o) for o in of if o.verified and (t := charged(o))])
         }
         if not fastest and _inapplicable(by_route[route]):
+            declined.add(route.kind)
             continue
         routes[route] = fastest
         stops[route] = _stop(sizes, by_route[route], fastest)
-    return Map(title=title, sizes=sizes, routes=routes, stops=stops)
+    return Map(
+        title=title,
+        sizes=sizes,
+        routes=routes,
+        stops=stops,
+        declined=frozenset(declined),
+    )
 
 
 def _inapplicable(answers: Mapping[int, Iterable[Outcome]]) -> bool:

@@ -203,10 +203,9 @@ def _stops_table(one: Map) -> Table:
         )
         for route, answers in one.routes.items()
     ]
-    rows += [
-        (Cell.label(kind), Cell(), Cell(), Cell.words("not in this run"), Cell())
-        for kind in one.missing
-    ]
+    for kind in one.missing:
+        why = "declined by all solvers" if kind in one.declined else "not in this run"
+        rows.append((Cell.label(kind), Cell(), Cell(), Cell.words(why), Cell()))
     return Table(
         caption=TEXT("stops_caption", one.title),
         columns=("route", "largest size", "ends at", "because", "solvers there"),

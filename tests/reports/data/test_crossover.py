@@ -127,6 +127,19 @@ def test_the_section_names_every_route_even_those_without_measurements(evidence)
     assert whole.pictures[0].name == "crossover"
 
 
+def test_a_route_that_all_solvers_declined_differs_from_one_not_measured(evidence):
+    declined = dict(verdict=Verdict.DECLINED, quantities={}, total_seconds=None)
+    records = [
+        *measured(),
+        *(record("a", n, None, None, form="dual-bounds", **declined) for n in SIZES),
+    ]
+    whole = crossover(Analysis(evidence(records)))
+
+    why = {row[0].text: row[3].text for row in whole.tables[-1].rows}
+    assert why["dual-bounds"] == "declined by all solvers"
+    assert why["hybrid TFETI"] == "not in this run"
+
+
 def test_a_folder_without_growing_series_has_no_section(evidence):
     old = [r.replace(build_peak_mib=None) for r in measured()]
     assert crossover(Analysis(evidence(old))) is None
