@@ -210,9 +210,9 @@ class Answer:
         )
         if figure is None:
             raise InputError("no picture: the case has neither bodies nor tractions")
-        if path is not None:
-            save(figure, check_output_file(path, PICTURES))
-        return draw(figure)
+        if path is None:
+            return draw(figure)
+        return save(figure, check_output_file(path, PICTURES))
 
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.

@@ -161,9 +161,7 @@ class Results:
         if len(names) != 1:
             raise unknown("figure", str(kind), available, where=str(self.folder))
         figure = available[names[0]]
-        if target is not None:
-            save(figure, target)
-        return draw(figure)
+        return draw(figure) if target is None else save(figure, target)
 
     def validate(self, **options: object) -> Validation:
         """Cross-validate the answers; see `mortarbench.validate`."""

@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -18,36 +18,37 @@ PACKAGES = ("harness", "problems", "solvers", "reports", "mortarbench")
 
 
 def modules(*packages):
-    """Return (path, syntax tree) of all modules of `packages`, default: all five."""
-    return [module for package in packages or PACKAGES for module in parsed(package)]
+    """Return (path, text) of all modules of `packages`, default: all five."""
+    return [module for package in packages or PACKAGES for module in texts(package)]
 
 
 @cache
-def parsed(package):
+def texts(package):
     return [
-        (str(path.relative_to(ROOT)), ast.parse(path.read_text("utf-8")))
+        (str(path.relative_to(ROOT)), path.read_text("utf-8"))
         for path in sorted((ROOT / package).rglob("*.py"))
     ]
 
 
-@cache
-def users():
-    """Return the modules that import or look up a name, by the dotted name."""
-    found = defaultdict(dict)
-    for path, tree in modules():
-        for node in ast.walk(tree):
+def users(name):
+    """Return the modules that import or look up a dotted name."""
+    found = []
+    for path, text in modules():
+        # only a module that contains all parts of the name needs a syntax tree
+        if not all(re.search(rf"\b{part}\b", text) for part in name.split(".")):
+            continue
+        used = []
+        for node in ast.walk(ast.parse(text)):
             match node:
                 case ast.Import(names=aliases):
-                    used = [alias.name for alias in aliases]
+                    used += [alias.name for alias in aliases]
                 case ast.ImportFrom(module=str(source), names=aliases):
-                    used = [source, *(f"{source}.{alias.name}" for alias in aliases)]
+                    used += [source, *(f"{source}.{alias.name}" for alias in aliases)]
                 case ast.Attribute(value=ast.Name(id=source), attr=attr):
-                    used = [f"{source}.{attr}"]
-                case _:
-                    continue
-            for name in used:
-                found[name][path] = True
-    return {name: list(paths) for name, paths in found.items()}
+                    used.append(f"{source}.{attr}")
+        if name in used:
+            found.append(path)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,7 @@ def users():
     ],
 )
 def test_definitions_are_not_duplicated(name, homes):
-    assert users().get(name, []) == homes
+    assert users(name) == homes
 
 
 #: packages that contain many similar modules → contents of a module
@@ -100,16 +101,17 @@ def words(name):
     return [w.lower() for w in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
 
 
+#: definition in a module, or in a program that is a string of a test
+DEFINITION = re.compile(r"^ *(?:async )?(?:(class)|def) +(?!_|test_)(\w+)", re.M)
+
+
 def names():
     """Yield path, type and name of modules, classes and public functions."""
-    for path, tree in [*modules(), *modules("tests")]:
+    for path, text in modules(*PACKAGES, "tests"):
         yield path, "module", Path(path).stem
-        for node in ast.walk(tree):
-            match node:
-                case ast.ClassDef(name=name) if not name.startswith("_"):
-                    yield path, "class", name
-                case ast.FunctionDef(name=name) if not name.startswith(("_", "test_")):
-                    yield path, "function", name
+        # syntax trees of all tests would take seconds
+        for kind, name in DEFINITION.findall(text):
+            yield path, kind or "function", name
 
 
 def test_every_package_is_pinned_once():
@@ -140,7 +142,8 @@ def test_the_harness_names_no_solver_and_no_unit_of_physics():
     solvers = {*prefixes, *(p.lower() for p in LIBRARIES)} - {"py-mkl-pardiso"}
     units = {"Pa", "MPa", "GPa", "N/m", "J/m", "SI", "mm", "kN", "GN"}
     found = []
-    for path, tree in modules("harness"):
+    for path, source in modules("harness"):
+        tree = ast.parse(source)
         docs = {
             id(node.body[0].value)
             for node in ast.walk(tree)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -31,8 +30,12 @@ def draw(figure: Figure | FieldFigure) -> Canvas:
     return draw_fields(figure)
 
 
-def save(figure: Figure | FieldFigure, path: Path) -> None:
+def save(figure: Figure | FieldFigure, path: Path) -> Canvas:
     """Write a figure in the format of the file's suffix, with reproducible bytes.
+
+    Returns
+    -------
+    canvas : matplotlib's figure, as returned by `draw`
 
     Raises
     ------
@@ -46,7 +49,10 @@ def save(figure: Figure | FieldFigure, path: Path) -> None:
             f"{path}: unknown picture format {path.suffix!r}; known: {known}"
         )
     canvas = draw(figure)
-    _save(canvas, _placed(canvas), [path])
+    engine = canvas.get_layout_engine()
+    _save(canvas, _placed(canvas), path)
+    canvas.set_layout_engine(engine)  # for changes by the caller
+    return canvas
 
 
 def draw_svg(figure: Figure | FieldFigure) -> Svg:
@@ -70,19 +76,23 @@ def save_all(
     """
     canvas = draw(figure)
     box = _placed(canvas)
-    paths = [folder / f"{name}{ending}" for ending in ENDINGS]
-    return paths, _save(canvas, box, paths)
-
-
-def _save(canvas: Canvas, box: Bbox, paths: Sequence[Path]) -> Svg:
-    """Write files in the formats of their suffixes, and return the SVG."""
     svg = _svg(canvas, box)
+    paths = [folder / f"{name}{ending}" for ending in ENDINGS]
     for path in paths:
-        if path.suffix == ".svg":
-            path.write_text(svg.text, "utf-8", newline="\n")
-        else:
-            _print(canvas, box, path, metadata=_METADATA.get(path.suffix, {}))
-    return svg
+        _save(canvas, box, path, svg)
+    return paths, svg
+
+
+def _save(canvas: Canvas, box: Bbox, path: Path, svg: Svg | None = None) -> None:
+    """Write a file in the format of its suffix.
+
+    svg : content of an SVG file if already known
+    """
+    if path.suffix == ".svg":
+        text = (svg or _svg(canvas, box)).text
+        path.write_text(text, "utf-8", newline="\n")
+    else:
+        _print(canvas, box, path, metadata=_METADATA.get(path.suffix, {}))
 
 
 def _svg(canvas: Canvas, box: Bbox) -> Svg:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mortarbench import progress
 from mortarbench.cli import main as main_module
 from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
+from mortarbench.harness.environment import noise
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.names import parse
 from mortarbench.harness.processes.reaper import is_alive
@@ -270,6 +272,13 @@ def test_a_factor_that_is_not_positive_is_refused(cli, factor):
     assert f"--factor = {float(factor)}; expected a positive number" in err
 
 
+@pytest.fixture
+def brief_noise(monkeypatch):
+    """Compare times for 0.1 s instead of 2 s."""
+    monkeypatch.setattr(noise, "noise_floor", partial(noise.noise_floor, 0.1))
+
+
+@pytest.mark.usefixtures("brief_noise")
 def test_doctor_describes_the_machine(cli):
     code, out, _ = cli("doctor")
 
@@ -278,6 +287,7 @@ def test_doctor_describes_the_machine(cli):
     assert "→" not in out or "warn" in out
 
 
+@pytest.mark.usefixtures("brief_noise")
 def test_doctor_prints_the_same_as_json(cli):
     code, out, _ = cli("doctor", "--json")
     told = json.loads(out)

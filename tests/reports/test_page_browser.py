@@ -46,8 +46,12 @@ def browser():
     if CHROMIUM is None:
         pytest.fail("no chromium; make browser installs it")
     root = ["--no-sandbox"] if os.geteuid() == 0 else []
+    # otherwise the address bar of each window loads two more pages
+    bar = "--disable-features=WebUIOmniboxPopup,WebUIOmniboxAimPopup"
     with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=root)
+        chromium = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=[*root, bar]
+        )
         yield chromium
         chromium.close()
 
@@ -96,13 +100,18 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(tabs):
-    """Open a page; at the end, assert no messages and no requests except for pages."""
+    """Open a page; at the end, assert that there were no messages and, except for
+    pages, no requests.
+
+    The factory lays out all figures, which takes half of the time, unless `whole` is
+    False.
+    """
     tab, said, asked = tabs
     said.clear()
     asked.clear()
     visits = []
 
-    def open_(path, fragment="", width=1400, *, folded=False, **options):
+    def open_(path, fragment="", width=1400, *, folded=False, whole=True, **options):
         page = tab(**options)
         scripts = options.get("java_script_enabled", True)
         visits.append((page, scripts))
@@ -110,7 +119,8 @@ def visit(tabs):
         page.set_viewport_size({"width": width, "height": 900})
         page.goto((path / "report" / "index.html").as_uri() + fragment)
         if scripts:
-            page.add_style_tag(content=ALL_LAID_OUT)
+            if whole:
+                page.add_style_tag(content=ALL_LAID_OUT)
             if not folded:
                 page.evaluate("for (const one of [...document.querySelectorAll("
                               "'#tools')]) one.open = true")  # fmt: skip
@@ -167,7 +177,7 @@ WIDE_LATER = [pytest.param(1400, marks=pytest.mark.slow), 390]
 def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
     visit, folder, width, height, scheme
 ):
-    page = visit(folder, width=width, folded=True, color_scheme=scheme)
+    page = visit(folder, width=width, folded=True, color_scheme=scheme, whole=False)
     page.set_viewport_size({"width": width, "height": height})
     claim = page.locator("main .claim").first
     plot = page.locator("main .plot").first
@@ -184,7 +194,7 @@ def test_the_first_screen_shows_the_first_sentence_and_the_first_figure(
 
 @pytest.mark.parametrize("width", WIDE_LATER)
 def test_navigation_and_filters_are_folded_until_opened(visit, folder, width):
-    page = visit(folder, width=width, folded=True)
+    page = visit(folder, width=width, folded=True, whole=False)
     link = page.get_by_role("link", name="Summary", exact=True).first
     for summary, inside in (("Contents", link), ("Filter", page.locator("#words"))):
         assert inside.is_hidden()
@@ -196,7 +206,9 @@ def test_navigation_and_filters_are_folded_until_opened(visit, folder, width):
 
 @pytest.mark.parametrize("width", WIDE_LATER)
 def test_no_text_of_the_first_figure_leaves_its_drawing(visit, folder, width):
-    drawing = visit(folder, width=width).locator("#answer .panel > svg").first
+    drawing = (
+        visit(folder, width=width, whole=False).locator("#answer .panel > svg").first
+    )
     drawing.scroll_into_view_if_needed()
     edges = drawing.bounding_box()
     for text in drawing.locator("> text").all():
@@ -216,7 +228,7 @@ def test_evidence_links_work_by_keyboard(visit, folder):
 
 
 def test_on_a_phone_the_answer_is_no_wider_than_the_screen(visit, folder):
-    page = visit(folder, width=390)
+    page = visit(folder, width=390, whole=False)
     for text in page.locator("#answer dt, #answer dd p").all():
         box = text.bounding_box()
         assert box["x"] >= 0
@@ -341,7 +353,7 @@ def test_a_redrawn_hostile_table_equals_the_written_one(visit, hostile):
 def test_colours_follow_the_system_until_a_theme_is_chosen(
     visit, folder, scheme, paper
 ):
-    page = visit(folder, color_scheme=scheme)
+    page = visit(folder, color_scheme=scheme, whole=False)
 
     def red():
         colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -380,7 +392,7 @@ def test_the_tab_key_reaches_all_controls(visit, folder):
 
 
 def test_keys_toggle_solvers_sort_tables_and_walk_through_numbers(visit, folder):
-    page = visit(folder)
+    page = visit(folder, whole=False)
     solver = page.locator("#solvers button").first
     for key, pressed in (("Enter", "false"), ("Space", "true")):
         solver.press(key)
@@ -438,20 +450,20 @@ def test_a_number_links_to_its_journal_line(visit, folder, records):
 
 
 def test_every_run_link_has_a_target(visit, folder, records):
-    page = visit(folder)
+    page = visit(folder, whole=False)
     links = page.evaluate(
         "[...document.querySelectorAll('a[href^=\"#run-\"]')].map((a) => a.hash)"
     )
     assert len(links) > 500
     assert set(links) <= {f"#run-{r.run_id}" for r in records}
-    one = visit(folder, fragment=f"#run-{records[7].run_id}")
+    one = visit(folder, fragment=f"#run-{records[7].run_id}", whole=False)
     assert f"Run {records[7].run_id}" in opened(one).inner_text()
 
 
 def test_a_plot_zooms_changes_its_axes_and_names_the_point_under_the_pointer(
     visit, folder, records
 ):
-    page = visit(folder)
+    page = visit(folder, whole=False)
     plot = page.locator("#times .panel")
     drawing = plot.locator("svg").first
     drawing.scroll_into_view_if_needed()
@@ -529,13 +541,13 @@ def test_names_beside_a_plot_are_not_clipped(visit, compared, width):
 )  # fmt: skip
 def test_the_ticks_of_an_axis_have_one_format(visit, folder, view, texts):
     axis = {"view": view, "log": True}
-    found = visit(folder).evaluate("axis => labelled(axis, 8)", axis)
+    found = visit(folder, whole=False).evaluate("axis => labelled(axis, 8)", axis)
 
     assert [text for _, text in found] == texts
 
 
 def test_dragging_over_a_plot_zooms_into_the_rectangle(visit, folder):
-    page = visit(folder)
+    page = visit(folder, whole=False)
     drawing = page.locator("#times .panel svg").first
     drawing.scroll_into_view_if_needed()
     box = drawing.bounding_box()

@@ -131,8 +131,8 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
 @pytest.mark.parametrize(
     "spread",
     [
-        1.0, 1.02, 1e6,
-        *(pytest.param(s, marks=pytest.mark.slow) for s in (1 + 1e-9, 1.5, 4.0)),
+        1.0, 1e6,
+        *(pytest.param(s, marks=pytest.mark.slow) for s in (1 + 1e-9, 1.02, 1.5, 4.0)),
     ],
 )  # fmt: skip
 def test_guide_lines_do_not_squeeze_nearly_equal_times(spread):

@@ -419,6 +419,24 @@ def test_a_figure_is_laid_out_only_once(tmp_path, monkeypatch):
     assert len(drawings) == len(ENDINGS)
 
 
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_one_file_is_drawn_once_and_its_figure_can_be_laid_out_again(
+    tmp_path, monkeypatch, ending
+):
+    drawings = []
+    draw_ = Canvas.draw
+    monkeypatch.setattr(Canvas, "draw", lambda *a: (drawings.append(1), draw_(*a)))
+    figure = save(a_line(), tmp_path / f"a{ending}")
+    assert len(drawings) == 1
+
+    def margins(figure):
+        figure.set_size_inches(2, 2)
+        figure.draw_without_rendering()
+        return figure.axes[0].get_position().bounds
+
+    assert margins(figure) == pytest.approx(margins(draw(a_line())), abs=0.005)
+
+
 def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure(
     tmp_path,
 ):

@@ -416,6 +416,7 @@ def test_many_failures_are_counted_not_listed(record, opened):
 # ---- rendering
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_the_answer_is_first_in_every_format_and_its_evidence_is_linked(
     record, evidence, tmp_path
 ):
@@ -456,6 +457,7 @@ def test_plain_sentences_equal_the_sentences_of_the_report(record, tmp_path):
         answer(tmp_path / "empty")
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_names_cannot_break_out_of_the_answer(record, evidence):
     names = ("<b>x</b>", r"\input{a}$", "| a |\n## b", "\u202eleft", "", "n" * 5000)
     records = [
