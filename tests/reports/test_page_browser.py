@@ -100,8 +100,7 @@ def tabs(browser):
 
 @pytest.fixture
 def visit(tabs):
-    """Open a page; at the end, assert that there were no messages and, except for
-    pages, no requests.
+    """Open a page; at the end, assert no messages and no requests except for pages.
 
     The factory lays out all figures, which takes half of the time, unless `whole` is
     False.
