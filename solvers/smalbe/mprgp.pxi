@@ -14,6 +14,14 @@ cdef double NOISE = 1e-13
 # these directions. Without this limit,
 # `test_rounding_along_previous_directions_is_removed` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
+# CG with a structural preconditioner M is *spent* on a face if φᵀz has fallen to the
+# square of the rounding unit, relative to its largest value, or if φᵀz exceeds its
+# smallest value by the factor MAX_GROWTH. In exact arithmetic, φᵀz grows by no more than
+# the condition number of MF, so such directions are rounding errors. With a
+# semidefinite F, as in hybrid FETI and with redundant rows, they approach the kernel of
+# F, and x grows without limit (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
+cdef double MIN_DECREASE = 2.0 ** -104
+cdef double MAX_GROWTH = 1e6
 
 cdef enum:
     # Largest number of CG directions stored for a face. Two passes over 200 directions
@@ -286,6 +294,10 @@ cdef class MPRGP:
     cdef double z_Hp
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
+    cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` of this run
+    # smallest and largest φᵀz on this face, see `is_spent`
+    cdef double least_slope
+    cdef double most_slope
     cdef Model B  # model of H; ᾱ = 1/τ is the length of gradient projection steps
     # model inverted on the face; None without preconditioning
     cdef Model preconditioner
@@ -332,8 +344,8 @@ cdef class MPRGP:
     cdef bint minimise(self, long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; return True if `stops` ended the run.
 
-        The run returns False after `most` steps, if no step is possible, or if it
-        *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
+        The run returns False after `most` steps, if no step is possible, if CG is spent
+        and the gradient cannot be improved (`refresh`), or if the run *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
         cost decreased by no more than the rounding of its terms. The first check is
         made after `FIRST_CHECK` steps, and each further check after twice as many
         steps.
@@ -360,6 +372,7 @@ cdef class MPRGP:
         self.split()
         self.minimise_along_directions()
         began, self.phi_square_at_drift = self.parts.phi_square, INFINITY
+        self.phi_square_at_refresh = INFINITY
         self.layers = 0
         self.first_direction()
         self.expected_slope = self.directions.conjugate(self.phi, self.p)
@@ -405,6 +418,11 @@ cdef class MPRGP:
                 if isinf(fmin(self.line.cg, self.line.feasible)):
                     return 0
                 if self.line.cg <= self.line.feasible:
+                    if self.M is not None and self.is_spent():
+                        if not self.refresh():
+                            return 0
+                        inside = 0
+                        continue
                     # 5. Conjugate gradient step, and the next direction.
                     gamma = self.minimise_along_p()
                     self.record_step(b"c", trace, note)
@@ -442,6 +460,31 @@ cdef class MPRGP:
         """Return True if x is accurate enough."""
         raise NotImplementedError
 
+    cdef bint is_spent(self) noexcept:
+        """Return True if the CG direction of `line` consists of rounding errors."""
+        cdef double slope = fabs(self.line.slope)  # φᵀz, apart from rounding
+        self.least_slope = fmin(self.least_slope, slope)
+        self.most_slope = fmax(self.most_slope, slope)
+        return (
+            slope > MAX_GROWTH * self.least_slope
+            or slope <= MIN_DECREASE * self.most_slope
+        )
+
+    cdef int refresh(self) except -1:
+        """Recompute the gradient from x and restart CG; takes one product.
+
+        Updates of the gradient retain rounding errors of its first, large values. The
+        function returns 0 if ‖φ‖ has not been halved since the last call.
+        """
+        if 4 * self.parts.phi_square > self.phi_square_at_refresh:
+            return 0
+        self.phi_square_at_refresh = self.parts.phi_square
+        self.gradient(self.x, self.g)
+        self.split()
+        self.directions.begin(self.free)
+        self.first_direction()
+        return 1
+
     cdef int record_step(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
         if note is not None:
@@ -478,6 +521,7 @@ cdef class MPRGP:
 
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
+        self.least_slope, self.most_slope = INFINITY, 0.0
         if self.in_two:
             # φ is added later, in the pass that computes the product
             memset(self.p, 0, self.n * sizeof(double))

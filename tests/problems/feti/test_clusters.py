@@ -322,3 +322,41 @@ def test_more_ranks_than_clusters_are_refused():
 def test_clusters_that_are_not_built_are_refused_by_name(name, message):
     with pytest.raises(InputError, match=message):
         built(name)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "contact-patch/lower=6/upper=7/slave=lower/ratio=0.01/feti=1/cluster=2",
+        "plate/dim=3/Sx=3/Sy=2/Sz=2/n=1/pattern=checkerboard/jump=100/cluster=2",
+        "hertz-sphere/n=2/feti=1/glue=redundant",
+        pytest.param(
+            "contact-patch/lower=12/upper=14/ratio=0.001/feti=2/cluster=2",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "contact-patch/lower=24/upper=28/ratio=0.001/feti=4/cluster=2",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "contact-patch/dim=3/lower=4/upper=4/ratio=0.001/feti=2/cluster=2",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "plate/dim=3/Sx=3/Sy=2/Sz=2/n=1/pattern=checkerboard/jump=1000/cluster=4",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_semidefinite_dual_ends_at_its_rounding_errors(case):
+    """Directions in the kernel of F do not enlarge the multipliers.
+
+    Without the rule for spent directions, these cases take 1000 products, and their
+    dual residuals are between 1e-6 and 1.7.
+    """
+    qp = mb.build(f"{case}/dual").qp
+    s = SMALBE().prepare(qp, 1e-8)()
+
+    assert (s.status, s.message) == (Status.SOLVED, "converged")
+    assert mb.verify(qp, s.x, s.y, s.z, s.z_box, tol=1e-8).residuals.worst <= 5e-8
+    assert s.counts["P_products"] < 150
