@@ -1,9 +1,9 @@
 """Program that runs several modules of this folder on the same MPI ranks.
 
-Run as ``mpiexec -n N python -m mpi4py programs_on_ranks.py PROGRAMS``, where PROGRAMS is
-a JSON list of [module, argument, …]. The program prints a JSON list of the results that
-``module.results(ranks, argument, …)`` returns on rank 0. Libraries are thus imported
-once for all modules.
+Run as ``mpiexec -n N python -m mpi4py programs_on_ranks.py PROGRAMS``, where PROGRAMS
+is a JSON list of [module, argument, …]. The program prints a JSON list of the results
+that ``module.results(ranks, argument, …)`` returns on rank 0. Libraries are thus
+imported once for all modules.
 """
 
 import json

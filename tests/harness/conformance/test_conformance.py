@@ -56,6 +56,7 @@ from tests.support.faulty_solvers import (
     Wanders,
 )
 
+pytestmark = pytest.mark.together  # all tests use the imported libraries
 #: backends that represent the wildcard entries of the registry; other backends are slow
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),

@@ -126,7 +126,9 @@ def disturbed(case, s, size):
     return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)
 
 
-@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+@pytest.mark.parametrize(
+    "form", ["primal", pytest.param("dual", marks=pytest.mark.slow), "dual-bounds"]
+)
 def test_a_planted_error_is_measured_and_only_its_solver_is_named(
     form, truths, tmp_path, cli
 ):
