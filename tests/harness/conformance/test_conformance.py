@@ -85,8 +85,8 @@ SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
-#: solvers that by default solve all equivalent formulations: our own and two libraries
-REWRITTEN = {"smalbe", "pdas", "feti", "bvls", "clarabel", "quadprog"}
+#: solvers that by default solve all equivalent formulations: our own and a library
+REWRITTEN = {"smalbe", "pdas", "feti", "clarabel"}
 #: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
