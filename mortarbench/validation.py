@@ -117,7 +117,9 @@ def validate(
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
-    pages = registries.validation_page(path, data, ())
+    pages: Sequence[Path] = ()
+    if budget:  # solves on finer meshes are slow, so the page is also written before
+        pages = registries.validation_page(path, data, ())
     records = {r.case: r for r in read_journal(path, progress)}
     cases = []
     for r in records.values():
@@ -129,7 +131,7 @@ def validate(
                 if r.energy_bound is not None or _refines(case):
                     cases.append(case)
     meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
-    if meshes:  # the page was first written before these slow solves
+    if meshes or not budget:
         pages = registries.validation_page(path, data, meshes)
     return Validation(
         agreed=result.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)

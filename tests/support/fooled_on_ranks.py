@@ -1,23 +1,17 @@
-"""Search for answers whose error exceeds the bound that ranks prove; print JSON.
+"""Search for answers whose error exceeds the bound that ranks prove.
 
-Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. Errors are
-relative to the reference point of the undivided problem, which the first rank builds.
-Every second trial disturbs the answer with the largest ratio of error to bound so far.
-
-The program also prints the reasons for which ranks and one process refuse loads without
-equilibrium.
+Errors are relative to the reference point of the undivided problem, which the first
+rank builds. Every second trial disturbs the answer with the largest ratio of error to
+bound so far. The search also returns the reasons for which ranks and one process refuse
+loads without equilibrium. See programs_on_ranks.py.
 """
 
-import json
-import sys
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 
 from mortarbench.harness import Solution, Status, certify
-from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.mechanics import Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.admissible import UncertifiableError
@@ -177,7 +171,7 @@ def problem_of(problem, ranks):
 
 
 def refused(ranks, sign, **keys):
-    """Return the reasons for which ranks and one process refuse a load."""
+    """Return the reasons for which ranks and, on rank 0, one process refuse a load."""
     problem = disc_in_parts(**keys)
     own = problem_of(replace(problem, load=lambda at: sign * problem.load(at)), ranks)
     m = disc_between_plates(**keys).mechanics
@@ -189,7 +183,7 @@ def refused(ranks, sign, **keys):
     nothing = np.zeros(own.components.size)
     return (
         why(lambda: certify_over_ranks(own, nothing, zero.z)),
-        why(lambda: certify(m, zero)),
+        why(lambda: certify(m, zero)) if ranks.rank == 0 else None,
     )
 
 
@@ -201,15 +195,9 @@ def why(certificate):
         return str(e)
 
 
-def main():
-    ranks, count = Ranks(MPI.COMM_WORLD), int(sys.argv[1])
-    found = {
-        "searches": {n: BoundSearch(n, ranks).result(count) for n in sys.argv[2:]},
+def results(ranks, count, *names):
+    """Search in problems; return faults and refusals."""
+    return {
+        "searches": {n: BoundSearch(n, ranks).result(count) for n in names},
         "refusals": [refused(ranks, 1, push=0.1), refused(ranks, -1)],
     }
-    if ranks.rank == 0:
-        print(json.dumps(found))
-
-
-if __name__ == "__main__":
-    main()

@@ -56,6 +56,7 @@ from tests.support.faulty_solvers import (
     Wanders,
 )
 
+pytestmark = pytest.mark.together  # all tests use the imported libraries
 #: backends that represent the wildcard entries of the registry; other backends are slow
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
@@ -85,7 +86,7 @@ CONCRETE = NATIVE | configured(BACKENDS)
 #: checks of conformance, without equivalent formulations, which have a separate test
 STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: solvers for which the default tests include all equivalent formulations
-REWRITTEN = {"smalbe", "pdas", "feti", "bvls", "clarabel", "quadprog"}
+REWRITTEN = {"smalbe", "pdas", "feti", "clarabel"}
 #: solver that accepts only equations, and therefore declines these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"

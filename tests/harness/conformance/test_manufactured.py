@@ -95,9 +95,17 @@ class Stops(Projections):
 
 
 OVER_SETS = [check for check in CHECKS if check.startswith(SETS_PREFIX)]
+#: checks of two kinds of constraints at once
+OF_BOTH = [check for check in OVER_SETS if " and " in check]
 
 
-@pytest.mark.parametrize("check", OVER_SETS)
+@pytest.mark.parametrize(
+    "check",
+    [
+        pytest.param(c, marks=[pytest.mark.slow] * (c in OF_BOTH[:-1]))
+        for c in OVER_SETS
+    ],
+)
 def test_checks_over_sets_pass_the_reference_and_catch_faults(check):
     grade, message, _ = run_check(check, Projections())
     assert grade is Grade.PASS, message

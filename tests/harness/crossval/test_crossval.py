@@ -91,8 +91,8 @@ def write_text_alone(directory, data, meshes=()):
     return [write_text(path, markdown(compose(data, meshes)))]
 
 
-def verdict_on(cli, folder, *more):
-    code, out, _ = cli(folder, "--json", *more)
+def verdict_on(cli, folder, *more, budget=0):
+    code, out, _ = cli(folder, "--json", "--budget", budget, *more)
     return code, json.loads(out)
 
 
@@ -126,7 +126,9 @@ def disturbed(case, s, size):
     return replace(s, x=s.x + size * point.norm / np.sqrt(v @ (case.qp.P @ v)) * v)
 
 
-@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+@pytest.mark.parametrize(
+    "form", ["primal", pytest.param("dual", marks=pytest.mark.slow), "dual-bounds"]
+)
 def test_a_planted_error_is_measured_and_only_its_solver_is_named(
     form, truths, tmp_path, cli
 ):
@@ -641,7 +643,7 @@ def test_a_file_at_the_path_of_the_page_is_reported_with_the_remedy(
 ):
     folder = write(tmp_path, [("a", f"{BEAM}/primal", truths[2, "primal"][1])])
     (folder / "report").touch()
-    code, _, err = cli(folder, validation_page=write_validation)
+    code, _, err = cli(folder, "--budget", 0, validation_page=write_validation)
 
     assert code == 2
     assert err.splitlines()[-1] == (
@@ -659,7 +661,9 @@ def test_hostile_names_and_huge_numbers_do_not_break_page_or_terminal(
     answers = [("a", f"{BEAM}/primal", s), (name, f"{BEAM}/primal", huge)]
 
     with svg_only():
-        code, out, _ = cli(write(tmp_path, answers), validation_page=write_validation)
+        code, out, _ = cli(
+            write(tmp_path, answers), "--budget", 0, validation_page=write_validation
+        )
 
     def refuse(constant):
         raise AssertionError(constant)
@@ -693,7 +697,7 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
     text = "obstacle/dim=1/n=12/primal"
     case = built(text)
     folder = write(tmp_path / "out", [("exact", text, reference_solution(case.qp))])
-    _, verdict = verdict_on(cli, folder)
+    _, verdict = verdict_on(cli, folder, budget=300)
     (found,) = read_discretisation(folder).values()
     (level, *_) = found.levels
 
@@ -704,7 +708,7 @@ def test_validate_leaves_the_discretisation_errors_for_the_report(cli, tmp_path)
     page = (folder / "report" / "validation.md").read_text()
     assert "Errors of the meshes" in page
     assert "obstacle/dim=1/n=12" in page.partition("Errors of the meshes")[2]
-    again = verdict_on(cli, folder, "--budget", "0")[1]["discretisation"]
+    again = verdict_on(cli, folder)[1]["discretisation"]
     assert again[0]["error"] == found.error
 
 
@@ -749,6 +753,6 @@ def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
         )
         journal.append(old.replace(verdict=Verdict.FAILED))
 
-    assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
-        "obstacle/dim=1/n=12"
-    ]
+    assert [
+        d["case"] for d in verdict_on(cli, folder, budget=300)[1]["discretisation"]
+    ] == ["obstacle/dim=1/n=12"]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from itertools import product
 
 import numpy as np
 import pyarrow as pa
@@ -386,8 +387,13 @@ TWO = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
-@pytest.mark.parametrize("dense", [True, False])
+@pytest.mark.parametrize(
+    ("suffix", "dense"),
+    [
+        *product(["npz", "mat"], [True, False]), ("parquet", False),
+        pytest.param("parquet", True, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_a_p_that_is_not_symmetric_is_refused_in_every_format(tmp_path, suffix, dense):
     """P[0, 1] and P[1, 0] differ by a half, as in the expected message."""
     path = tmp_path / f"a.{suffix}"

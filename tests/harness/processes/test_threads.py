@@ -255,7 +255,8 @@ def env(tmp_path):
 @pytest.mark.parametrize(
     ("number", "code"),
     [
-        (signal.SIGTERM, 143),
+        # `test_a_terminated_export_says_so_and_leaves_no_file` sends SIGTERM
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         (signal.SIGINT, 130),
     ],

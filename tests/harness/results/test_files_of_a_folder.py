@@ -259,8 +259,11 @@ def folder_copy(folder_of_run, tmp_path):
 @pytest.mark.parametrize(
     "part",
     [
-        "vectors", "journal", ".scratch",
-        *(pytest.param(part, marks=pytest.mark.slow) for part in ("report", "cases")),
+        "vectors",
+        *(
+            pytest.param(part, marks=pytest.mark.slow)
+            for part in ("journal", ".scratch", "report", "cases")
+        ),
     ],
 )  # fmt: skip
 def test_folders_nested_without_end_are_refused_in_one_line(folder_copy, part, capsys):

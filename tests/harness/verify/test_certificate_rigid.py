@@ -71,6 +71,8 @@ QUICK = (
     RATIOS[0], RATIOS[-1], "obstacle/n=8", "beam-ring/Nr=2/Nh=2/step=5",
     "disc under rollers", "tilted mortar disc", "soft disc",
 )  # fmt: skip
+#: cases whose disturbed answers are certified by default
+ATTACKED = (RATIOS[0], "obstacle/n=8", "disc under rollers", "soft disc")
 
 
 def marked(*quick: str) -> list[Any]:
@@ -179,7 +181,7 @@ def errors_of(
     return [mechanics.norm(v - u) for v in points]
 
 
-@pytest.mark.parametrize("name", marked(*QUICK))
+@pytest.mark.parametrize("name", marked(*ATTACKED))
 def test_no_answer_is_further_from_the_solution_than_its_bound(name):
     told, _ = attack(name, 7)
     assert told == []
@@ -368,7 +370,7 @@ def test_balance_is_required_only_up_to_rounding():
 @pytest.mark.parametrize(
     ("name", "count"),
     [
-        ("stiff disc", 8),
+        ("stiff disc", 3),
         pytest.param("stiff disc", 40, marks=pytest.mark.slow),
         pytest.param("disc under rollers", 40, marks=pytest.mark.slow),
     ],

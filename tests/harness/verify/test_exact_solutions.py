@@ -140,7 +140,13 @@ def solved(name: str, labels=tuple(SOLVERS)):
                 yield f"{label} to {tol}", s
 
 
-@pytest.mark.parametrize("name", [STIFF_AND_SOFT[3], RUBBING[3], PLATES[0]])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(STIFF_AND_SOFT[3], marks=pytest.mark.slow),
+        RUBBING[3], PLATES[0],
+    ],
+)  # fmt: skip
 def test_no_error_exceeds_its_bound(name):
     found = certified(name, disturbances(name, 24))
 

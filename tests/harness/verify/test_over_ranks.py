@@ -40,8 +40,8 @@ MINDLIN = "hertz-cylinder/n=1/m=1/feti=9/friction=coulomb/mu=0.3/Q=0.5/dual"
 ROUNDING = 1e-4
 
 
-#: cases that take several seconds on two ranks
-LONG = (*HELD[3:], REDUNDANT, HERTZ, MINDLIN)
+#: cases that take several seconds on two ranks, or resemble a quick one
+LONG = (HELD[0], *HELD[3:], HELD_BY_CONTACT, REDUNDANT, HERTZ, MINDLIN)
 QUICK = tuple(
     case
     for case in (*HELD, HELD_BY_CONTACT, ELIMINATED, REDUNDANT, PATCH)
@@ -56,18 +56,35 @@ def marked(*cases):
     ]
 
 
+SHORT = (5, 2, ("membranes/S=3/n=2/dual", "disc under rollers"))
+#: modules that the default tests run on the same two ranks
+BY_DEFAULT = (("evaluated_on_ranks", *QUICK), ("fooled_on_ranks", SHORT[0], *SHORT[2]))
+
+
+def result(ranks, *program):
+    """Return the result of a module of `tests.support` on several ranks."""
+    same = ranks == 2 and program in BY_DEFAULT
+    programs = BY_DEFAULT if same else (program,)
+    return results(ranks, programs)[programs.index(program)]
+
+
 @cache
-def evaluated(ranks, cases):
-    """Return evaluations of the same answers on several ranks and in one process."""
+def results(ranks, programs):
+    """Run programs on the same ranks; return their results."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "evaluated_on_ranks.py"), *cases,
+            str(SUPPORT / "programs_on_ranks.py"), json.dumps(programs),
         ],
         cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+def evaluated(ranks, cases):
+    """Return evaluations of the same answers on several ranks and in one process."""
+    return result(ranks, "evaluated_on_ranks", *cases)
 
 
 @pytest.fixture(params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
@@ -197,7 +214,6 @@ def test_digests_depend_on_the_qp_and_not_on_the_number_of_ranks(ranks):
     assert all(digest.startswith(DISTRIBUTED_DIGEST) for digest, _ in digests)
 
 
-SHORT = (8, 2, ("membranes/S=3/n=2/dual", "disc under rollers"))
 SEARCHED = (
     HELD[0], "membranes/S=3/n=2/dual", "contact-patch/ratio=0.1/feti=3/dual",
     "contact-patch/ratio=0.1/friction=coulomb/mu=0.2/feti=3/dual", MINDLIN, SPACE,
@@ -205,18 +221,9 @@ SEARCHED = (
 )  # fmt: skip
 
 
-@cache
 def searched(count, ranks, names):
     """Return faults that a search on several ranks finds, and reasons of refusals."""
-    done = subprocess.run(
-        [
-            mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
-            str(SUPPORT / "fooled_on_ranks.py"), str(count), *names,
-        ],
-        cwd=ROOT, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": "."},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return result(ranks, "fooled_on_ranks", count, *names)
 
 
 @pytest.mark.parametrize(
