@@ -222,8 +222,8 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which obtain the same bound.
 
-    The pairs of `harness.verify.certificate.certify` are tried, except the pair that
-    results from an exchange of closed rows.
+    The pairs of `harness.verify.certificate.certify` are tried, the second before the
+    first, except the pair that results from an exchange of closed rows.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def certify_over_ranks(
     Raises
     ------
     UncertifiableError
-        If the answer contains NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or if no pair proves a bound.
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:
@@ -320,7 +320,10 @@ def _admissible_pair(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows at the components `at`, and 1/Kᵢᵢ (w,), 0 at fixed components."""
+    """Return the data of the rows, restricted to the components `at` (w,), and 1/Kᵢᵢ.
+
+    1/Kᵢᵢ (w,) is replaced by 0 at fixed components; `f` of the data is empty.
+    """
     contact = local.contact
     B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
