@@ -30,7 +30,7 @@ _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _FILE = re.compile(
     r"[^=:]*\.[A-Za-z]\w*(/|$)"
-)  #: pattern of a path that ends in a suffix
+)  #: pattern of a text that begins with the path of a file with a suffix
 _INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bits
 _TYPE_NAMES = {
     int: "an integer, such as 4",
@@ -128,7 +128,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
 
 
 def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
-    """Return the case name for a bare path, or None if the text is not a path."""
+    """Return the case name for a bare path; None if no family reads such a path."""
     if not _FILE.match(text) and not (text and os.path.isfile(text)):
         return None
     takers = [

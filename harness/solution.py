@@ -158,7 +158,8 @@ def checked_history(history: object) -> History:
     ------
     ValueError
         If `history` is not a mapping from identifiers to columns of equal length, if a
-        column has another type, or if the size exceeds MAX_HISTORY_BYTES.
+        column contains neither numbers nor texts of at most 16 characters, or if the
+        size exceeds MAX_HISTORY_BYTES.
 
     """
     if not isinstance(history, Mapping):
