@@ -35,7 +35,7 @@ _INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bit
 _TYPE_NAMES = {
     int: "an integer, such as 4",
     float: "a finite number, such as 0.5",
-    str: "text",
+    str: "nonempty text without control characters",
 }
 
 
@@ -275,7 +275,7 @@ def _number(text: str, kind: type) -> object:
 
 
 def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
-    """Check the type of a value, and return it; an integer may become a float.
+    """Check a value, and return it; an integer may become a float.
 
     kind : type of the default of the key
     free : True to allow the characters / and =, which are separators in a name
@@ -290,4 +290,9 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
             return value
         case int() | float() if kind is float and abs(value) <= sys.float_info.max:
             return float(value) + 0.0  # −0.0 becomes 0.0: equal values need equal names
-    raise InputError(f"{where}={shown(value)}; expected {_TYPE_NAMES[kind]}")
+    expected = _TYPE_NAMES[kind]
+    if kind is str and not free:
+        expected += ", / and ="
+    elif kind is int and type(value) is int:
+        expected = "an integer of at most 64 bits"
+    raise InputError(f"{where}={shown(value)}; expected {expected}")

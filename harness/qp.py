@@ -38,7 +38,7 @@ _STRIP_ROWS = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """The matrices K and B in the matrix P = B K⁺ Bᵀ of a dual QP, in its units."""
+    """The matrices K and B of a dual QP with P = B K⁺ Bᵀ, in the units of the QP."""
 
     K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
     B: Matrix  #: (n, N) sparse constraint rows

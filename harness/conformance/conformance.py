@@ -355,7 +355,7 @@ def _near(
     error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
     if not error <= tol:
         raise ContractError(
-            f"{name} differs from the known value by {error:.1e}; expected at most "
+            f"{name} differs from the expected value by {error:.1e}; expected at most "
             f"{tol:.1e}"
         )
 

@@ -178,7 +178,7 @@ def feasible_at_rows(
     ----------
     exact : contact and friction rows; B has a column for each of the w components that
         occur in rows
-    R : (w, p) rigid motions that change gaps; they cost no energy
+    R : (w, p) rigid motions that change gaps or slip; they cost no energy
     softness : (w,) 1/Kᵢᵢ, zero at prescribed components
     u : (w,) displacement of these components
     closed : (m,) mask of the rows to satisfy with equality
@@ -231,11 +231,11 @@ def closing(
         F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
     The arguments of the solver are the violations t (v,) and the loads e (p,) along the
-    motions R that change gaps. α is zero along motions that do not change the gaps of
-    the rows V. F_VV may be singular, since K⁺ is zero on fixed components. It is
-    therefore replaced by F_VV + ρUUᵀ, where U spans the range of G_V. Rows are scaled
-    to similar compliance, since the stiffnesses of bodies may differ by orders of
-    magnitude.
+    motions R that change gaps or slip. α is zero along motions that do not change the
+    rows V. F_VV may be singular along the range of G_V, since K⁺ may be zero at
+    components that prevent rigid motions in its factorisation. F_VV is therefore
+    replaced by F_VV + ρUUᵀ, where U spans the range of G_V. Rows are scaled to similar
+    compliance, since the stiffnesses of bodies may differ by orders of magnitude.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
@@ -319,7 +319,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if any motion that leaves all gaps unchanged has a load along it.
+    """Return True if a load acts along any motion that changes neither gaps nor slip.
 
     A load that does not exceed its rounding counts as zero.
 
@@ -373,7 +373,8 @@ def supported_and_floating(
 class Balance(NamedTuple):
     """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
+    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps or
+    slip.
     """
 
     G: Extended  #: (m, p)  BR

@@ -585,8 +585,9 @@ def _reach(
     0 yields a bound if its left-hand side equals ±γₖ. A combination with a small bound
     is sought for the squared error `square`, with the compliance of row i approximated
     by Bᵢdiag(K)⁻¹Bᵢᵀ; the dual norm ‖Σ±yᵢBᵢ‖ of the result is then evaluated. Motions
-    that λ̂ does not support and motions that do not change gaps are disregarded,
-    because the rounding of K along these motions is not part of the problem.
+    that λ̂ does not support, and motions that change neither gaps nor slip, are
+    disregarded, because the rounding of K along these motions is not part of the
+    problem.
     """
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))

@@ -79,8 +79,8 @@ class Contact:
 class FloatingBodies:
     """Rigid motions of bodies that supports do not fix, at the components of a rank.
 
-    Columns are orthonormal to double precision in the inner product over the components
-    of all ranks.
+    The columns of `motions` and of `combinations` are orthonormal to double precision,
+    the former in the inner product over the components of all ranks.
     """
 
     motions: csr_array  #: (n, k) rigid motions, ordered by body, regardless of supports
@@ -356,8 +356,8 @@ class _RigidMotions:
     components of all ranks. Products of K_T with these motions are exactly zero.
     """
 
-    #: (n, r) sparse, at local components. The first p motions change gaps
-    #: ("constrained"); the other ("free") motions change gaps only by rounding
+    #: (n, r) sparse, at local components. The first p ("constrained") motions change
+    #: gaps or slip; the other ("free") motions change them only by rounding
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in subdomain motions
@@ -384,7 +384,7 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions into motions that change gaps and free motions.
+    """Split the rigid motions into motions that change gaps or slip, and free motions.
 
     at : (w,) global components in the rows
     """

@@ -78,7 +78,7 @@ class Split(Protocol):
 
     Vectors (n,) of components have extended precision and are zero on fixed components;
     vectors (N,) contain the copies of components in all subdomains. Columns of R are
-    the rigid motions that the supports allow; the first p columns change contact gaps.
+    the rigid motions that the supports allow; the first p columns change gaps or slip.
     """
 
     def along(self, v: Extended) -> Extended:
@@ -112,7 +112,7 @@ class Split(Protocol):
         """Sum each number over all processes."""
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along combinations `supported` (p, h) of motions that change gaps."""
+        """Bound E along combinations `supported` (p, h) of the first p columns of R."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.

@@ -212,7 +212,8 @@ def evaluated_by_ranks(
     require the whole QP; `bounds`: fields of `certified`, or None if they require the
     whole QP; `quantities`: physical quantities, or None if they require the whole QP;
     `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
-    After a failure, the values concerned are None or empty
+    After a failure, the values concerned are None or empty. If `values` is None, all
+    values are None
 
     """
     found: dict[str, Any] = {
