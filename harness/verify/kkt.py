@@ -540,7 +540,7 @@ def scales_at(qp: QP, x: Vector, E: float) -> Scales:
     is the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ, since |xⱼ| may be
     arbitrarily large along a direction without cost. The size of a variable with
     neither curvature nor cost follows from its active rows; without such rows, it is
-    |xⱼ|. If P has no diagonal, Xⱼ is at most ‖x‖∞.
+    |xⱼ|. If P has no diagonal, Xⱼ of a variable with cost is at most ‖x‖∞.
     """
     d, has_diagonal = _curvature(qp)
     return _scales(qp, x, E, d, has_diagonal=has_diagonal)

@@ -35,7 +35,7 @@ FORMULA largest(double a, double b)
     return (a < b) | (b != b) ? b : a;
 }
 
-/* The scale of energy of a point: the largest term t of |xᵀPx|, |qᵀx| and
+/* The scale of energy of a point: t, the largest of |xᵀPx|, |qᵀx| and
    |bᵀy + hᵀz + σ(z_box)|, but at most the larger of MAX_CANCELLATION·|½xᵀPx + qᵀx| and
    t/MAX_CANCELLATION. */
 FORMULA energy_scale(double quadratic, double linear, double work)
