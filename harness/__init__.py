@@ -1,6 +1,6 @@
 """Interfaces between problems, solvers and reports; measurement and verification.
 
-Each exported name is imported at its first access. Commands that only list cases and
+Each exported name is imported on first access. Commands that only list cases and
 solvers therefore do not load NumPy and SciPy. `__init__.pyi` lists the exported names.
 """
 

@@ -43,7 +43,8 @@ def case_limit_mib() -> float:
         limit = 0.0
     if not limit > 0:
         raise InputError(
-            f"{CASE_VARIABLE} = {shown(text)}; expected a number of MiB, such as 65536"
+            f"{CASE_VARIABLE} = {shown(text)}; expected a positive number of MiB, such "
+            "as 65536"
         )
     return limit
 

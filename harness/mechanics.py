@@ -36,8 +36,9 @@ from mortarbench.harness.solution import Solution
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
 #: Largest change of the gaps by a rigid motion, and largest work of the loads along a
-#: rigid motion, that count as rounding (of coordinates, normals and tractions). Each
-#: value is relative to the sum of the absolute values of its terms.
+#: rigid motion, that count as rounding (of coordinates, normals and tractions). The
+#: work is relative to the sum of the absolute values of its terms, and the change of
+#: the gaps to the largest such sum (`constrained_first`).
 MOTION_ROUNDING = 1e-10
 
 
@@ -723,8 +724,8 @@ def constrained_first(
 ) -> tuple[NDArray[np.float64], int]:
     """Return an orthogonal V (r, r) and the number p of nonzero columns of BRV.
 
-    The nonzero columns come first. Each row of B is divided by its length. A column of
-    the product counts as zero if its length is at most `MOTION_ROUNDING` times the
+    The nonzero columns come first. Each row of B is first divided by its length. A
+    column of BRV counts as zero if its length is at most `MOTION_ROUNDING` times the
     largest entry of |B||R|.
 
     B : (m, n) rows of contact and friction

@@ -30,12 +30,12 @@ _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _FILE = re.compile(
     r"[^=:]*\.[A-Za-z]\w*(/|$)"
-)  #: pattern of a path that ends in a suffix
+)  #: pattern of a text that begins with the path of a file with a suffix
 _INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bits
 _TYPE_NAMES = {
     int: "an integer, such as 4",
     float: "a finite number, such as 0.5",
-    str: "text",
+    str: "nonempty text without control characters",
 }
 
 
@@ -128,7 +128,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
 
 
 def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
-    """Return the case name for a bare path, or None if the text is not a path."""
+    """Return the case name for a bare path; None if no family reads such a path."""
     if not _FILE.match(text) and not (text and os.path.isfile(text)):
         return None
     takers = [
@@ -275,7 +275,7 @@ def _number(text: str, kind: type) -> object:
 
 
 def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
-    """Check the type of a value, and return it; an integer may become a float.
+    """Check a value, and return it; an integer may become a float.
 
     kind : type of the default of the key
     free : True to allow the characters / and =, which are separators in a name
@@ -290,4 +290,9 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
             return value
         case int() | float() if kind is float and abs(value) <= sys.float_info.max:
             return float(value) + 0.0  # −0.0 becomes 0.0: equal values need equal names
-    raise InputError(f"{where}={shown(value)}; expected {_TYPE_NAMES[kind]}")
+    expected = _TYPE_NAMES[kind]
+    if kind is str and not free:
+        expected += ", / and ="
+    elif kind is int and type(value) is int:
+        expected = "an integer of at most 64 bits"
+    raise InputError(f"{where}={shown(value)}; expected {expected}")

@@ -60,7 +60,7 @@ class WithDiagonal(Protocol):
     """A product x ↦ Px with a method that returns the diagonal of P.
 
     A maker may return such a product. Pᵢᵢ scales the residual of component i. Without
-    the diagonal, the scale is smaller, and the verdict is stricter than for a matrix
+    the diagonal, scales may be smaller, and the verdict stricter, than for a matrix
     (`harness.verify.kkt`).
     """
 

@@ -199,7 +199,8 @@ class Fields:
     """A deformed state of all bodies, for plots and VTK files, in SI units."""
 
     points: NDArray[Any]  #: (N, dim) reference positions of the nodes, m
-    #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
+    #: node numbers: (E, 4) in 2D, counter-clockwise, where a triangle repeats its last
+    #: node; (E, c) in 3D, see `harness.mechanics.cell_blocks`
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
     displacement: NDArray[Any]  #: (N, dim) displacement of each node, m

@@ -38,7 +38,7 @@ _STRIP_ROWS = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """The matrices K and B in the matrix P = B K⁺ Bᵀ of a dual QP, in its units."""
+    """The matrices K and B of a dual QP with P = B K⁺ Bᵀ, in the units of the QP."""
 
     K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
     B: Matrix  #: (n, N) sparse constraint rows
@@ -60,14 +60,16 @@ class QP:
     Blocks of variables may also be restricted to convex sets; z_box is then an element
     of the normal cone of the set at x.
 
-    Absent constraints have zero rows, and absent bounds are ±inf, never None. All
-    arrays become read-only, so that an exception occurs if a solver scales its input in
-    place. `from_arrays` accepts more types of input and copies the arrays.
+    Absent constraints have zero rows, and absent bounds are ±inf, never None. Vectors
+    and the entries of matrices become read-only, so that an exception occurs if a
+    solver scales its input in place. `from_arrays` accepts more types of input and
+    copies the arrays.
 
     Parameters
     ----------
     P, q, A, b, G, h, structure : see the attributes
-    lb, ub : (n,) bounds, -inf and inf where absent; None if no variable has a bound
+    lb, ub : (n,) bounds, -inf and inf where absent; None for the bounds of the `Box` in
+        `sets`, or for no bounds
     sets : convex sets of blocks of variables; the first may be a `Box` instead of lb
         and ub. Discs of a single variable are converted to bounds
 
@@ -75,7 +77,7 @@ class QP:
     ------
     ValueError
         If shapes disagree, bounds cross, a vector contains NaN (or inf, except in
-        bounds), or two sets share a variable.
+        bounds), a set has an index that is out of range, or two sets share a variable.
 
     Examples
     --------
@@ -192,9 +194,9 @@ class QP:
         ------
         InputError
             If an argument is missing, is not numeric, has the wrong shape or contains
-            NaN (or inf, except in bounds), if `sets` is not a valid tuple of convex
-            sets, if bounds cross, or if P is not symmetric or not positive semidefinite
-            (see `check_convex`).
+            NaN (or inf, except in bounds), if `sets` is not a tuple or list of valid
+            convex sets other than `Box`, if bounds cross, or if P is not symmetric or
+            not positive semidefinite (see `check_convex`).
 
         Examples
         --------
@@ -248,7 +250,7 @@ class QP:
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Return the diagonal of P (n,); None if the operator P has no `diagonal`."""
+        """Return the diagonal of P (n,); None if an operator P does not provide it."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
@@ -390,8 +392,8 @@ def check_convex(P: Matrix) -> None:
     Raises
     ------
     InputError
-        If D⁻½PD⁻½ has an eigenvalue of at most −1e-6, or if a diagonal entry of P is
-        below −1e-10 max|P|.
+        If a diagonal entry of P is below −1e-10 max|P|, or, up to 2000 rows, if
+        D⁻½PD⁻½ has an eigenvalue of at most −1e-6.
 
     """
     largest = float(abs(P).max()) if P.shape[0] else 0.0
@@ -565,7 +567,7 @@ def _rows(
 
 
 def _freeze(M: Matrix) -> None:
-    """Mark the buffers of a dense or sparse matrix as read-only."""
+    """Mark the entries of a dense or sparse matrix as read-only."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]
     for buffer in buffers:
         if isinstance(buffer, np.ndarray):

@@ -45,7 +45,8 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 class Verdict(StrEnum):
     """Verdict on a measurement: states whether the claim of the solver is true."""
 
-    VERIFIED = "verified"  #: every residual, or a known `optimum_error`, is ≤ 10·tol
+    #: `optimum_error` if it is known, otherwise every residual, is ≤ min(10·tol, 0.1)
+    VERIFIED = "verified"
     #: the solver claimed infeasibility, which is proven; see
     #: `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"

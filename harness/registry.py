@@ -138,9 +138,9 @@ class PluginFile:
     def content(self) -> Iterator[bytes]:
         """Yield the bytes of the file, then paths and bytes of imported neighbours.
 
-        These are the modules in the same folder that the file imports, directly or
-        through other neighbours, sorted by path. Import statements inside functions
-        count.
+        Neighbours are the modules in the same folder that the file imports, directly or
+        through other neighbours, and all modules of packages there that it imports;
+        they are sorted by path. Import statements inside functions count.
 
         Raises
         ------
@@ -197,7 +197,7 @@ def entry(module: str, attribute: str, **options: Any) -> Entry:
 
 
 class Registry(Mapping[str, T]):
-    """Mapping of names to objects, each imported at its first access."""
+    """Mapping of names to objects, each imported on first access."""
 
     def __init__(self, entries: Mapping[str, Entry | T]) -> None:
         self.entries = dict(entries)  #: objects, or references to objects, by name
@@ -253,7 +253,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Return the values of a solver's options by name; {} without a dataclass."""
+    """Return the values of a solver's options by name; {} if it is not a dataclass."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
@@ -717,12 +717,12 @@ def _has(parts: Sequence[str], thing: object) -> bool:
 
 
 def _check_names(where: str, family: Any) -> None:
-    """Check that the keys, defaults and forms of a family can occur in case names.
+    """Check the types of the keys, defaults and forms of a family.
 
     Raises
     ------
     InputError
-        If `defaults` or `forms` has the wrong type.
+        If `defaults` or `forms` has the wrong type, or `forms` is empty.
 
     """
     defaults, forms = family.defaults, family.forms

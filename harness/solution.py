@@ -11,8 +11,8 @@ following columns:
   gradient; the norm of the projected gradient is √(‖φ‖² + ‖β‖²)
 * ``infeasibility``: relative norm of Ax − b
 * ``active``: number of active bounds
-* ``two_sided``: number of components at a bound that have two finite bounds; in a dual
-  QP with friction, these components are the rows that slip
+* ``two_sided``: number of components at a bound that have two finite bounds; in the
+  dual QP of a 2D problem with friction, these components are the rows that slip
 * ``cost``: value of the objective or the Lagrangian
 * ``seconds``: time since the start of `prepare`
 
@@ -158,7 +158,8 @@ def checked_history(history: object) -> History:
     ------
     ValueError
         If `history` is not a mapping from identifiers to columns of equal length, if a
-        column has another type, or if the size exceeds MAX_HISTORY_BYTES.
+        column contains neither numbers nor texts of at most 16 characters, or if the
+        size exceeds MAX_HISTORY_BYTES.
 
     """
     if not isinstance(history, Mapping):

@@ -68,8 +68,8 @@ _DECLINE_OPERATORS = (
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-#: Largest gradient that counts as rounding, relative to the largest term of the
-#: gradient. The dual residual uses the same value.
+#: Largest multiplier of an absent bound that counts as rounding, relative to the
+#: largest term of the gradient. `harness.verify.kkt.ROUNDING` has the same value.
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest permitted difference in x between repeats. The order of summation, and hence
 #: rounding, may depend on the alignment of arrays in memory.
@@ -212,7 +212,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
     """Require zero multipliers on absent bounds, up to rounding.
 
     If the multipliers are at most 8·2⁻⁵² times the largest term of the gradient, the
-    check passes with a remark, since the dual residual neglects values of this size.
+    check passes with a remark, since values of this size may be rounding errors.
     """
     qp, _ = manufactured("some bounds")
     s = _solve(solver, qp, 1e-3)
@@ -355,7 +355,7 @@ def _near(
     error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
     if not error <= tol:
         raise ContractError(
-            f"{name} differs from the known value by {error:.1e}; expected at most "
+            f"{name} differs from the expected value by {error:.1e}; expected at most "
             f"{tol:.1e}"
         )
 

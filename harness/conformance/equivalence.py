@@ -106,7 +106,7 @@ def answer(solver: Solver, qp: QP) -> Solution:
 
 
 def _fault(qp: QP, s: Solution) -> str:
-    """Return the reason why an answer is not verified; "" if it is verified."""
+    """Return the reason why an answer is not a verified claim of success, or ""."""
     residuals = kkt_residuals(qp, s)
     judged = verdict(s.status, residuals, TOL)
     if s.status is Status.SOLVED and judged is Verdict.VERIFIED:

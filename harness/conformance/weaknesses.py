@@ -36,8 +36,8 @@ unknowns, 4 equality and 23 inequality rows, its dual, and its dual with bounds 
 Each form is first solved at tolerance {TOL:g} in non-dimensional form. It is then
 solved in equivalent formulations: in other units, in another order, with rows scaled by
 powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
-opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
-verdict nor answer should change.
+opposite sign. In exact arithmetic, the QPs are equivalent
+(`harness.conformance.metamorphic`), so neither verdict nor answer should change.
 
 A change of units multiplies the non-dimensional quantities by the factors in the next
 table. The factors are the load and the length of the paper's benchmark, expressed in
@@ -48,7 +48,7 @@ the new units and rounded to powers of two, and their products and quotients:
 KEY = """
 The entries of the next table have these meanings:
 
-- "·": verdict and answer are the same in every form;
+- "·": verdict and answer do not change in any form that the solver solves;
 - ×k: in the worst form, the solver takes k times as many iterations (for k ≥ 2);
 - **form**: verdict or answer change in this form; see the section *Evidence*;
 - (form): the solver declines the changed QP of this form;

@@ -54,7 +54,7 @@ class Assessment:
     #: largest resultant force or moment on a body, relative to the forces on the body
     balance: float | None
     active: int | None  #: number of closed contact rows
-    #: rows whose state contradicts the state in the reference
+    #: contact rows whose state contradicts the state in the reference
     rows: tuple[int, ...] = ()
     #: contact rows in tension, λᵢDᵢ < −sᵢ, and friction rows that exceed the friction
     #: bound by more than sᵢ/Dᵢ

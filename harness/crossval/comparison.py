@@ -1,12 +1,12 @@
 """Comparison of all answers to one problem with a reference and with each other.
 
-The reference is a point with a proven error bound (`harness.verify.references`), which
-is computed independently of the solvers under test. An answer is refuted if a residual
-is too large or, if an optimum is proven, if the error relative to this optimum is too
-large. It is also refuted if a multiplier is inadmissible, or if its distance to the
-reference, minus the error bound of the reference, exceeds the error that the claim of
-the answer permits (`harness.crossval.assessment`). Agreement of several answers is not
-used as evidence.
+The reference is a point with an error bound (`harness.crossval.ground_truth`), which is
+computed independently of the solvers under test if the reference solve succeeds. A
+claim of success is refuted if a residual is too large or, if an optimum is proven, if
+the error relative to this optimum is too large. It is also refuted if a multiplier is
+inadmissible, or if the distance of the answer to the reference, minus the error bound
+of the reference, exceeds the error that the claim permits
+(`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
 If two answers differ by more than the sum of the permitted errors, and neither answer
 is refuted, the disagreement is unresolved.
 """
@@ -216,7 +216,7 @@ def _contradiction(a: Answer) -> str:
 
     The result is "" for a point with remarks, and for a point whose new verdict differs
     from the stored verdict. In both cases, the point may differ from the certified
-    point.
+    point. Certified bounds above 1 % are not examined.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""

@@ -158,8 +158,8 @@ def _plain_truth(
 ) -> GroundTruth | str:
     """Return the reference point of a QP without mechanics, or why it is missing.
 
-    The error of the point is bounded by √(2r), where r is its largest KKT residual. The
-    errors of verified answers have the same bound.
+    The assumed bound on the error of the point is √(2r), where r is its largest KKT
+    residual. For verified answers, the same formula holds with the largest permitted r.
     """
     qp, why = answers[0].case.qp, ""
     try:

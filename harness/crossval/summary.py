@@ -25,7 +25,7 @@ class Row:
 
     solver: str
     tol: float
-    answers: int  #: number of answers with a stored point
+    answers: int  #: number of distinct stored points
     refuted: int  #: number of refuted claims
     unanswered: int  #: number of measurements in `Validation.unanswered`
     #: median of the bounds on the relative error in the energy norm
@@ -34,7 +34,8 @@ class Row:
     worst_case: str  #: case with the error `error_worst`
     penetration: float | None  #: largest penetration relative to the mesh size
     balance: float | None  #: largest relative resultant force or moment on a body
-    contradicted_rows: int  #: number of rows whose state contradicts the reference
+    #: number of contact rows, over all answers, whose state contradicts the reference
+    contradicted_rows: int
     primal_dual: float | None  #: largest distance between primal and dual answers
     from_ours: float | None  #: largest distance from the answers of `ours`
 

@@ -67,7 +67,8 @@ class Validation:
     #: false claims without a point, which are not in `problems`
     false_claims: tuple[Listed, ...]
     #: measurements that ended without a claim of success, such as crashes and limits;
-    #: without declined QPs, proven claims of infeasibility, and `false_claims`
+    #: without declined QPs, verified points, proven claims of infeasibility, and
+    #: `false_claims`
     unanswered: tuple[Listed, ...]
     #: stored points and claims of infeasibility that could not be assessed
     not_validated: tuple[Listed, ...]
@@ -105,7 +106,7 @@ class _Part(NamedTuple):
     """Result of the cross-validation of one physical case, in all its forms."""
 
     problems: list[Problem]
-    lost: list[Listed]  #: answers that could not be assessed
+    lost: list[Listed]  #: points and claims of infeasibility that were not assessed
     false: list[Listed]  #: false claims without a point
     suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
     truths: dict[str, Vector]  #: multipliers of reference points by name of the problem
@@ -122,7 +123,8 @@ def validate_folder(
 
     reference : function that solves a QP accurately, independent of the solvers under
         test
-    tell : progress callback, called with the name of each case before it is assessed
+    tell : progress callback, called with the name and the number of each case before
+        the case is assessed
 
     Raises
     ------
@@ -170,7 +172,7 @@ def validate_folder(
 
 
 def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group all records that were not declined by physical case, sorted by name."""
+    """Group records by physical case, sorted by name; omit declined QPs."""
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
         if r.verdict is not Verdict.DECLINED:
@@ -261,9 +263,10 @@ def _built(
 def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
 ) -> tuple[list[StoredAnswer], list[Listed]]:
-    """Read the stored points of claims of success; read equal points of a solver once.
+    """Read the stored points of claims of success, and other verified points.
 
-    The second result lists the points that cannot be read, with the reasons.
+    Equal points of a solver for the same case and tolerance are read once. The second
+    result lists the points that cannot be read, with the reasons.
     """
     answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
     lost: list[Listed] = []
@@ -306,7 +309,7 @@ def _is_proven(r: Record) -> bool:
 def _falsehood(r: Record, solved: Problem | None) -> str:
     """Return the reason why the claim of a record is false, or "".
 
-    Only claims without a point are considered.
+    Only claims of success without a point, and claims of infeasibility, are considered.
 
     solved : the problem if it has a reference point, else None
     """

@@ -439,6 +439,7 @@ cdef double PIVOT_TOLERANCE = 1e-3
 def factor_above(M, double share, L_0):
     """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
 
+    L is in the lower triangle of the result; the upper triangle is not meaningful.
     M is a difference of matrices whose norms are similar to that of L₀L₀ᵀ. If `share`
     is smaller than the relative rounding errors of these matrices, the computed M may
     have negative eigenvalues. In exact arithmetic, the pivots of M are at least the

@@ -8,8 +8,9 @@ such operations to NumPy vectors therefore runs unchanged on several ranks:
     x + alpha*p, np.where(free, g, 0)   elementwise, on the local slice
     x @ y, v.max(), moves.any()         reduction over all ranks
 
-A `DistributedVector` raises TypeError for all other operations, since their results
-would depend on the local slice only.
+A `DistributedVector` raises TypeError for all other NumPy functions, and for methods
+such as `mean` and `argmax`, since their results would depend on the local slice only.
+Indexing and conversion by `np.asarray` apply to the local slice.
 """
 
 from __future__ import annotations
@@ -223,8 +224,9 @@ class DistributedVector(np.ndarray):
     Raises
     ------
     TypeError
-        If an operation is neither elementwise nor one of the reductions sum, min, max,
-        any, all, dot product, norm and count of nonzeros.
+        If a NumPy function is neither elementwise nor one of the reductions sum, min,
+        max, any, all, dot product, norm and count of nonzeros, or if a method such as
+        `mean` or `argmax` would use only the local slice.
 
     """
 

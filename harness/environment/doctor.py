@@ -145,8 +145,8 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "memory",
         f"{available} of {total} MiB free" if is_known else None,
-        f"Free {MIN_MEMORY_MIB} MiB of memory, or lower memory_limit in the suite"
-        * (is_known and available < MIN_MEMORY_MIB),
+        f"Provide {MIN_MEMORY_MIB} MiB of free memory, or lower memory_limit in the "
+        "suite" * (is_known and available < MIN_MEMORY_MIB),
     )
 
 

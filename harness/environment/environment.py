@@ -156,8 +156,8 @@ def packages_of(environment: Mapping[str, Any]) -> list[str]:
 def digest(environment: Mapping[str, Any]) -> str:
     """Return 12 hexadecimal digits that identify an environment.
 
-    Load and free memory do not affect the digest. Times may be compared if the digests
-    of their environments are equal.
+    Time, load and free memory do not affect the digest. Measured times may be compared
+    if the digests of their environments are equal.
     """
     lasting = {k: v for k, v in environment.items() if k not in VOLATILE}
     canonical = json.dumps(lasting, sort_keys=True, separators=(",", ":"))

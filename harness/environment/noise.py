@@ -90,7 +90,7 @@ def noise_floor(
 
 @contextmanager
 def _on_the_workers_cpu() -> Iterator[None]:
-    """Run the block on the last CPU, to which `harness.processes` binds workers."""
+    """Run the block on the last usable CPU, to which workers are bound."""
     usable = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(usable)})
     try:

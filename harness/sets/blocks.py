@@ -88,7 +88,7 @@ class Blocks(ABC):
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the distance (k,) of z from the normal cone at x in each block.
 
-        tol : relative slack below which x counts as a point of the boundary
+        tol : largest relative slack for which x counts as a point of the boundary
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -87,7 +87,7 @@ class Cones(Blocks):
         return part
 
     def support(self, z: Vector) -> Sum:
-        """Return 0, the supremum of zᵀx for z in the polar cones."""
+        """Return 0, the supremum of zᵀy over the cones, for z in the polar cones."""
         return Sum(0.0, 0.0)
 
     def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
@@ -100,8 +100,8 @@ class Cones(Blocks):
 
         At the apex, the normal cone is the polar cone. At other points of a cone of
         positive slope, the normal cone is a ray if x is on the boundary, and {0} if x
-        is inside. A block of x whose norm is at most `tol` times the largest norm
-        counts as the apex.
+        is inside. For slope 0, it is the plane z_N = 0. A block of x whose norm is at
+        most `tol` times the largest norm of a block counts as the apex.
         """
         at, force = x[self.index], z[self.index]
         sizes, tangents = norms(at), norms(at[:, 1:])

@@ -17,9 +17,9 @@ from mortarbench.harness.sets.convex import Limits, Sum, Vector
 class Discs(Blocks):
     """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
 
-    At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
-    radius 0, the normal vector is arbitrary. A `QP` converts discs of one variable (d =
-    1) to bounds.
+    The normal vector `z_box` is a nonnegative multiple of x at an active disc, zero at
+    an inactive disc, and arbitrary for radius 0. A `QP` converts discs of one variable
+    (d = 1) to bounds.
 
     Parameters
     ----------

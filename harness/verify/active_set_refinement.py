@@ -10,8 +10,8 @@ precision. The multiplier of a row that is not closed is on the boundary of the 
 admissible multipliers: an open contact has λ = 0, and a slipping node with the friction
 bound g has ‖λ‖ = g. As in a primal-dual active set method, a closed row leaves A if its
 multiplier is not in Λ. A row of N enters A if its motion contradicts its multiplier
-(for contact, if the gap is negative). The exchange ends when A does not change, or at
-the latest after a given number of exchanges.
+(for contact, if the gap is negative). The exchange ends when A does not change or
+recurs, or at the latest after a given number of exchanges.
 """
 
 from __future__ import annotations
@@ -63,8 +63,9 @@ class ActiveSet(NamedTuple):
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
     """Solve K u = force with u = 0 on fixed components; return u and its error.
 
-    u (n,) is in extended precision and has no rigid motion. The returned error is
-    √(rᵀK⁺r) with the residual r, that is, the error in the energy norm.
+    u (n,) is in extended precision and has no rigid motion. The part of `force` along
+    rigid motions is disregarded. The returned error is √(rᵀK⁺r) with the residual r,
+    that is, the error in the energy norm.
     """
     K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
@@ -121,7 +122,7 @@ def predicted(
     push = multipliers[discs.index] * soft + v[discs.index]
     size = norms(push)[:, None]
     slips = size >= discs.radius[:, None] * soft
-    # if λ + v/D is zero, the direction of λ is used as the direction of slip
+    # if λD + v is zero, λ itself is the limit
     limits[discs.index] = np.where(
         size > 0,
         push / np.where(size > 0, size, 1) * discs.radius[:, None],
@@ -144,8 +145,9 @@ def exchanged(
     """Exchange rows, starting from a guess; return u (n,), λ (m,) and the active set.
 
     The direction of slipping friction vectors is fixed. The iteration ends if no row
-    violates a condition, if an active set recurs, or after `rounds` exchanges. The last
-    active set need not be optimal, so a certificate has to bound the error of u and λ.
+    violates a condition, if an active set recurs, or after `rounds` exchanges. In the
+    last case, u belongs to the last active set but one. The last active set need not be
+    optimal, so a certificate has to bound the error of u and λ.
     """
     exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):

@@ -36,21 +36,22 @@ from mortarbench.harness.mechanics import (
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.sets.blocks import norms
 
-MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
+MAX_ROUNDS = 20  #: largest number of corrections in `_feasible_near`
 #: Largest number of rows for which F_VV is assembled. Systems with more rows are solved
 #: by CG.
 MAX_DENSE_ROWS = 2000
 #: A combination of rigid motions counts as floating if its singular value in √W G is at
 #: most this fraction of the largest singular value (`supported_and_floating`).
 SUPPORT_THRESHOLD = 1e-5
-#: Largest load along a floating or free motion that counts as rounding, relative to the
-#: sum of the absolute terms of the load.
+#: Largest load along a motion that counts as rounding: for floating motions, relative
+#: to the sum of the absolute terms of the equilibrium equation; for free motions,
+#: relative to the sum of the absolute loads times the largest entry of the motion.
 LOAD_ROUNDING = 1e-12
 _EPS = Real(np.finfo(Real).eps)
 
 
 class UncertifiableError(Exception):
-    """Failure to find an admissible pair; the message is the reason."""
+    """Failure to bound the error of an answer; the message is the reason."""
 
 
 def admissible(
@@ -62,7 +63,8 @@ def admissible(
     equality: û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα. Here, F_VV = B_V
     K⁺B_Vᵀ is the compliance of the rows, and the columns of R are rigid motions. V
     initially consists of the closed and the violated rows and is extended until Bû ≤ c.
-    If this fails and c ≥ 0, û = θu with θ ≤ 1, without equality on the closed rows.
+    If this fails and c ≥ 0, û = θu with θ ≤ 1, without equality on the closed rows. The
+    inequalities hold for contact rows only. Free motions are first removed from u.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
@@ -98,9 +100,9 @@ def _feasible_near(
     V initially consists of the closed and the violated rows; contact rows that become
     violated after a correction are added. The target of a correction is a few units in
     the last place inside the feasible set, so that rounding of Bu cannot hide a
-    violation. If MAX_ROUNDS rounds do not suffice and c ≥ 0, a feasible θu with θ ≤ 1
-    is returned. Friction rows belong to V only if they are closed, that is, if they
-    stick.
+    violation. If MAX_ROUNDS corrections do not suffice or overflow, a feasible θu with
+    θ ≤ 1 is returned if c ≥ 0, and otherwise None. Friction rows belong to V only if
+    they are closed, that is, if they stick.
 
     nearest : returns, for rows V, the map from violations t (v,) to a
         correction δ with B_V δ = −t
@@ -176,15 +178,15 @@ def feasible_at_rows(
     ----------
     exact : contact and friction rows; B has a column for each of the w components that
         occur in rows
-    R : (w, p) rigid motions that change gaps; they cost no energy
+    R : (w, p) rigid motions that change gaps or slip; they cost no energy
     softness : (w,) 1/Kᵢᵢ, zero at prescribed components
     u : (w,) displacement of these components
     closed : (m,) mask of the rows to satisfy with equality
 
     Returns
     -------
-    (w + p,) displacement of these components, followed by the coefficients of R in it;
-    None on failure
+    a point whose `u` (w + p,) is the displacement of these components, followed by the
+    coefficients of R in it; None on failure
 
     """
     none = csr_array((exact.c.size, R.shape[1]))
@@ -229,11 +231,11 @@ def closing(
         F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
     The arguments of the solver are the violations t (v,) and the loads e (p,) along the
-    motions R that change gaps. α is zero along motions that do not change the gaps of
-    the rows V. F_VV may be singular, since K⁺ is zero on fixed components. It is
-    therefore replaced by F_VV + ρUUᵀ, where U spans the range of G_V. Rows are scaled
-    to similar compliance, since the stiffnesses of bodies may differ by orders of
-    magnitude.
+    motions R that change gaps or slip. α is zero along motions that do not change the
+    rows V. F_VV may be singular along the range of G_V, since K⁺ may be zero at
+    components that prevent rigid motions in its factorisation. F_VV is therefore
+    replaced by F_VV + ρUUᵀ, where U spans the range of G_V. Rows are scaled to similar
+    compliance, since the stiffnesses of bodies may differ by orders of magnitude.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
@@ -317,7 +319,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Return True if any motion that leaves all gaps unchanged has a load along it.
+    """Return True if a load acts along any motion that changes neither gaps nor slip.
 
     A load that does not exceed its rounding counts as zero.
 
@@ -371,7 +373,8 @@ def supported_and_floating(
 class Balance(NamedTuple):
     """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps.
+    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps or
+    slip.
     """
 
     G: Extended  #: (m, p)  BR
@@ -388,8 +391,8 @@ class Balance(NamedTuple):
         from the boundary of Λ (for contact, wᵢ is proportional to λᵢ), since
         corrections at open gaps or slipping nodes would do work. Along motions that λ
         does not support (`supported_and_floating`), the load must vanish up to
-        rounding. Otherwise, all rows are corrected in two further attempts, the last
-        with equal weights.
+        rounding. If this attempt fails, all rows are corrected in two further attempts,
+        the last with equal weights.
 
         Raises
         ------
@@ -491,8 +494,8 @@ def _curvature(
 ) -> Extended:
     """Return GᵀWΠ'(λ)G (p, p) at a trial point λ (m,), with the projection Π onto Λ.
 
-    Π' is the identity inside Λ, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc of
-    radius g.
+    Π' is the identity inside Λ, 0 at contact rows with λ ≤ 0, and (g/‖λ‖)(I − nnᵀ) with
+    n = λ/‖λ‖ outside a disc of radius g.
     """
     discs = forces.discs
     at, size = free[discs.index], norms(free[discs.index])

@@ -32,10 +32,10 @@ Errors are relative to ‖u*‖, which is bounded from below by ‖M‖ minus th
 This bound differs much from ‖û‖ only if the error is comparable with the solution.
 
 If only contact supports a body, λ̂ must also balance its load, Rᵀ(f − Bᵀλ̂) = 0 for its
-rigid motions R; otherwise D(λ̂) = −∞. In this case ‖v‖ is a seminorm, the energy norm
-of v − RRᵀv, and the error of the rigid motion itself is not bounded. Motions that do
-not change any gap (BR = 0 up to rounding) or that λ̂ does not support are disregarded.
-The rounding of K and f along these motions is also disregarded.
+rigid motions R; otherwise D(λ̂) = −∞. For such a body, ‖v‖ is a seminorm, the energy
+norm of v − RRᵀv, and the error of the rigid motion itself is not bounded. Motions that
+do not change any gap or slip (BR = 0 up to rounding) or that λ̂ does not support are
+disregarded. The rounding of K and f along these motions is also disregarded.
 
 The bounds are evaluated for the stored K = TᵀK_T T + E, where T maps displacements to
 their copies in one or more subdomains, K_T contains the stiffness matrices of the
@@ -49,7 +49,7 @@ Tû − d with any d. By (R2) of docs/certificates.md, (1) becomes
 where the last two terms are rounding. Inequality (R3) of docs/certificates.md bounds
 these terms by ‖e'‖ and γ, and (R4) bounds γ by the contact conditions.
 
-If P is not a stored stiffness matrix, as for half-spaces, a proven lower bound μ > 0 of
+If P is not a stored stiffness matrix, as for half-spaces, a proven lower bound μ > 0 on
 its eigenvalues is used. Let S be the product of the sets, x̂ ∈ S, z normal to S at x̂,
 and r = Px̂ + q + z. The solution x* of a QP over S without rows satisfies (Px* + q)ᵀ(x̂
 − x*) ≥ 0, and zᵀ(x* − x̂) ≤ 0 holds as z is normal. The two inequalities imply ‖x̂ −
@@ -94,8 +94,8 @@ from mortarbench.harness.verify.substructured import (
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
-#: Largest residual with which a combination of contact rows counts as equal to a rigid
-#: motion.
+#: Largest residual with which a combination of rows of G counts as equal to a supported
+#: motion (`_reach`).
 COMBINATION_RESIDUAL = 1e-9
 #: Rounding of a product with P by FFT, relative to ‖P‖‖x‖: the error of the FFT grows
 #: like the logarithm of the size, and is below 30·2⁻⁵³ for 2²⁰ entries (Higham 2002,
@@ -104,9 +104,9 @@ PRODUCT_ROUNDING = 2.0**-46
 #: Safety factor, since power iteration underestimates ‖P‖.
 POWER_ITERATION_FACTOR = 2.0
 #: A certificate is sharp if its `work` is at most this fraction of its squared
-#: `distance` d: without work, the bound √(d² + 2·work) would decrease by only 5 %.
+#: `distance` d: without work, the bound √(d² + 2·work) would decrease by less than 5 %.
 SHARP_WORK = 0.05
-SHARP_BOUND = 1e-7  #: bound below which no further pair is tried
+SHARP_BOUND = 1e-7  #: largest relative bound for which no further pair is tried
 #: Largest bound for which the closed rows are taken from the answer. If the error is
 #: larger, the solution for these rows may be far from the answer.
 MAX_EXCHANGE_BOUND = 1e-3
@@ -116,10 +116,10 @@ EXCHANGE_ROUNDS = 5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate:
-    """An admissible pair (û, λ̂) near an answer, and the bounds that it proves.
+    """An admissible pair (û, λ̂), and the bounds that it proves for an answer.
 
-    All norms are energy norms ‖·‖_K of non-dimensional displacements. Equations (1) to
-    (5) are derived in the docstring of the module.
+    All norms are energy norms of non-dimensional displacements. Relations (1) to (5)
+    are stated in the docstring of the module.
     """
 
     u: Extended  #: û (n,)
@@ -129,7 +129,8 @@ class Certificate:
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g_t‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: second term of `work`, which is due to friction
-    rounding: float  #: rounding terms of (4), from KR ≠ 0 and inexact equilibrium
+    #: bound on the rounding terms of (4), from KR ≠ 0 and inexact equilibrium
+    rounding: float
     stretch: float  #: upper bound on ‖v‖_K/‖Tv‖, where ‖Tv‖ is the energy norm in K_T
     claimed: float  #: bound (3) on the error of the answer
     least: float  #: lower bound on ‖u*‖
@@ -155,7 +156,8 @@ class Certificate:
     def bound(self) -> float:
         """Bound on the relative errors of û, u_λ and the answer, in the energy norm.
 
-        The bound is infinite if the solution is not proven to be nonzero.
+        If the solution is not proven to be nonzero, the bound is infinite, or 0 if
+        `error` is 0.
         """
         return self._relative(self.error)
 
@@ -190,7 +192,7 @@ class EigenvalueCertificate(NamedTuple):
     x: Vector  #: x̂ (n,), in the sets
     z: Vector  #: (n,) vector that is normal to the sets at x̂
     distance: float  #: ‖r‖/√μ, bound on ‖x̂ − x*‖_P, including the rounding of r
-    moved: float  #: ‖x − x̂‖_P, distance of the answer from x̂
+    moved: float  #: upper bound on ‖x − x̂‖_P, distance of the answer from x̂
     norm: float  #: lower bound on ‖x̂‖_P, reduced by rounding errors
 
     @property
@@ -225,8 +227,8 @@ class EigenvalueCertificate(NamedTuple):
 def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertificate:
     """Bound the error of x over convex sets by (5), from an eigenvalue of P.
 
-    With the projection Π, x̂ = Π(t) is the projected gradient step t = x − (Px + q)/L,
-    and z = L(t − x̂) is normal at x̂ for any L > 0. Multipliers are not used. If
+    The point x̂ = Π(t) is the projection of t = x − (Px + q)/L onto the sets, and z =
+    L(t − x̂) is normal at x̂ for any L > 0. Multipliers are not used. If
     rounding leaves ‖x̂_I‖ = (1 + δ)r on a disc I of radius r, then x̂ and z are exact
     for the radius (1 + δ)r. The larger disc moves x* by at most δ(‖q‖ + 2‖P‖‖x‖)/√μ.
     The rounding term of the residual covers this distance (docs/certificates.md).
@@ -242,7 +244,9 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     if not np.isfinite(s.x).all():
         raise UncertifiableError("the answer contains NaN or inf")
     if qp.b.size + qp.h.size:
-        raise UncertifiableError("the QP has rows; expected bounds, discs and cones")
+        raise UncertifiableError(
+            "the QP has rows; expected only bounds, discs and cones"
+        )
     L = largest_eigenvalue(qp)
     step = near = s.x - (qp.P @ s.x + qp.q) / L
     for one in qp.sets:
@@ -271,21 +275,23 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
-    Up to four pairs (û, λ̂) are tried, and the certificate with the smallest bound is
-    returned:
+    Up to four pairs (û, λ̂) are tried, and the certificate with the smallest `error` is
+    returned (for decomposed bodies, see `harness.verify.over_ranks`):
 
     1. the pair of the answer, changed as little as admissibility requires;
-    2. if the first certificate is not sharp, as for an interior point with positive
-       multipliers and gaps: a pair with the active rows that the answer suggests;
-    3. if only contact supports a body, and one of the first two pairs proves the answer
-       to be accurate: the solution for the closed rows of the answer;
+    2. if the first pair yields no sharp certificate, as for an interior point with
+       positive multipliers and gaps: a pair with the active rows that the answer
+       suggests;
+    3. if only contact supports a body, and the first two pairs prove a bound of at most
+       `MAX_EXCHANGE_BOUND` but no sharp one: the solution for the closed rows that the
+       answer suggests, after at most `EXCHANGE_ROUNDS` exchanges of rows;
     4. if no other pair proves a bound: the pair near zero, which does not depend on the
        answer.
 
     Raises
     ------
     UncertifiableError
-        If the answer contains NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or if no pair proves a bound.
 
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
@@ -305,7 +311,7 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
 def sharpest(
     tried: Iterator[Certificate | str], at_rest: Callable[[], Certificate | str]
 ) -> Certificate:
-    """Return the certificate with the smallest bound.
+    """Return the certificate with the smallest `error`.
 
     Parameters
     ----------
@@ -330,7 +336,10 @@ def sharpest(
 
 
 def _least_norm(split: Undivided) -> float:
-    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer."""
+    """Return a lower bound on ‖u*‖ from a pair that does not depend on an answer.
+
+    The bound is 0 if the pair is not admissible.
+    """
     mechanics = split.mechanics
     u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
@@ -395,12 +404,12 @@ def proof(
     """Evaluate bounds (4) and (3) for an admissible pair near u and λ.
 
     claimed : (n,) displacement of the answer
-    closed : (m,) mask of the rows that û satisfies with equality
+    closed : (m,) mask of the rows that û should satisfy with equality
 
     Raises
     ------
     UncertifiableError
-        If no admissible pair is found.
+        If no admissible pair is found, or the answer is too large; see `proven`.
 
     """
     mechanics = split.mechanics
@@ -436,7 +445,7 @@ def proven(
     Parameters
     ----------
     exact : contact and friction rows, restricted to the w components of `at_rows`
-    G : (m, p) derivative of the gaps with respect to the rigid motions that change them
+    G : (m, p) derivative of Bu along the rigid motions that change gaps or slip
     claimed : (n,) displacement of the answer
     u, at_rows : û (n,), and its values (w,) at the components that occur in rows
     multipliers : λ̂ (m,)
@@ -528,9 +537,9 @@ def _charge(
 
     The rounding terms depend on the bounds on the errors, which depend on the rounding
     terms. Each iterate is increased by 1 %, so that the iteration ends above the fixed
-    point.
+    point. If it does not converge, the result is inf.
 
-    pull : (h,) magnitudes of Rᵀ(ρ − TᵀK_T d) along the supported motions
+    pull : (h,) bounds on |Rᵀ(ρ − TᵀK_T d)| along the supported motions
     square : 2g without the rounding terms
     """
 
@@ -576,8 +585,9 @@ def _reach(
     0 yields a bound if its left-hand side equals ±γₖ. A combination with a small bound
     is sought for the squared error `square`, with the compliance of row i approximated
     by Bᵢdiag(K)⁻¹Bᵢᵀ; the dual norm ‖Σ±yᵢBᵢ‖ of the result is then evaluated. Motions
-    that λ̂ does not support and motions that do not change gaps are disregarded,
-    because the rounding of K along these motions is not part of the problem.
+    that λ̂ does not support, and motions that change neither gaps nor slip, are
+    disregarded, because the rounding of K along these motions is not part of the
+    problem.
     """
     if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
@@ -614,7 +624,10 @@ def _reach(
 
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
-    """Return y ≥ 0 with columns·y = target (p,); inf if no such y is found."""
+    """Return y ≥ 0 with columns·y ≈ target (p,), up to `COMBINATION_RESIDUAL`.
+
+    If no such y is found, all entries of the result are inf.
+    """
     # imported here, since scipy.optimize loads slowly and workers do not need it
     from scipy.optimize import nnls
 

@@ -60,11 +60,12 @@ MAX_PIVOTS = 40
 #: this size takes seconds.
 MAX_TABLEAU = 1500
 MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
-#: Bounds larger than this multiple of the largest right-hand side are omitted in the
-#: first search, because the accuracy of the linear program does not suffice for costs
-#: of such different magnitudes.
+#: Bounds larger than this multiple of the largest right-hand side (of the smallest
+#: nonzero bound if all right-hand sides are zero) are omitted in the first search,
+#: because the accuracy of the linear program does not suffice for costs of such
+#: different magnitudes.
 MAX_BOUND_RATIO = 1e6
-LP_SECONDS = 20.0  #: time limit of the search for a ray
+LP_SECONDS = 20.0  #: time limit of each linear program in the search for a ray
 EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
@@ -74,7 +75,8 @@ class Ray(NamedTuple):
     rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
     centre: Any  #: (k,) approximate multipliers, as fractions
     radius: Any  #: (k,) bounds on |multipliers − centre|, as fractions
-    vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
+    #: (n,) mask of variables for which cⱼ = 0 holds exactly, by construction
+    vanish: NDArray[np.bool_]
 
 
 #: Cached margins from `_searched`, which do not depend on an answer; None if the
@@ -223,7 +225,11 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
 
 
 def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
-    """Bound the margin from below over an enclosure of rays; None below MIN_MARGIN."""
+    """Bound the margin from below over an enclosure of rays.
+
+    Return None if the bound does not exceed `MIN_MARGIN`, or if the enclosure contains
+    a negative multiplier of an inequality, or a ray with infinite V.
+    """
     m = qp.b.size
     if (ray.centre < ray.radius)[ray.rows >= m].any():
         return None
@@ -275,7 +281,9 @@ def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]
 def _solved(
     M: csr_array, m: int, rhs: Vector, lb: Vector, ub: Vector, reach: float
 ) -> Vector | None:
-    """Solve the linear program of `_rays`; return None if its minimum is not negative.
+    """Solve the linear program of `_rays`.
+
+    Return None if no solution with a negative value is found.
 
     M, rhs, lb, ub : scaled rows, right-hand sides of at most 1, and bounds; the first m
         rows are equations

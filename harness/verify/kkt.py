@@ -1,8 +1,9 @@
 """Measures of the optimality of a primal-dual point, independent of the solver.
 
 All residuals are scale-free: they do not change if the objective or a row is multiplied
-by a constant, so that one threshold suits every problem. A change of the unit of a
-variable can change only the dual residual, through the scale S of all components.
+by a positive constant (and the multipliers are scaled accordingly), so that one
+threshold suits every problem. If the diagonal of P is available, a change of the unit
+of a variable can change only the dual residual, through the scale S of all components.
 Up to rounding, all four residuals vanish if and only if the point is a KKT point. Such
 a point is a solution if P is positive semidefinite, which is not checked here.
 docs/verdicts.md states what small residuals prove about the objective. If residuals do
@@ -33,9 +34,10 @@ from mortarbench.harness.verify import scales
 #: (`test_rounding_in_products_with_an_operator_does_not_refute_an_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
 #: Largest error, as a fraction of its scale, that may be attributed to rounding.
-#: `MAX_CANCELLATION` allows a relative error of 5e-4 of the objective at tol 1e-8. This
-#: fraction is added twice, for the uncertainty of the optimum and for rounding. The
-#: total is below 1e-3, so that three digits of the objective are correct. With 2e-3,
+#: In a comparison with a proven optimum, `MAX_CANCELLATION` allows an error of 5e-4 of
+#: the objective at tol 1e-8. This fraction is added twice, for the uncertainty of the
+#: optimum and for rounding. The total is below 1e-3, so that three digits of the
+#: objective are correct. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9,
 #: `test_cancelling_terms_are_evaluated_exactly` fails.
 NEGLIGIBLE = 2e-4
@@ -49,27 +51,29 @@ LEAST_ENERGY = 1e-2
 #: `test_the_code_of_your_own_solver` fails: answers with residuals of 1.2e-2 and 3.6e-2
 #: are then compared with the proven optimum at tol 1e-3 and verified.
 NO_ENERGY = 1e-6
-#: Loads (entries of q) below this fraction of the largest load are attributed to
-#: rounding: about 400 errors of 2⁻⁵². With 0, loads of 1e-17 determine the scale
+#: Loads (entries of q) are attributed to rounding below this fraction of the largest
+#: load, or of the largest diagonal entry of P times the largest right-hand side or
+#: bound: about 450 errors of 2⁻⁵². With 0, loads of 1e-17 determine the scale
 #: (`test_a_right_point_is_verified_by_its_residuals`, case 11).
 LOAD_ROUNDING = 1e-13
 #: Largest number of passes over the rows. Each pass determines the sizes of variables
-#: without curvature and cost that share a row with variables of known size. The limit
-#: bounds the run time. With 3,
+#: without curvature and cost in active rows that have a nonzero right-hand side or a
+#: variable of known size. The limit bounds the run time. With 3,
 #: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails.
 MAX_PASSES = 100
-#: Number of power iterations for the largest eigenvalue of P. The estimate is a few
-#: percent too small, which changes the natural map by a similar percentage.
+#: Number of power iterations for the largest eigenvalue of P. The estimate is typically
+#: a few percent too small, which changes the natural map by a similar percentage.
 POWER_STEPS = 20
 
 
 class Residuals(NamedTuple):
-    """Scale-free KKT residuals; NaN if the point contains NaN."""
+    """Scale-free KKT residuals; at least one is NaN if the point contains NaN."""
 
     primal: float  #: largest violation of a row, bound or other set
     dual: float  #: largest error of stationarity or of the sign of a multiplier
-    complementarity: float  #: largest |multiplier·slack|, relative to the energy
-    gap: float  #: |primal − dual objective|, relative to the energy
+    #: largest |multiplier·slack|, or |support gap| of a disc or cone, relative to E
+    complementarity: float
+    gap: float  #: |primal − dual objective|, relative to the scale E of energy
 
     @property
     def worst(self) -> float:
@@ -78,7 +82,7 @@ class Residuals(NamedTuple):
 
 
 class Normality(NamedTuple):
-    """Distances from optimality for discs and cones; NaN if the point contains NaN.
+    """Distances from optimality for discs and cones; NaN if x contains NaN.
 
     The complementarity of a disc, r‖z‖ − zᵀx, is of second order in the angle between z
     and x, whereas these distances are of first order. Verdicts do not depend on these
@@ -100,7 +104,7 @@ class Scales(NamedTuple):
 class _Constraints(NamedTuple):
     """Slacks of all constraints at a point: b − Ax, h − Gx, and slacks of the sets."""
 
-    equalities: Limits
+    equalities: Limits  #: in contrast to other limits, satisfied only if slack = 0
     inequalities: Limits
     sets: list[Sequence[Limits]]  #: limits of each set of the QP
 
@@ -119,13 +123,15 @@ class _Terms:
     x: Vector  #: |xⱼ| (n,)
     constraints: _Constraints
     Px: Vector
-    Px_size: Vector  #: upper bound on Σ|Pᵢⱼ||xⱼ|
-    curvature: Vector  #: Pᵢᵢ; zero if an operator P has no `diagonal`
-    has_diagonal: bool  #: False if an operator P has no `diagonal`
+    #: upper bound on Σ|Pᵢⱼ||xⱼ|; ‖Px‖∞ if P has no diagonal
+    Px_size: Vector
+    curvature: Vector  #: max(Pᵢᵢ, 0); zero if P has no diagonal
+    has_diagonal: bool  #: False if P is an operator that does not return its diagonal
     forces: Vector  #: Aᵀy + Gᵀz + z_box
     forces_size: Vector  #: sums of the absolute terms of `forces`
     residual: Vector  #: r in `kkt_residuals`: Px + q + Aᵀy + Gᵀz⁺ + admissible z_box
-    excess: Vector  #: multipliers of absent bounds: z_box minus its admissible part
+    #: z_box minus its admissible part, for instance the multipliers of absent bounds
+    excess: Vector
     energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + σ(z_box)
     energies_size: float  #: sum of the absolute terms of the three energies
 
@@ -138,20 +144,26 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     r = Px + q + Aᵀy + Gᵀz⁺ + z_box without the multipliers of absent bounds, where
     v⁺ = max(v, 0) and v⁻ = min(v, 0). Each residual is the largest of these quantities:
 
-    * primal: violations of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, divided by |bᵢ| + Σ|aᵢⱼ|Xⱼ
-      or, if bᵢ ≠ 0 and this is smaller, by 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ are
-      computed without a scale of energy (`own_size` in scales.h)
+    * primal: violations of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, divided by |bᵢ| + Σ|aᵢⱼ|Xⱼ;
+      if bᵢ ≠ 0, by the smaller of this sum and 10|bᵢ| + Σ|aᵢⱼ|oⱼ, where the sizes oⱼ
+      are computed without a scale of energy (`own_size` in scales.h)
     * dual: |rᵢ|/S, |zᵢ⁻|‖gᵢ‖∞/S and multipliers of absent bounds divided by S, where S
-      is the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and √(E·min Pⱼⱼ); the smaller
-      of |rᵢ|Dᵢ/E and the ratio of |rᵢ| to the largest of |Px|ᵢ, |qᵢ| and
-      |Aᵀy + Gᵀz + z_box|ᵢ
+      is the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and √(E·p), and p is the
+      smallest positive Pⱼⱼ; the smaller of |rᵢ|Dᵢ/E and the ratio of |rᵢ| to the
+      largest of |Px|ᵢ, |qᵢ| and |Aᵀy + Gᵀz + z_box|ᵢ
     * complementarity: |zᵢ(h − Gx)ᵢ|/E, and the same products for bounds
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
-    Dᵢ = min(max(|xᵢ|, sᵢ), wᵢ), where sᵢ = |rᵢ|/Pᵢᵢ is the step to the minimum along i
-    (Xᵢ for a variable with neither curvature nor cost) and wᵢ the distance to the bound
-    in that direction. Before a residual is divided by its scale, `ROUNDING` times the
-    sum of its absolute terms, but at most `NEGLIGIBLE` times the scale, is subtracted.
+    The violation, support gap and support function of each disc and cone are treated
+    like those of bounds (`harness.sets.convex`). Dᵢ = min(max(|xᵢ|, sᵢ), wᵢ), where
+    sᵢ = |rᵢ|/Pᵢᵢ is the step to the minimum along i (Xᵢ for a variable with neither
+    curvature nor cost) and wᵢ the distance to the bound in that direction, 0 beyond the
+    bound. If P has no diagonal, xᵀPx/xᵀx replaces Pᵢᵢ in sᵢ.
+
+    Before a residual is divided by its scale, `ROUNDING` times the sum of its absolute
+    terms is subtracted, but at most `NEGLIGIBLE` times the scale. In the ratios that
+    contain Dᵢ or the largest term, the subtraction is not limited. Nothing is
+    subtracted from zᵢ⁻ and from multipliers of absent bounds.
 
     generous : use the largest justifiable scale of energy, and subtract the rounding of
         energies even if it exceeds `NEGLIGIBLE` times the scale
@@ -193,7 +205,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
     * `natural_map` is ‖x − Π(x − g/L)‖·L/‖q‖ with g = Px + q + Aᵀy + Gᵀz, the
       projection Π onto all sets and an estimate L of the largest eigenvalue of P. It
       does not depend on z_box. If q = 0, the value is relative to the larger of ‖Px‖
-      and ‖Aᵀy + Gᵀz‖.
+      and ‖Aᵀy + Gᵀz‖. If P = 0, L is 1.
     * `normal_distance` is the largest Euclidean distance of z_box on a disc or cone
       from the normal cone of the set at x, relative to the largest of ‖Px‖∞, ‖q‖∞ and
       ‖Aᵀy + Gᵀz + z_box‖∞.
@@ -309,7 +321,7 @@ def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     """Return the largest relative violation of a row or bound; see `kkt_residuals`.
 
     X : (n,) sizes of the variables from the scale of energy
-    own : (n,) sizes of the variables from their values (`own_sizes`)
+    own : (n,) sizes of the variables that do not depend on energies
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
 
@@ -336,7 +348,8 @@ def own_sizes(qp: QP, x: Vector) -> Vector:
     """Return sizes (n,) of the variables at x (n,) that do not depend on energies.
 
     The size of variable j is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ with k ≠ j, the
-    distance by which the other variables shift the minimum along j.
+    distance by which the other variables shift the minimum along j. It is at most the
+    size oⱼ in `kkt_residuals`.
     """
     shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
     sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
@@ -400,9 +413,10 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
 
     E is the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|, where σ is the support
     function of the sets. The terms of the third sum are not used separately, since they
-    can be arbitrarily large if multipliers cancel. E is at most `MAX_CANCELLATION`
-    times the objective (`energy_scale` in scales.h), and at least `LEAST_ENERGY` times
-    the smallest natural energy of a variable (`_natural_energies`).
+    can be arbitrarily large if multipliers cancel. E is limited to `MAX_CANCELLATION`
+    times the absolute value of the objective (`energy_scale` in scales.h), and is then
+    raised to at least `LEAST_ENERGY` times the smallest natural energy of a variable
+    (`_natural_energies`).
 
     generous : do not limit E by `MAX_CANCELLATION`; use the median of the natural
         energies instead of the smallest, and return it if the energy of the point is
@@ -446,9 +460,9 @@ def _natural_energies(
 ) -> Vector:
     """Return the energies that single variables can gain; omit undetermined energies.
 
-    The energy of variable i is |½Pᵢᵢxᵢ² + qᵢxᵢ| at its minimum within the bounds. If
-    the minimum is at xᵢ = 0, the energy is the smaller of qᵢ²/Pᵢᵢ and |qᵢ|wᵢ, where wᵢ
-    is the width of the feasible interval.
+    The energy of variable i is the smallest of qᵢ²/Pᵢᵢ, |qᵢ|wᵢ and, unless the minimum
+    of ½Pᵢᵢxᵢ² + qᵢxᵢ within the bounds is at xᵢ = 0, the magnitude of this minimum.
+    Here, wᵢ is the width of the feasible interval. If wᵢ = 0, only the minimum is used.
 
     bounds : lower and upper bounds (n,), possibly tightened by rows
     by_length : limit the energies of variables without curvature to |qᵢ|lᵢ, and return
@@ -477,7 +491,10 @@ def _natural_energies(
 
 
 def _lengths(qp: QP) -> Vector:
-    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| of each variable (n,), or inf."""
+    """Return the least length of each variable (n,), inf if it has none.
+
+    Lengths of variable j are nonzero |bᵢ/aᵢⱼ|, |hᵢ/gᵢⱼ|, and absolute values of bounds.
+    """
     least = np.full(qp.q.size, np.inf)
     for bound in hull(qp.sets, qp.q.size):
         has_length = np.isfinite(bound) & (bound != 0)
@@ -509,7 +526,7 @@ def tightened(qp: QP) -> tuple[Vector, Vector]:
 
 
 def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
-    """Yield row and column indices, values and right-hand side of A, then of G."""
+    """Yield rows, columns and values of nonzeros, and right-hand side; of A, then G."""
     for M, rhs in ((qp.A, qp.b), (qp.G, qp.h)):
         at = csr_array(M).tocoo()
         is_entry = at.data != 0
@@ -522,7 +539,8 @@ def scales_at(qp: QP, x: Vector, E: float) -> Scales:
     The energy changes by E over the length lⱼ, the smaller of √(E/Pⱼⱼ) and E/|qⱼ|. Xⱼ
     is the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ, since |xⱼ| may be
     arbitrarily large along a direction without cost. The size of a variable with
-    neither curvature nor cost follows from its active rows.
+    neither curvature nor cost follows from its active rows; without such rows, it is
+    |xⱼ|. If P has no diagonal, Xⱼ of a variable with cost is at most ‖x‖∞.
     """
     d, has_diagonal = _curvature(qp)
     return _scales(qp, x, E, d, has_diagonal=has_diagonal)
@@ -587,13 +605,14 @@ def verdict(
 ) -> Verdict:
     """Return the verdict on a point, given its residuals.
 
-    A point is verified if every residual is at most factor·tol (`allowed`), even if the
-    solver claims no success, unless the QP was declined or is proven to be infeasible.
-    Otherwise, the claim determines the type of failure. If the error relative to a
-    proven optimum, `error`, is given, it replaces all residuals. A refuted claim of
-    success is `inaccurate` if the point has at least half of the requested digits
-    (worst residual ≤ √(factor·tol)), and `wrong` otherwise. A point with a residual
-    above 0.1 is not verified at any tolerance.
+    A point is verified if every residual is at most `allowed(tol, factor)`, even if the
+    solver claims no success, unless the solver declined the QP or makes a proven claim
+    of infeasibility. Otherwise, the claim determines the type of failure. If the error
+    relative to a proven optimum, `error`, is given, it replaces all residuals. A
+    refuted claim of success is `inaccurate` if the point has at least half of the
+    requested digits (worst residual ≤ √allowed), and `wrong` otherwise. A point whose
+    `error`, or worst residual if `error` is None, exceeds 0.1 is not verified at any
+    tolerance.
 
     infeasible : True if the QP is proven to have no feasible point, which verifies a
         claim of infeasibility regardless of the point
@@ -637,7 +656,7 @@ def rejudged(record: Record, factor: float) -> Verdict:
 
 
 def _curvature(qp: QP) -> tuple[Vector, bool]:
-    """Return the diagonal Pᵢᵢ (n,) and True; zeros and False if it is unavailable."""
+    """Return max(Pᵢᵢ, 0) (n,) and True; zeros and False if Pᵢᵢ is unavailable."""
     diagonal = qp.diagonal()
     if diagonal is None:
         return np.zeros(qp.q.size), False
@@ -662,7 +681,7 @@ def _over(a: Vector | float, b: Vector) -> Vector:
 
 
 def _largest(*values: float) -> float:
-    """Return the largest value; NaN counts as larger than every number."""
+    """Return the largest value; NaN counts as infinite."""
     return max(values, key=lambda value: np.inf if np.isnan(value) else value)
 
 

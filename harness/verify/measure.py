@@ -74,7 +74,8 @@ def measure(
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
         `harness.plugin.Chained`
     sample_seconds : if preparation and solve take less than half of this time, they are
-        repeated until the repetitions together take about this time. The returned
+        repeated until the repetitions together take about this time, or
+        `MAX_INNER_LOOPS` times. The returned
         answer is the answer of the first solve. The times are means over the
         repetitions, because the first solve runs with cold caches. Every repetition
         receives a QP of new objects, so that the solver cannot recognise the QP by
@@ -213,7 +214,10 @@ def _timed(
 
 
 def _fresh_copy(qp: QP) -> QP:
-    """Return a QP of new objects that share the data of `qp`."""
+    """Return a QP of new objects that share the data of `qp`.
+
+    Operators and `structure` are not copied.
+    """
 
     def other(M: Any) -> Any:
         if isinstance(M, tuple):

@@ -44,7 +44,8 @@ from mortarbench.harness.verify.optimum import EPS
 #: change the complementarity residual by more than this multiple of ε. Because of the
 #: large slack of this row, its multiplier cannot reduce both residuals.
 MAX_COMPLEMENTARITY_RATIO = 100.0
-#: Number of Newton steps; the first half is damped (`_Linearisation.is_careful`). With
+#: Largest number of Newton steps; the first half is damped
+#: (`_Linearisation.is_careful`). With
 #: 8, a residual of 6e-7 remains for rows whose variables are all in balls
 #: (`test_multipliers_over_balls_are_computed_also_with_common_rows`).
 NEWTON_STEPS = 16
@@ -81,10 +82,13 @@ def with_multipliers(
 ) -> Solution:
     """Return a solution; multipliers that are None are fitted to the KKT conditions.
 
+    If x or another argument contains NaN or inf, these multipliers are zero instead.
+
     Raises
     ------
     InputError
-        If the least-squares problem would have more than `MAX_ENTRIES` entries.
+        If the least-squares problem would have more than `MAX_ENTRIES` entries, or if
+        its iteration does not converge.
     """
     given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
     unknown = {name for name, (v, like) in given.items() if v is None and like.size}
@@ -181,7 +185,7 @@ class _Linearisation:
         for j, along in enumerate(forces.T):
             size = np.abs(along[self.block]).max(initial=0.0)
             if size > 0:
-                # the norm is zero if x is at the apex of all cones: use 1
+                # x + τf may be zero, for instance at the apex of all cones: use 1
                 h = STEP * (float(np.abs(at[self.block]).max()) or 1.0) / size
                 for one in self.sets:
                     ends = one.project(at + h * along), one.project(at - h * along)

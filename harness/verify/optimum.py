@@ -65,9 +65,9 @@ MAX_ASSEMBLED = 800
 #: Largest number of unknowns of equations that are solved in rational arithmetic; the
 #: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
-#: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
-#: energy changes by E. At a distance of √2 such lengths from its minimum, the quadratic
-#: term alone has grown by E. With 0 and with infinity,
+#: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the size Xⱼ (`scales_at`), at
+#: least the length over which the energy changes by E. At a distance of √2 such lengths
+#: from its minimum, the quadratic term alone has grown by E. With 0 and with infinity,
 #: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
@@ -110,10 +110,11 @@ def decided(
 
     Returns
     -------
-    the larger of the error |f(x) − f*| and the violation of the constraints, both
-    relative to the scales of the optimum. Unless f* is zero up to rounding, the scale
-    of the error is 10 times the smallest of 500·|f*|, max(xᵀPx, Σ|qᵢxᵢ|) at the
-    optimum, and the generous scale of energy (`harness.verify.kkt.energy_at`)
+    the larger of the error |f(x) − f*|, reduced by the doubt about f*, and the
+    violation of the constraints, both relative to the scales of the optimum. Unless f*
+    is zero up to rounding, the scale of the error is 10 times the smallest of 500·|f*|
+    (more if f* is uncertain), max(|xᵀPx|, Σ|qᵢxᵢ|) at the optimum, and the generous
+    scale of energy (`harness.verify.kkt.energy_at`)
 
     """
     if not is_small(qp):
@@ -144,7 +145,11 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Return a mask (n,) of variables that are coupled by P, rows or sets."""
+    """Return a mask (n,) of the coupled variables.
+
+    A variable is coupled if it occurs in an off-diagonal entry of P, in a row, or in a
+    set other than bounds.
+    """
     is_coupled = np.zeros(qp.q.size, dtype=bool)
     for one in qp.sets[1:]:
         is_coupled[one.block] = True
@@ -263,7 +268,7 @@ def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
 
     The rows and bounds with a nonzero multiplier in `s` become equations. Unknowns that
     the KKT equations leave undetermined are set to zero. If the result is not optimal,
-    undetermined multipliers are set to values close to the least multipliers
+    undetermined multipliers are set to the least multipliers
     (`_least_multipliers`). If this result is not optimal either, undetermined unknowns
     are set to the values of `s`. The result must satisfy the KKT conditions of all rows
     and bounds exactly.
@@ -283,7 +288,8 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
 
     Rows with multipliers of the wrong sign leave the active set, and violated rows
     enter it. The result is None if an active set recurs, since the iteration would
-    cycle, or if the equations of an active set have no solution.
+    cycle, if the equations of an active set have no solution or more than
+    `MAX_RATIONAL` unknowns, or if the QP has sets other than bounds.
     """
     if len(qp.sets) > 1:
         return None
@@ -319,8 +325,10 @@ class _ExactPoint(NamedTuple):
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
     """Yield solutions of the KKT equations of rows with a nonzero multiplier.
 
-    In three solutions, undetermined unknowns are zero, close to the least multipliers,
-    and equal to the values of `s`.
+    In three solutions, undetermined multipliers are zero, equal to the least
+    multipliers, and equal to the multipliers of `s`; undetermined variables are zero,
+    zero, and equal to x of `s`. Nothing is yielded if the equations have no solution or
+    more than `MAX_RATIONAL` unknowns.
     """
     lower = (s.z_box < 0) & np.isfinite(qp.lb)
     upper = (s.z_box > 0) & np.isfinite(qp.ub)

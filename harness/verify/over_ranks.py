@@ -79,8 +79,8 @@ class Contact:
 class FloatingBodies:
     """Rigid motions of bodies that supports do not fix, at the components of a rank.
 
-    Columns are orthonormal to double precision in the inner product over the components
-    of all ranks.
+    The columns of `motions` and of `combinations` are orthonormal to double precision,
+    the former in the inner product over the components of all ranks.
     """
 
     motions: csr_array  #: (n, k) rigid motions, ordered by body, regardless of supports
@@ -222,8 +222,8 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which obtain the same bound.
 
-    The pairs of `harness.verify.certificate.certify` are tried, except the pair that
-    results from an exchange of closed rows.
+    The pairs of `harness.verify.certificate.certify` are tried, the second before the
+    first, except the pair that results from an exchange of closed rows.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def certify_over_ranks(
     Raises
     ------
     UncertifiableError
-        If the answer contains NaN or inf, or no admissible pair is found near it.
+        If the answer contains NaN or inf, or if no pair proves a bound.
     """
     finite = np.isfinite(claimed).all() and np.isfinite(multipliers).all()
     if local.reduction.total(float(finite))[0] < local.ranks.size:
@@ -320,7 +320,10 @@ def _admissible_pair(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows at the components `at`, and 1/Kᵢᵢ (w,), 0 at fixed components."""
+    """Return the data of the rows, restricted to the components `at` (w,), and 1/Kᵢᵢ.
+
+    1/Kᵢᵢ (w,) is replaced by 0 at fixed components; `f` of the data is empty.
+    """
     contact = local.contact
     B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
@@ -353,8 +356,8 @@ class _RigidMotions:
     components of all ranks. Products of K_T with these motions are exactly zero.
     """
 
-    #: (n, r) sparse, at local components. The first p motions change gaps
-    #: ("constrained"); the other ("free") motions change gaps only by rounding
+    #: (n, r) sparse, at local components. The first p ("constrained") motions change
+    #: gaps or slip; the other ("free") motions change them only by rounding
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) constrained motions at components in rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in subdomain motions
@@ -381,7 +384,7 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions into motions that change gaps and free motions.
+    """Split the rigid motions into motions that change gaps or slip, and free motions.
 
     at : (w,) global components in the rows
     """

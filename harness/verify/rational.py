@@ -49,7 +49,7 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 def nonnegative_solution(M: Any, b: Any) -> Any | None:
     """Return w ≥ 0 with Mw = b by the simplex method, or None if no such w exists.
 
-    Phase one of the method minimises the sum of one artificial variable per row.
+    Phase one of the method minimises the sum of artificial variables, one per row.
     Bland's rule (1977) selects the first column with a negative cost and, among the
     binding rows, the row whose basic variable has the lowest index. With this rule, no
     basis recurs, and the method terminates even if steps are degenerate.

@@ -1,12 +1,12 @@
 """Reference solutions of contact problems, with certified error bounds.
 
 An injected reference solver, which is not under test, solves the dual QP of the contact
-and friction rows. The solution of this QP identifies the closed rows, which hold with
-equality: contacts that touch and friction that sticks.
-`harness.verify.active_set_refinement` then computes the solution in extended precision,
-and `harness.verify.certificate` bounds the error of this solution. The cache contains
-only the states of the rows and the multipliers, which determine the directions of slip.
-A later run uses the cached data as an initial guess.
+and friction rows, unless this QP is too large (`_identified`). The solution of this QP
+identifies the closed rows, which hold with equality: contacts that touch and friction
+that sticks. `harness.verify.active_set_refinement` then computes the solution in
+extended precision, and `harness.verify.certificate` bounds the error of this solution.
+The cache contains only the states of the rows and the multipliers, which determine the
+directions of slip. A later run uses the cached data as an initial guess.
 """
 
 from __future__ import annotations

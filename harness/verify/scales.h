@@ -10,9 +10,9 @@ enum {
        scale is then at most 1e-3 of the objective, which is three digits. Without this
        limit, `test_a_cancelling_objective_is_accurate_relative_to_its_terms` fails. */
     MAX_CANCELLATION = 10000,
-    /* Violations and errors of the objective are divided by this factor times their terms.
-       As residuals of up to 10·tol are accepted, errors of up to 100·tol times the terms
-       are accepted as well.
+    /* Violations, and errors of the objective relative to a proven optimum, are divided by
+       at most this factor times their terms. As residuals of up to 10·tol are accepted,
+       errors of up to 100·tol times the terms are accepted as well.
        With 100, `test_a_narrow_box_does_not_increase_the_scale_of_a_row` fails. */
     TERMS_FACTOR = 10,
     /* Largest size of a variable, in units of the length over which the energy changes
@@ -35,9 +35,9 @@ FORMULA largest(double a, double b)
     return (a < b) | (b != b) ? b : a;
 }
 
-/* The scale of energy of a point: the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|,
-   but at most MAX_CANCELLATION times the absolute objective; if the objective vanishes,
-   1/MAX_CANCELLATION of that largest term. */
+/* The scale of energy of a point: t, the largest of |xᵀPx|, |qᵀx| and
+   |bᵀy + hᵀz + σ(z_box)|, but at most the larger of MAX_CANCELLATION·|½xᵀPx + qᵀx| and
+   t/MAX_CANCELLATION. */
 FORMULA energy_scale(double quadratic, double linear, double work)
 {
     double terms = largest(largest(fabs(quadratic), fabs(linear)), fabs(work));
@@ -68,29 +68,31 @@ FORMULA own_size(double Px, double curvature, double x)
     return TERMS_FACTOR * (fabs(x) + minimum_shift(Px, curvature, x));
 }
 
-/* The scale of the violation of a row or bound: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, if bᵢ ≠ 0 and this is
-   smaller, TERMS_FACTOR·|bᵢ| + Σ|aᵢⱼ|oⱼ. `sizes` and `own` are the two sums. */
+/* The scale of the violation of a row or bound: |bᵢ| + Σ|aᵢⱼ|Xⱼ; if bᵢ ≠ 0, the smaller of
+   this sum and TERMS_FACTOR·|bᵢ| + Σ|aᵢⱼ|oⱼ. `rhs` is |bᵢ|, `sizes` is Σ|aᵢⱼ|Xⱼ, and `own`
+   is Σ|aᵢⱼ|oⱼ. */
 FORMULA row_scale(double rhs, double sizes, double own)
 {
     return rhs > 0 ? least(rhs + sizes, TERMS_FACTOR * rhs + own) : rhs + sizes;
 }
 
-/* |error|/scale with 0/0 = 0; inf where the scale overflowed. */
+/* |error|/scale; 0 if the error is 0, otherwise inf if the scale has overflowed. */
 FORMULA ratio(double error, double scale)
 {
     double size = scale < INFINITY || scale != scale ? fabs(error) / scale : INFINITY;
     return error == 0 ? 0 : size;
 }
 
-/* The excess of an error over its rounding; infinite rounding is not subtracted. */
+/* The excess of |error| over its rounding, at least 0; rounding that is inf or NaN is not
+   subtracted. */
 FORMULA beyond(double error, double rounding)
 {
     return largest(fabs(error) - (rounding < INFINITY ? rounding : 0), 0);
 }
 
-/* |rᵢ| relative to `own`, the largest of its terms, or the energy |rᵢ|Dᵢ relative to E if
-   that ratio is smaller. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i,
-   but no more than the `room` to the bound in that direction. */
+/* The smaller of |rᵢ|/`own`, where `own` is the largest absolute term of rᵢ, and |rᵢ|Dᵢ/E.
+   `error` is |rᵢ|. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i, but at
+   most the `room` to the bound in that direction, which counts as 0 if it is negative. */
 FORMULA balance_error(double error, double own, double step, double x, double room,
                       double energy)
 {

@@ -78,7 +78,7 @@ class Split(Protocol):
 
     Vectors (n,) of components have extended precision and are zero on fixed components;
     vectors (N,) contain the copies of components in all subdomains. Columns of R are
-    the rigid motions that the supports allow; the first p columns change contact gaps.
+    the rigid motions that the supports allow; the first p columns change gaps or slip.
     """
 
     def along(self, v: Extended) -> Extended:
@@ -112,7 +112,7 @@ class Split(Protocol):
         """Sum each number over all processes."""
 
     def rounding(self, supported: NDArray[np.float64]) -> Rounding:
-        """Bound E along combinations `supported` (p, h) of motions that change gaps."""
+        """Bound E along combinations `supported` (p, h) of the first p columns of R."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Ew (n,) and |wᵀEw| for w (n,) with Rᵀw = 0.
@@ -146,7 +146,11 @@ class Rounding(NamedTuple):
     curvature: NDArray[np.float64]  #: (h, h) upper bounds on |RᵀER|
 
     def work(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound |eᵀEe| for e = e' + Rγ by ‖e'‖, |γ| (h,) and |e'ᵀEe'| ≤ θ‖e'‖²."""
+        """Bound |eᵀEe| for e = e' + Rγ, where |e'ᵀEe'| ≤ θ‖e'‖².
+
+        size : bound on ‖e'‖
+        gamma : (h,) bounds on |γ|
+        """
         rigid = 2 * size * (gamma @ self.strain) + gamma @ self.curvature @ gamma
         return float(rigid + theta * size * size)
 
@@ -173,10 +177,11 @@ def without_rigid_motion(split: Split, v: Extended) -> Extended:
 def neighbour(split: Split, rho: Extended) -> Neighbour:
     """Solve (5) with iterative refinement.
 
-    The last correction is not added to d, but is used to bound the error. If the norm
-    of each correction is at most q times the norm of the previous correction, the norms
-    of the omitted corrections sum to at most size/(1 − q), where `size` is the norm of
-    the last correction.
+    The correction that ends the refinement is not added to d, but is used to bound the
+    error. If the norm of each correction is at most q times the norm of the previous
+    correction, the norms of the omitted corrections sum to at most size/(1 − q), where
+    `size` is the norm of the last correction. If `MAX_REFINEMENTS` corrections do not
+    suffice, all of them are added, and the same bound holds.
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
@@ -259,8 +264,9 @@ class _Stored(ABC):
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
         """Return Ku, the energy vᵀKv of the deformation v = u − RRᵀu, and v.
 
-        Ku is evaluated as Kv + (KR)Rᵀu, where KR was computed by `cancelling`, since
-        its terms cancel.
+        Ku is evaluated as Kv + (KR)Rᵀu for the constrained motions R, where KR was
+        computed by `cancelling`, since its terms cancel. The rounding of K along free
+        motions is disregarded.
         """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u
@@ -279,7 +285,7 @@ class _Stored(ABC):
         return self.free(found)
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Kw − TᵀK_T Tw on free components, and the difference of the energies.
+        """Return Kw − TᵀK_T Tw on free components, and |wᵀKw − (Tw)ᵀK_T Tw|.
 
         Kw is computed by `cancelling`, because the terms of Kw cancel if w moves bodies
         far together with their supports.

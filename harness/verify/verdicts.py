@@ -101,7 +101,7 @@ def judged(
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
     prove : returns the proven optimum of `qp`; called if residuals do not decide the
-        verdict
+        verdict, or if P is a small operator
     values : residuals and objective that ranks have evaluated; None to evaluate them in
         this function
     """
@@ -175,8 +175,9 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     of `work`. `seminorm` is 1 if bodies can move rigidly; the errors of these motions
     are not bounded.
 
-    If the case has no mechanics but an operator P with a positive `least_eigenvalue`,
-    the error of x is bounded in the norm of P (`certify_by_eigenvalue`).
+    If the case has no mechanics and no rows, but an operator P with a positive
+    `least_eigenvalue`, the error of x is bounded in the norm of P
+    (`certify_by_eigenvalue`).
     """
     if not has_point(s):
         return {}, ""
@@ -211,7 +212,8 @@ def evaluated_by_ranks(
     require the whole QP; `bounds`: fields of `certified`, or None if they require the
     whole QP; `quantities`: physical quantities, or None if they require the whole QP;
     `recover_seconds`: time to evaluate the quantities; `notes`: reasons of failures.
-    After a failure, the values concerned are None or empty
+    After a failure, the values concerned are None or empty. If `values` is None, all
+    values are None
 
     """
     found: dict[str, Any] = {

@@ -303,7 +303,7 @@ def test_the_memory_limit_for_cases_can_be_raised(monkeypatch):
     monkeypatch.setenv(CASE_VARIABLE, "1000")
     assert parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS).params["Nr"] == 30
     monkeypatch.setenv(CASE_VARIABLE, "-1")
-    with pytest.raises(InputError, match="expected a number of MiB"):
+    with pytest.raises(InputError, match="expected a positive number of MiB"):
         parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
 
 
