@@ -67,7 +67,7 @@ def _title(a: Analysis) -> str:
 
 @section(1, "answer", _title)
 def answer(a: Analysis) -> Iterator[Part]:
-    """Name the fastest combination of solver and form, or each form's fastest solver."""
+    """Name the fastest combination of solver and form, or of each form."""
     if a.ways.comparisons:
         comparisons = _by_subject(a.ways.comparisons)
         for subject, mine in comparisons.items():
@@ -103,7 +103,7 @@ def forms(a: Analysis) -> Iterator[Part]:
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Return a sentence for use after a colon: a capital stays only if a name is first."""
+    """Return a sentence for use after a colon; only an initial name keeps its case."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
@@ -293,7 +293,7 @@ def _faster_elsewhere(f: FastestSolver) -> list[str]:
 
 
 def _shared(f: FastestSolver) -> str:
-    """Count the cases on which each solver was fastest, and ties; at most four counts."""
+    """Count the cases on which each solver was fastest, and ties; at most 4 counts."""
     count = Counter(
         _name(front[0]) if len(front) == 1 else f"a tie of {_named(front, 2)}"
         for front in f.fronts().values()
