@@ -225,8 +225,8 @@ def _compared(
     were measured (unpaired if there are fewer than two such blocks). Over cases, each
     end of Student's interval is moved out to the end of the sign-flip interval if that
     end is farther out. Student's interval assumes normally distributed logarithms of
-    ratios, the sign-flip interval only a symmetric distribution. Neither assumption is safe for six cases, so both intervals must
-    exclude 1 for a significant difference.
+    ratios, the sign-flip interval only a symmetric distribution. Neither assumption is
+    safe for six cases, so both intervals must exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
