@@ -264,8 +264,8 @@ def read_evidence(
     """Read a result folder: journal, environment.json and suite.toml.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
-    warn : function that receives warnings about damaged lines and records whose
-        residuals contradict their verdict
+    warn : function that receives warnings about repeated lines of the journal and about
+        records whose residuals contradict their verdict
 
     Raises
     ------
