@@ -65,7 +65,7 @@ def check_size(what: str, size: int) -> None:
 
     """
     if size > (most := max_bytes()):
-        # division rounds down: a size just above the limit would be printed as the limit
+        # `//` rounds down, so a size just above the limit would be printed as the limit
         needed = f"{max(size // MIB, most // MIB + 1)}"
         needed = needed if size < 2**60 else "more than 10^12"
         raise InputError(
