@@ -386,6 +386,8 @@ def solve(
     InputError
         If there is no such case, solver or option, the case cannot be built, the
         solver cannot be copied, or `ranks` exceeds 1 and MPI is not installed.
+    FaultError
+        If something other than the solver prevents the measurement.
 
     Examples
     --------
@@ -543,7 +545,7 @@ def verify(
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
     tol : relative KKT accuracy; a point is verified if every residual is at most 10·tol
         or, for a small QP with a proven optimum, if its error relative to the optimum
-        is at most 10·tol
+        is at most 10·tol (and at most 0.1)
 
     Raises
     ------

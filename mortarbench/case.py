@@ -67,14 +67,15 @@ class Case(plugin.Case):
         """Non-dimensional QP; its energy in SI units is scale · objective + constant.
 
         The matrices have types that other libraries accept: ``scipy.sparse``
-        ``csc_matrix`` with 32-bit indices, or dense arrays. P may also be
-        an operator, as for a decomposed problem; its matrix is ``P @ numpy.eye(n)``.
+        ``csc_matrix``, with 32-bit indices if these suffice, or dense arrays. P may
+        also be an operator, as for a decomposed problem; its matrix is
+        ``P @ numpy.eye(n)``.
         """
         return self.family_case.qp.with_matrices(_exported)
 
     @property
     def scale(self) -> float:
-        """Factor that converts the objective of the QP to an energy in SI units."""
+        """Factor in energy = scale · objective + constant, in SI units."""
         return self.family_case.scale
 
     @property

@@ -29,8 +29,9 @@ _UPDATE_SECONDS = 0.2  #: shortest time between two updates of a bar in a notebo
 class Event:
     """State of a run, passed to the function `progress` of `mortarbench.run`."""
 
-    done: int  #: number of completed measurements, including those of earlier runs
-    total: int  #: number of measurements of the run
+    #: number of measurements that are completed, also by earlier runs, or are left out
+    done: int
+    total: int  #: largest possible number of measurements of the run
     now: str = ""  #: current activity
     warning: str = ""  #: warning that caused this event; empty if there is no warning
     record: Record | None = None  #: measurement that was just completed, or None

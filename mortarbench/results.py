@@ -204,12 +204,12 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    warn : called with a message for each damaged or incomplete line in the journal
+    warn : called with a message if lines of the journal repeat earlier lines
 
     Raises
     ------
     InputError
-        If the folder contains no measurements.
+        If the folder contains no measurements, or its journal is damaged.
 
     Examples
     --------
@@ -246,8 +246,8 @@ def merge(
     ----------
     folders : result folders
     out : new folder, or result of an earlier merge
-    tell : called with messages about records that `out` already contains, and about
-        missing solutions and environments
+    tell : called with messages about duplicate records, files too large to be copied,
+        and missing solutions and environments
 
     Raises
     ------
@@ -306,7 +306,7 @@ def run(
         in s and MiB
     options : options to set in every solver that has them; if the value of an option is
         a list, each value in the list is measured
-    fresh : delete the contents of the folder first
+    fresh : delete the previous results in the folder first
     dask : address of a Dask scheduler, or ``local`` to start one; None to measure
         without Dask
     plugins : Python files with more solvers or families

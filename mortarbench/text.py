@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.solution import History
 
-#: units of the quantities of plane elastic bodies; other quantities have no unit
+#: units of the quantities of elastic bodies; /m: per thickness, omitted in 3D. Other
+#: quantities have no unit
 UNITS = {
     "energy": "J/m",
     "dissipation": "J/m",
@@ -285,7 +286,7 @@ def convergence(history: History) -> str:
 
 
 def legend(history: History) -> str:
-    """Return the legend of `convergence`, one line per column of the history."""
+    """Return the legend of `convergence`: the explanations of its columns."""
     lines = (text for k, text in _LEGEND.items() if k in history and history[k].size)
     return "\n".join(lines)
 

@@ -173,7 +173,7 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
                 "answers within their claims, but far less accurate than "
                 "those of other solvers",
             ),
-            ("unanswered", "measurements ended without an answer"),
+            ("unanswered", "measurements ended without a claim of success"),
         )
         if data["counts"][key]
     ]

@@ -104,7 +104,7 @@ class Copies:
         return copy
 
     def digest(self, path: str) -> str:
-        """Return the digest of a file or, if it is missing, of its copy.
+        """Return the digest of a file or, if it is missing, its digest in the list.
 
         Raises
         ------
@@ -191,7 +191,8 @@ def keep_copies(
 ) -> None:
     """Copy the input files of cases into a result folder; equal files share one copy.
 
-    tell : called with a message for each file that is too large to be copied
+    tell : called with a message for each file that is not copied because of its size or
+        of the total size of the copies
 
     Raises
     ------
@@ -213,7 +214,8 @@ def merge_copies(
 ) -> None:
     """Merge the copies in several result folders into `out`, without duplicates.
 
-    tell : called with a message for each file that is too large
+    tell : called with a message for each file that is not copied because of its size or
+        of the total size of the copies
     """
     writer = _Writer(out, tell)
     for source in sources:
@@ -275,7 +277,7 @@ class _Writer:
         self._entries[entry] = None
 
     def keep(self, original: Path, digest: str, suffix: str, name: str | None) -> None:
-        """Copy a file, unless an intact copy exists or the file is too large.
+        """Copy a file, unless an intact copy exists or the sizes forbid it.
 
         name : path to list, as in the names of cases; None if unknown
         """

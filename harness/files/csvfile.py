@@ -1,9 +1,9 @@
 """CSV tables that are safe to open in spreadsheets.
 
 Spreadsheets interpret a cell that begins with ``=``, ``+``, ``-`` or ``@`` as a
-formula, so text that begins in this way is prefixed with an apostrophe. Control
-characters, which may end a cell or reverse the direction of its text, are escaped.
-Numbers are written unchanged.
+formula, so text that begins in this way is prefixed with an apostrophe. Characters that
+may end a cell or reverse the direction of its text are escaped. Numbers are written
+unchanged.
 """
 
 from __future__ import annotations

@@ -65,7 +65,9 @@ def check_size(what: str, size: int) -> None:
 
     """
     if size > (most := max_bytes()):
-        needed = f"{size // MIB}" if size < 2**60 else "more than 10^12"
+        # `//` rounds down, so a size just above the limit would be printed as the limit
+        needed = f"{max(size // MIB, most // MIB + 1)}"
+        needed = needed if size < 2**60 else "more than 10^12"
         raise InputError(
             f"{what} would take {needed} MiB of memory; expected at most {most // MIB} "
             f"(set {VARIABLE} to allow more)"

@@ -32,8 +32,8 @@ class Experiment:
 
     #: setting of the experiment as plain data that JSON can represent
     setting: Mapping[str, Any]
-    #: rows of each table, by the name of the table; all rows of a table have the same
-    #: keys
+    #: rows of each table, at least one, by the name of the table; all rows of a table
+    #: have the same keys
     tables: Mapping[str, Sequence[Row]]
     states: Mapping[str, Fields]  #: deformed states by name
 
@@ -68,12 +68,13 @@ def load_experiment(folder: Path) -> Experiment:
     try:
         index = read_json(path)
         tables = {name: _read_csv(folder / f"{name}.csv") for name in index["tables"]}
+        setting, digests = dict(index["setting"]), dict(index["states"])
     except OSError as e:
         raise InputError(f"{e.filename}: cannot be read: {e.strerror}") from None
     except (ValueError, KeyError, TypeError) as e:
         raise InputError(f"{path}: not the setting of an experiment: {e}") from None
-    states = {name: load_fields(folder, key) for name, key in index["states"].items()}
-    return Experiment(setting=index["setting"], tables=tables, states=states)
+    states = {name: load_fields(folder, digest) for name, digest in digests.items()}
+    return Experiment(setting=setting, tables=tables, states=states)
 
 
 def _read_csv(path: Path) -> list[Row]:

@@ -54,8 +54,9 @@ class Lines:
     """Sole writer of a file of lines.
 
     The writer keeps a digest of the content in memory to detect edits by other
-    programs. The digest is compared when the writer ends, and whenever the time stamps
-    of the file have changed since the last write. Edits between two runs are allowed.
+    programs. The digest is compared when the writer ends without an error, and before a
+    line is appended if the time stamps of the file have changed since the last write.
+    Edits between two runs are allowed.
 
     restored : called with a message after the file has been written again
     """

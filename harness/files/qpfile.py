@@ -90,14 +90,16 @@ def save_qp(
     digits. Equal digests mean equal QPs; a serialised operator and its assembled matrix
     have different digests.
 
-    meta : plain data; the keys ``dense`` and ``maker`` are overwritten
+    meta : plain data; the key ``dense`` and, if P is serialised, ``maker`` are
+        overwritten
     serialised : store a `SerialisableOperator` P by its arrays instead of assembling
         it; only workers of the same run can read such a file
 
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If the file cannot be written, or P is an operator that is too large to be
+        assembled.
 
     Examples
     --------

@@ -8,9 +8,9 @@ The process follows `harness.processes.protocol` and answers four kinds of reque
   built and discarded beforehand
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates the
   point in the file ``point``. Reply: ``{"event": "done", "quantities": {…}, "bounds":
-  {…}, "notes": […]}``, with the physical quantities of the point and the bounds on its
-  error. If ``fields`` is a path and the case defines a deformed state, this state is
-  written to ``fields``
+  {…}, "notes": […], "seconds": …}``, with the physical quantities of the point, the
+  bounds on its error, and the time in which the quantities were computed. If ``fields``
+  is a path and the case defines a deformed state, this state is written to ``fields``
 * ``{"shared": NAME}`` determines, without building the case, whether MPI ranks can emit
   the QP of the case. Reply: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}`` solves the QP in the first file with the reference
@@ -23,7 +23,8 @@ If a case cannot be built, the reply to the first two requests is ``{"event": "d
 lies beyond the last problem of a sequence (`PastEndError`). NAME is ``{"family": …,
 "params": {…}, "form": …, "name": …}``; N is the number of cases to keep in memory. The
 map from a point to physical quantities is code and cannot be stored in a file. A case
-whose QP is in the cache is therefore built again before a point is evaluated.
+whose QP is in the cache, but which is not in memory, is therefore built again before a
+point is evaluated.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ class CaseWorker:
     _cases: dict[str, Case] = field(default_factory=dict)
     _build_seconds: float = 0.0  # duration of the last build, s
     _build_peak_mib: float | None = None  # peak memory during the last build, MiB
-    _warm: bool = False  # True once a dual case has been built
+    _warm: bool = False  # True once a dual case, or a case "first", has been built
     #: error bounds and note (see `certified`) by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict

@@ -31,10 +31,10 @@ class Footprint:
         """Return the memory of a tree, in MiB.
 
         Resident sizes are cheap to read, but their sum counts a shared page once per
-        process. If this sum exceeds `limit`, in MiB, the proportional set sizes are
-        read instead. Proportional sizes divide the size of a shared page among the
-        processes that map it, but the kernel has to walk all page tables to compute
-        them.
+        process. If the sum over several processes exceeds `limit`, in MiB, the
+        proportional set sizes are read instead. Proportional sizes divide the size of a
+        shared page among the processes that map it, but the kernel has to walk all page
+        tables to compute them.
         """
         tree = list(tree)
         self.notice(tree)

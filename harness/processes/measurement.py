@@ -329,7 +329,7 @@ def measure_once(
     *,
     source: Source = Source.FILE,
 ) -> tuple[Record, Solution | None]:
-    """Measure once without limits, judge the answer, and evaluate its quantities.
+    """Measure once without limits, judge the answer, compute quantities and bounds.
 
     case : returns the case; the first call builds it
     reference : reference solver, called if the residuals alone do not decide the

@@ -295,7 +295,7 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
 class RankCosts(NamedTuple):
     """Costs of a solve on several ranks, each a pair (mean, largest) over the ranks.
 
-    The tables are empty for a solve in a single process.
+    The tables are empty for a solve in a single process and for copies.
     """
 
     seconds: Mapping[str, tuple[float, float]] = {}  #: times in s by category of work
@@ -345,8 +345,8 @@ class ParallelSolver:
         -------
         a placeholder QP of the same sizes, and the entries of the event "emitted": the
         `sizes` and the `digest` of the QP, and the time of the slowest rank, in s. If
-        the emission fails, the sizes are zero and `declines` or `prepare` reports the
-        failure.
+        the emission fails, the placeholder has size zero, the entries are empty, and
+        `declines` or `prepare` reports the failure.
 
         """
         self._order({"case": dict(case), "memory_limit": memory_limit})

@@ -18,8 +18,8 @@ answers three kinds of requests:
   MPI ranks (`harness.plugin.Family.emission`), measure, and write the point to ``out``.
   If the request has the entry ``first``, the ranks emit the case in that entry
   beforehand. If ``source`` is "ranks", the ranks also evaluate the answer. The event
-  ``emitted`` contains the ``sizes`` and the ``digest`` of the QP; the event
-  ``measured`` is sent when the point has been written
+  ``emitted`` contains the ``sizes``, the ``digest`` and the ``build_seconds`` of the
+  QP; the event ``measured`` is sent when the point has been written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
 Every measurement loads the QP again, so that modifications by a solver do not affect
@@ -117,7 +117,7 @@ class _SolverHost:
         self.parallel: ParallelSolver | None = None
 
     def warm_up(self) -> dict[str, Any]:
-        """Solve a QP with bounds and a QP with constraint rows; ignore the results.
+        """Solve a QP with bounds, and one with bounds and rows; ignore the results.
 
         Code that is compiled or loaded at its first use must not be timed. The QPs
         model a chain of springs, long enough for solvers to enter most of their

@@ -61,7 +61,8 @@ def refuse_links(folder: Path) -> None:
 
     The folder may come from an untrusted source. Through a link, files outside the
     folder could be overwritten or deleted. Opening a pipe could block forever. Deeply
-    nested folders could cause a stack overflow.
+    nested folders could cause a stack overflow. Files and folders whose names commands
+    do not use are ignored.
 
     Raises
     ------

@@ -83,8 +83,8 @@ def read_journal(
     """Read all records of a result folder, in the order of file names and lines.
 
     Every run_id occurs once in the result: a line is skipped if its record equals an
-    earlier record. Equal strings and tables of different records are stored only once
-    in memory.
+    earlier record. Equal strings and tables of different records in one file are stored
+    only once in memory.
 
     tell : called with a message of one line if lines are skipped
 

@@ -32,7 +32,7 @@ class Commands:
 
 @dataclass(frozen=True, kw_only=True)
 class WorkUnit:
-    """A block: measurements of all solvers on one case, or on one sequence."""
+    """A block: the remaining measurements of all solvers on one case or sequence."""
 
     number: int
     #: incomplete records of each solver, in the order of measurement: one record for a

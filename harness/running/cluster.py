@@ -4,8 +4,8 @@ Every Dask worker executes one block at a time, under the same supervision as in
 on one machine. A task is one turn of a block: the measurement of one solver on one case
 or on the steps of one sequence. The parent stores the records of a turn before it
 submits the next turn. If a worker is lost, another worker measures the turns that the
-lost worker did not return, and their records count as a separate block. Only the parent
-writes to the result folder.
+lost worker did not return; if the lost worker had returned some turns, the records of
+the others count as a separate block. Only the parent writes to the result folder.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:  # this module imports the optional package distributed
 
 LOCAL = "local"
 CONNECT_SECONDS = 10  #: time limit for connecting, and for fetching a finished result
-#: time between two checks for workers that joined or were lost
+#: longest time between two checks for workers that joined or were lost
 CLUSTER_POLL_SECONDS = 2.0
 MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up
 #: exit code of a process in which importing the main script starts a run
@@ -74,7 +74,7 @@ def on_cluster(
     leaves no folder.
 
     address : address of a scheduler, or "local" to start a scheduler with a worker for
-        each CPU of this machine
+        each CPU that this process may use
     plugins : files that must exist under the same paths on every node
     operators : makers of operators P by name, except those of `plugins`
     environment : environment of this process, with which nodes are compared
@@ -84,8 +84,9 @@ def on_cluster(
     Raises
     ------
     InputError
-        If Dask is not installed or the scheduler does not answer. During the execution
-        of blocks, also if a node is unsuitable or the scheduler is lost.
+        If Dask is not installed, the scheduler does not answer, or the processes of a
+        local cluster cannot import the main script. During the execution of blocks,
+        also if a node is unsuitable or the scheduler is lost.
 
     """
     try:
@@ -185,7 +186,7 @@ class Nodes:
 
 @dataclass(eq=False, kw_only=True)
 class _ActiveBlock:
-    """Block in progress; at any time, exactly one of its turns is a Dask task."""
+    """Block in progress; if it has a worker, one of its turns is a Dask task."""
 
     block: WorkUnit
     turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet

@@ -94,7 +94,7 @@ class ExecutorPlugin(WorkerPlugin):
         Raises
         ------
         InputError
-            If this machine is unsuitable for measurements.
+            If this machine is unsuitable for measurements, or its disk is full.
 
         """
         try:

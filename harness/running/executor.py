@@ -304,6 +304,16 @@ class Executor:
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
+        """Send a request to build or to evaluate a case, and return the answer.
+
+        Raises
+        ------
+        _BuildError
+            If the case cannot be built or evaluated.
+        FaultError
+            If the harness or the machine failed.
+
+        """
         is_limited = block.warm_up is not None
         # retry once: the process may have been killed from outside, or an earlier case
         # may have crashed it
@@ -321,8 +331,10 @@ class Executor:
             refuse_full_disk(self.scratch, reply.message)
             if reply.fault:
                 raise FaultError(reply.message)
-            case = block.turns[0][0].case
-            raise _BuildError(f"{case} could not be built: {reply.message}", "")
+            what = "built" if "build" in request else "evaluated"
+            case = request.get("build") or request["describe"]
+            reason = f"{case['name']} could not be {what}: {reply.message}"
+            raise _BuildError(reason, "")
         if "unbuilt" in reply.answer:
             refuse_full_disk(self.scratch, reply.answer["unbuilt"])
             answer = reply.answer

@@ -25,7 +25,7 @@ class Ratio(NamedTuple):
     high: float  #: upper end of the interval
     #: number of pairs; for samples that are not paired, the size of the smaller sample
     pairs: int
-    paired: bool = True  #: False for samples without a common block
+    paired: bool = True  #: False for samples with fewer than two common blocks
 
     @property
     def half_width(self) -> float:
@@ -61,7 +61,7 @@ def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None
 def unpaired_ratio(
     a: Iterable[float], b: Iterable[float], coverage: float = COVERAGE
 ) -> Ratio | None:
-    """Return the ratio of the mean times of two samples that share no block.
+    """Return the ratio of the mean times of two samples, without pairing by blocks.
 
     The means are geometric, and the interval is Welch's interval [1]_. Disturbances do
     not cancel in this ratio, and the interval does not account for a change of the

@@ -90,8 +90,8 @@ def run(
     InputError
         If `out` is not a result folder, contains results of a different suite, case or
         environment, is in use, or was moved or deleted during the run, or if its disk
-        is full. Any other failure affects only single measurements, which are then
-        missing.
+        is full. Any other failure affects only single cases or measurements, which are
+        then missing.
 
     """
     refuse_foreign(out)
@@ -160,7 +160,7 @@ class _Recorder:
     journal: Journal
     schedule: Schedule
     progress: Progress
-    was_deleted: bool = False  #: True if the folder was deleted after the last outcome
+    was_deleted: bool = False  #: True if the last outcome came after the folder's end
     _counted: set[str] = field(default_factory=set)  # run IDs reported to `progress`
     _faults: dict[str, Fault] = field(default_factory=dict)  # last fault by run ID
 
@@ -173,7 +173,7 @@ class _Recorder:
             If the folder has been moved, or another run has locked it.
         OSError
             If the result cannot be written, for instance because the disk is full; the
-            journal then has no line for this result
+            journal then has no line for this result.
 
         """
         match outcome:

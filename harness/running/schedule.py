@@ -141,7 +141,10 @@ class Schedule:
         return s.repeats if s.precision is None else max(s.repeats, s.max_repeats)
 
     def _is_enough(self, group: Group, tol: float) -> bool:
-        """Return True if the requested precision is reached or the budget is spent."""
+        """Return True if the requested precision is reached or the budget is spent.
+
+        The precision counts as reached if fewer than two solvers remain to compare.
+        """
         assert self.suite.precision is not None
         records = [
             r

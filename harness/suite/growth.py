@@ -4,7 +4,7 @@ Such a suite may only be extended: solvers, cases, tolerances and a `null_arm` m
 added, the number of repeats and the budget may be raised, and a precision may be set or
 tightened. The limits, the accuracy and the solver of each label must not change, since
 the stored measurements depend on these settings. Suites in which these settings agree
-can be united.
+can be united. The name of a suite that has a result folder must not change either.
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If suites differ in a limit, in the accuracy, or in the solver of a label.
+        If suites differ in a limit, in the accuracy, or in the solver or the options of
+        a label.
 
     """
     union: dict[str, Any] = {}

@@ -99,7 +99,8 @@ class Suite:
     #: value. If None, the number of repeats is `repeats`
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
-    #: largest time per case and tolerance in s, if a precision is set
+    #: total time of the solvers per case and tolerance, in s, after which no repeats
+    #: beyond `repeats` are measured, if a precision is set
     budget: float = 600.0
     #: tolerance of the verdicts; None for the tolerance that is passed to the solver
     accuracy: float | None = None
@@ -119,7 +120,7 @@ class Suite:
 
     @property
     def names(self) -> tuple[CaseId, ...]:
-        """All cases: single cases, followed by the steps of sequences."""
+        """All cases: single cases, then the steps of each sequence, once for each θ."""
         return tuple(case for group in self.groups for case in group.cases)
 
 

@@ -29,8 +29,8 @@ libraries](solvers-libraries.md) from the docstrings in `solvers/`.
 
 Every solver is called with the same `tol`, the relative KKT accuracy of the
 non-dimensional QP. The notes explain how each adapter translates `tol` to the stopping
-test of its solver. The status that a solver claims is recorded, but whether its answer
-is verified does not depend on this claim ([comparison policy](fair-play.md)).
+criterion of its solver. The status that a solver claims is recorded, but whether its
+answer is verified does not depend on this claim ([comparison policy](fair-play.md)).
 
 | your QP | try first |
 | --- | --- |

@@ -309,7 +309,7 @@ _COMMANDS = {
             ),
             _Option("--time-limit", "SECONDS", _INSTEAD),
             _Option("--memory-limit", "MIB", _INSTEAD),
-            _Option("--fresh", "", "delete the contents of the result folder first"),
+            _Option("--fresh", "", "delete the previous results in the folder first"),
             _Option(
                 "--dask",
                 "ADDRESS|local",
@@ -317,7 +317,10 @@ _COMMANDS = {
                 "in several processes on this machine; see docs/cluster.md",
             ),
             _Option(
-                "--strict", "", "exit with 1 if a claim is refuted or a solver fails"
+                "--strict",
+                "",
+                "exit with 1 if a claim is refuted, or a solver fails or reaches a "
+                "limit",
             ),
             _Option("--quiet", "", "print only warnings and missing measurements"),
             _JSON,
@@ -442,8 +445,8 @@ _COMMANDS = {
                 "--fail-on",
                 ",".join(GATES),
                 "exit with 1 if, from DIR to DIR2, "
-                "a verdict became worse or a solver "
-                "became significantly slower",
+                "a verdict became worse (worse) or a solver "
+                "became significantly slower (slower)",
             ),
             _Option(
                 "--verbose",

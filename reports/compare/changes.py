@@ -56,7 +56,10 @@ class Pair:
 
     @cached_property
     def log(self) -> float | None:
-        """Mean logarithm of the times after, minus the mean logarithm before."""
+        """Mean logarithm of the times after, minus the mean logarithm before.
+
+        None if the times cannot be compared.
+        """
         a, b = _seconds(self.after), _seconds(self.before)
         if not (self.both_verified and self.same_machine and a and b):
             return None
@@ -276,7 +279,7 @@ def side(interval: Ratio | Mean | None) -> int:
 
 
 def resolved(interval: Ratio | Mean) -> bool:
-    """Return whether a change by the factor `ALIKE` or its inverse would be visible."""
+    """Return whether a change is visible, or one by `ALIKE` or 1/`ALIKE` would be."""
     return side(interval) != 0 or 1 / ALIKE < interval.low <= interval.high < ALIKE
 
 

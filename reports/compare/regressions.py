@@ -14,8 +14,9 @@ Both intervals are unpaired between the folders, which are different sessions.
   their solvers (1.4826 times the median distance, which is the standard deviation of a
   normal law). At least `CELLS` cells are needed to estimate the scatter.
 
-The joint coverage of all intervals is at least 95 %: half of the error probability of
-5 % is assigned to the solvers and half to the cells, and each half is divided evenly
+The intervals of the ratios after / before have a joint coverage of at least 95 %, and
+so have the intervals of the relative ratios: half of the error probability of 5 % is
+assigned to the solvers and half to the cells, and each half is divided evenly
 (Bonferroni) [1]_.
 
 References

@@ -229,7 +229,10 @@ def ranks(means: Array) -> Array:
 
 
 def order_of(means: Array) -> NDArray[np.int64]:
-    """Compare means pairwise, (solvers, solvers): 1: row slower, −1: row faster."""
+    """Compare means pairwise, (solvers, solvers): 1: row slower, −1: row faster.
+
+    The entry is 0 if the means are equal up to rounding, or if one of them is NaN.
+    """
     logs = np.log(means)
     gap = logs[:, None] - logs[None, :]
     return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)

@@ -167,7 +167,7 @@ class ComparisonGroup:
 
     @cached_property
     def shift(self) -> float:
-        """Shift of geometric means: the median over cases of the best time, ≤ 10 s."""
+        """Shift of means: median of the best times of solved cases, at most 10 s."""
         best = self.times.min(axis=1)
         return float(min(LARGEST_SHIFT, np.median(best[np.isfinite(best)])))
 

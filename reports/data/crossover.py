@@ -32,7 +32,7 @@ PRIMAL = KINDS[:2]
 class Route(NamedTuple):
     """Form, decomposition and number of ranks; `MULTIGRID` has a kind of its own."""
 
-    kind: str  #: one of `KINDS`
+    kind: str  #: one of `KINDS`, or the name of another form
     layout: str  #: keys of the decomposition, "feti=16"; empty without decomposition
     ranks: int
 
@@ -58,10 +58,10 @@ class Map:
 
     title: str
     sizes: tuple[int, ...]  #: dofs, ascending
-    #: verified answers of the fastest solver, by dofs
+    #: at each size, the answer of the fastest verified solver; by dofs
     routes: Mapping[Route, Mapping[int, Outcome]]
     stops: Mapping[Route, Stop]
-    #: kinds of routes that are not in `routes` because all solvers declined every case
+    #: kinds of the routes that were left out because all solvers declined every case
     declined: frozenset[str] = frozenset()
 
     @property
@@ -99,13 +99,13 @@ class Crossover(NamedTuple):
     """Comparison of two routes on the sizes that both reached."""
 
     #: smallest number of dofs such that the dual route is significantly faster at this
-    #: and every larger size with repeats; None if the dual route is not significantly
-    #: faster at the largest of these sizes
+    #: and every larger common size with repeats; None if the dual route is not
+    #: significantly faster at the largest of these sizes, or if there are none
     pays: int | None
     smallest: int  #: smallest number of dofs that both routes reached
     largest: int  #: largest number of dofs that both routes reached
     ratio: Ratio  #: time of the primal route relative to the dual one, at `largest`
-    beyond: bool  #: True if the dual route reached larger sizes
+    beyond: bool  #: True if the dual route reached larger sizes than the primal route
     answers: tuple[Outcome, Outcome]  #: answers of both routes at the size `largest`
 
 
@@ -116,7 +116,7 @@ def charged_seconds(r: Record) -> float | None:
 
 
 def charged(o: Outcome) -> Interval | None:
-    """Return the median time from the mesh to the answer, with its interval."""
+    """Return the median time from the mesh to the answer, s; None if incomplete."""
     times = [t for r in o.records if (t := charged_seconds(r)) is not None]
     return median_interval(times) if times else None
 
@@ -126,7 +126,7 @@ def memory(o: Outcome) -> Interval | None:
 
     Building and solving take place in successive processes, so the larger of their
     peaks counts. On several ranks, the ranks build the case themselves, and the peak is
-    the joint memory of all ranks.
+    the joint memory of all ranks. The value is None if no peak of the solves is known.
     """
     peaks = [
         max(r.build_peak_mib or 0.0, r.peak_mib)
@@ -137,7 +137,10 @@ def memory(o: Outcome) -> Interval | None:
 
 
 def crossover_maps(evidence: Evidence) -> list[Map]:
-    """Return a map for each series of meshes that was measured with fresh builds."""
+    """Return a map for each series of three or more sizes, measured with fresh builds.
+
+    A build is fresh if each repeat builds the case anew.
+    """
     fresh = {r.family for r in evidence.records if r.build_peak_mib is not None}
     answers = [
         o

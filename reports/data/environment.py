@@ -41,7 +41,10 @@ def machine(environment: Mapping[str, Any]) -> str:
 
 
 def flatten(data: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the values in nested mappings and lists with their dotted names."""
+    """Return the values in nested mappings and lists with their dotted names.
+
+    A list is a single value unless it contains a mapping or another list.
+    """
     match data:
         case Mapping():
             items = [(str(k), v) for k, v in data.items()]

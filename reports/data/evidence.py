@@ -158,13 +158,16 @@ class Outcome:
 
     @cached_property
     def dualising(self) -> Interval | None:
-        """Median time of dualisation over builds of the case; None for primal forms."""
+        """Median time of dualisation over builds of the case; None if none is recorded.
+
+        Primal forms have no such time.
+        """
         # a set: all measurements on one build record the same time
         return _median({r.dualise_seconds for r in self.records if r.dualise_seconds})
 
     @cached_property
     def with_dualising(self) -> Interval | None:
-        """Median total time including dualisation; None for primal forms."""
+        """Median total time including dualisation; None if `dualising` is None."""
         return _median(
             r.total_seconds + r.dualise_seconds
             for r in self.records
@@ -189,7 +192,7 @@ class Outcome:
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:
-        """Return the sum of integer quantities; None if one is absent."""
+        """Return the sum of integer quantities; None if one is absent or no integer."""
         values = [self.quantities.get(name) for name in names]
         return sum(values) if all(isinstance(v, int) for v in values) else None  # type: ignore[arg-type]
 
@@ -248,7 +251,7 @@ class Evidence:
 
     @cached_property
     def flat(self) -> tuple[Outcome, ...]:
-        """All outcomes, sorted by case and tolerance."""
+        """All outcomes, sorted by case, then tolerance, then solver."""
         return tuple(o for row in self.outcomes.values() for o in row.values())
 
 
@@ -261,8 +264,8 @@ def read_evidence(
     """Read a result folder: journal, environment.json and suite.toml.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
-    warn : function that receives warnings about damaged lines and records whose
-        residuals contradict their verdict
+    warn : function that receives warnings about repeated lines of the journal and about
+        records whose residuals contradict their verdict
 
     Raises
     ------
@@ -337,7 +340,10 @@ def _one_name_per_qp(records: list[Record]) -> list[Record]:
 def _warn_of_contradictions(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
-    """Warn about verified records whose residuals are too large for that verdict."""
+    """Warn about verified records whose residuals are too large for that verdict.
+
+    If a proven optimum decided, the error relative to the optimum is examined instead.
+    """
     wrong = []
     for r in records:
         names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
@@ -419,7 +425,7 @@ def shared(outcomes: Iterable[Outcome]) -> str:
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Sort records by case, tolerance and repeat; keep the last of equal run_ids."""
+    """Sort by case, tolerance, solver and repeat; keep the last of equal run_ids."""
     # run_ids are unique within a journal, but not across several folders
     latest = {r.run_id: r for r in records}
     return tuple(sorted(latest.values(), key=_position))

@@ -8,6 +8,9 @@ called the fastest only if every other competitor is significantly slower:
 - with fewer cases, if the interval of the ratio within blocks (repeats of one session)
   is above 1 on each case.
 
+If two solvers were measured in different sessions, the interval of the unpaired ratio
+must be above 1 on each case, for any number of cases.
+
 Each interval by itself has 95 % coverage. The first solver is wrongly called the
 fastest only if the interval of a competitor that is not slower misses its true ratio;
 therefore this intersection-union test needs no correction for the number of
@@ -69,10 +72,11 @@ class Competitor:
     slower: bool = False  #: True if significantly slower than the first solver
     #: ratio over the cases, or within the blocks of a single case
     ratio: Ratio | None = None
-    #: ratios within blocks, by case
+    #: ratios within blocks (unpaired if fewer than two blocks are common), by case
     by_case: Mapping[str, Ratio] = field(default_factory=dict)
     form: str = ""  #: form of the QPs; empty unless forms are compared
-    #: True if on some case the solver has no block in common with the first solver
+    #: True if `ratio` is over cases, and on some case that both solved, the solver has
+    #: no block in common with the first solver
     apart: bool = False
 
     @property
@@ -122,7 +126,10 @@ class FastestSolver:
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return, by case, the fastest competitor and all competitors tied with it."""
+        """Return, by case, the fastest competitor and all competitors tied with it.
+
+        A competitor without an interval of the ratio to the fastest counts as tied.
+        """
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]
@@ -215,11 +222,11 @@ def _compared(
 
     If their times on a case come from different environments, return the competitor
     without ratios. On each case, the ratio is taken within the blocks in which both
-    were measured. Over cases, each end of Student's interval is moved out to the end of
-    the sign-flip interval if that end is farther out. Student's interval assumes
-    normally distributed logarithms of ratios, the sign-flip interval only a symmetric
-    distribution. Neither assumption is safe for six cases, so both intervals must
-    exclude 1 for a significant difference.
+    were measured (unpaired if there are fewer than two such blocks). Over cases, each
+    end of Student's interval is moved out to the end of the sign-flip interval if that
+    end is farther out. Student's interval assumes normally distributed logarithms of
+    ratios, the sign-flip interval only a symmetric distribution. Neither assumption is
+    safe for six cases, so both intervals must exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):

@@ -68,13 +68,16 @@ class SolverRun:
 
     @cached_property
     def infeasibility(self) -> Vector | None:
-        """(rows,) relative norm of Ax − b; None if it is never positive."""
+        """(rows,) relative norm of Ax − b; None if it is missing or never positive."""
         values = self.numbers("infeasibility")
         return values if values is not None and (values > 0).any() else None
 
     @property
     def two_sided(self) -> Vector | None:
-        """(rows,) number of slipping rows: active components with two bounds."""
+        """(rows,) number of active components with two bounds; None if not recorded.
+
+        In a dual with friction, this is the number of slipping rows.
+        """
         return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:

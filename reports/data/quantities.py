@@ -53,7 +53,7 @@ def elastic(outcome: Outcome) -> bool:
 
 
 def unit(outcome: Outcome, name: str) -> str:
-    """Return the unit of a quantity; empty for a plain number."""
+    """Return the unit of a quantity; empty for a plain number or an unknown unit."""
     plane = _UNITS.get(name, "") if elastic(outcome) else ""
     return plane.removesuffix("/m") if in_space(outcome.quantities) else plane
 
@@ -70,6 +70,8 @@ def known_digits(doubt: float, most: int) -> int:
 
 def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
     """Return the scalars of the quantities by path, with vectors as components.
+
+    A list of more than three values is replaced by a text with their number.
 
     sizes : True for the quantities in `SIZES`, False for all others
     """
@@ -113,10 +115,10 @@ def head(path: tuple[str, ...], outcomes: Sequence[Outcome]) -> str:
 def quantity(
     path: tuple[str, ...], best: Outcome, leaf: Leaf | None, peers: Sequence[Leaves]
 ) -> Cell:
-    """Return a cell of the best answer, with as many digits as all answers support.
+    """Return a cell of the best answer, with one more digit than its peers agree on.
 
     leaf : scalar of the best answer, if it has one at `path`
-    peers : leaves of all answers
+    peers : leaves of all verified answers at the tolerance of the best answer
     """
     if leaf is None or leaf.value is None or isinstance(leaf.value, bool):
         return Cell()

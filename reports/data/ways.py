@@ -106,8 +106,9 @@ def compare_ways(evidence: Evidence) -> Ways:
 
 
 def _has_all_times(r: Record) -> bool:
-    """Return whether a record contains the time of dualisation or has no dualisation.
+    """Return whether a record contains the time of dualisation or does not need it.
 
-    Journals of older versions and cases built by ranks lack this time.
+    Primal forms and records without a total time do not need it. Journals of older
+    versions and cases built by ranks lack it.
     """
     return r.form == PRIMAL or r.total_seconds is None or r.dualise_seconds is not None

@@ -29,7 +29,9 @@ class Cell:
     text: str = ABSENT
     symbol: str = ""  #: symbol before the text, if the format supports it
     after: str = ""  #: small print after the text
-    kind: str = ""  #: a verdict, "best", "tied", "void" (not comparable) or "total"
+    #: a verdict, "best", "tied", "over" (emphasised), "void" (not comparable), "quiet",
+    #: "none", "words" or "total"; empty for a plain entry
+    kind: str = ""
     title: str = ""  #: hover text; run_ids in the format of `sources` become links
     value: float | None = None  #: sort key; None to sort by text
 

@@ -201,7 +201,7 @@ def _line(c: CaseHistories, run: SolverRun, x: Vector, y: Vector) -> Series:
 def _steps(
     c: CaseHistories, run: SolverRun, values: Vector, panel: Panel, height: float
 ) -> list[Series]:
-    """Mark the step types on a curve, omitting overlapping markers."""
+    """Mark the step types on a curve, without overlapping markers of the same type."""
     markers = []
     ends = limits([panel], "x"), limits([panel], "y")
     sizes = 72 * (WIDTH - _BESIDE), 72 * height  # points

@@ -125,7 +125,7 @@ def automatic_scale(fields: Fields) -> float:
 def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     """Draw all bodies, and an enlargement of each contact under load.
 
-    In 3D, draw the surface of the bodies, and the pressure on each contact side.
+    In 3D, draw the surface of the bodies, and the pressure on each loaded contact side.
 
     scale : magnification of the displacement; None: `automatic_scale`
 
@@ -214,7 +214,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 
 def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
-    """Draw the surface of solids, and the pressure on each contact side.
+    """Draw the surface of solids, and the pressure on each loaded contact side.
 
     Several bodies are seen from above, since sides between them are hidden from every
     direction. A single body is seen from the side that touches a rigid body.

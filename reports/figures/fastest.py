@@ -64,7 +64,7 @@ def fastest_figure(
 
 
 def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
-    """Return the first competitors, including the best one of each form."""
+    """Return at most `most` solvers: the first ones, and the best one of each form."""
     every = (*f.competitors, *f.others)
     best = {c.form: c for c in reversed(every)}.values()
     late = [c for c in every[most:] if any(c is one for one in best)]

@@ -36,7 +36,8 @@ def traction_maps(fields: Fields) -> FieldFigure | None:
     """Draw the tractions on the surface of half-spaces; None if there are no tractions.
 
     With friction, arrows show the direction in which the upper body slips, opposite to
-    the shear traction on it. Circles are the exact edges of contact and stick zone.
+    the shear traction on it. Circles are the exact edges of contact and stick zone, if
+    known.
     """
     if fields.dim != 3 or len(fields.cells) or len(fields.contacts) != 1:
         return None

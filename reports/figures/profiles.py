@@ -57,7 +57,7 @@ Ends = tuple[float, float]  #: ends of an axis
 
 
 def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
-    """Distribute solvers over rows by rank, with distinct colours in each row.
+    """Distribute the first `ROW`·`ROWS` solvers by rank over rows of distinct colours.
 
     solvers : all solvers of the report, whose order determines colours and markers
     """
@@ -156,7 +156,7 @@ def _end(ratios: Array) -> float:
 
 
 def _grey(values: Array, ends: Ends, solver: str) -> Series:
-    """Return the grey profile of a solver that is in colour in another row."""
+    """Return the grey profile of a solver that is not coloured in this row."""
     at, share = curve(values, *ends, points=_COARSE)
     return Series(
         x=numbers(at), y=numbers(share.value), look=_GREY, step=True, solver=solver

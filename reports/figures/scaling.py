@@ -83,7 +83,7 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
 
 
 def iterations_figure(plotted: Sequence[SizeSeries], solver: str) -> Figure | None:
-    """Plot the iterations of one solver in every series; None without iterations."""
+    """Plot the iterations of one solver in the first `MOST_SERIES` series, if known."""
     curves = list[Series]()
     keys = list[Key]()
     for series in plotted[:MOST_SERIES]:
@@ -141,7 +141,10 @@ def along(ends: Limits, part: float) -> float:
 
 
 def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
-    """Plot counts of one solver against dofs with fits c·nᵖ; None without counts."""
+    """Plot counts and condition numbers of one solver against dofs, with fits c·nᵖ.
+
+    Condition numbers are not fitted. Return None if there is nothing to plot.
+    """
     points = [(float(n), o) for n, o in series.curve(solver)]
     laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
     title = f"{solver}, {series.title}"
@@ -149,7 +152,7 @@ def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
 
 
 def subdomain_figure(sweep: Sweep) -> Figure | None:
-    """Plot counts of one solver against H/h; None if it reports no counts."""
+    """Plot counts and condition numbers against H/h; None if there are neither."""
     points = [(float(value), o) for value, o in sweep.answers]
     shown = tuple((x, f"{x:g}") for x, _ in points)
     low, high = points[0][0] / 1.15, points[-1][0] * 1.15

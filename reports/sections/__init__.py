@@ -99,7 +99,8 @@ def section(
 
     place : sort key of the section; sections are in ascending order of `place`
     name : anchor, and stem of the section's files
-    needs : title and required measurements, listed in reports without this section
+    needs : title and required measurements, which reports without this section list; a
+        section with empty `needs` is omitted silently
     """
 
     def register(write: Write) -> Callable[[Analysis], Section | None]:
@@ -115,7 +116,7 @@ def section(
 
 
 def sections(analysis: Analysis) -> Iterator[Section]:
-    """Compose all sections; list the omitted ones before the appendix."""
+    """Compose all sections; list the omitted ones with `needs` before the appendix."""
     missing: list[str] = []
     for entry in _entries():
         if entry.place >= APPENDIX and missing:

@@ -29,6 +29,7 @@ from mortarbench.reports.document.formatting import (
     TIMED,
     clean,
     listing,
+    plural,
     power,
     significant,
     tolerance,
@@ -45,7 +46,7 @@ from mortarbench.reports.statistics.growth import Trend
 ACCURACIES = (
     3  #: maximum number of accuracies per form: the tightest, a middle one, the loosest
 )
-FAILURES = 3  #: largest number of failures per form that are described individually
+FAILURES = 3  #: largest number of solvers in a list of failures that are described
 FIRST_ROWS = 8  #: maximum number of rows of the first figure, to fit on a phone screen
 REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
 MOST_SERIES = 4  #: largest number of size series that are described by a sentence each
@@ -66,7 +67,7 @@ def _title(a: Analysis) -> str:
 
 @section(1, "answer", _title)
 def answer(a: Analysis) -> Iterator[Part]:
-    """Name the fastest combination of solver and form, or the fastest of each form."""
+    """Name the fastest combination of solver and form, or of each form."""
     if a.ways.comparisons:
         comparisons = _by_subject(a.ways.comparisons)
         for subject, mine in comparisons.items():
@@ -102,7 +103,7 @@ def forms(a: Analysis) -> Iterator[Part]:
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Return a sentence for use after a colon, in lower case unless a name is first."""
+    """Return a sentence for use after a colon; only an initial name keeps its case."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
@@ -188,8 +189,9 @@ def _statement(
         TEXT("failed", failed, counted),
         TEXT("declined", declined, counted),
         *_reservations(found),
-        f"{len(found) - len(selected)} more tolerances are in the sections below."
-        if len(selected) < len(found)
+        f"{plural(more, 'more tolerance')} {'is' if more == 1 else 'are'} in the "
+        "sections below."
+        if (more := len(found) - len(selected))
         else "",
     )
     return Statement(
@@ -230,7 +232,11 @@ def _forms(f: FastestSolver) -> list[str]:
 def _next_behind(
     f: FastestSolver,
 ) -> tuple[Competitor | None, list[tuple[str, Competitor | None]]]:
-    """Return the next significantly slower solver, and the best of each other form."""
+    """Return the next significantly slower competitor, and the best of further forms.
+
+    A form is further if it differs from the forms of the first, the tied and the next
+    competitors. Its best is None if no solver competes on it.
+    """
     slower = [c for c in f.competitors[1:] if c.slower and c.closest]
     following = slower[0] if slower else None
     named = {c.form for c in (f.first, *f.tied, *slower[:1])}
@@ -243,7 +249,10 @@ def _next_behind(
 
 
 def _depends_on_case(f: FastestSolver) -> bool:
-    """Return whether every tied solver is faster on one case and slower on another."""
+    """Return whether all tied solvers are faster on some case and slower on another.
+
+    Only differences from the first solver that are significant on the case count.
+    """
     known = [c.by_case.values() for c in f.tied]
     return bool(known) and all(
         any(r.low > 1 for r in of) and any(r.high < 1 for r in of) for of in known
@@ -284,7 +293,7 @@ def _faster_elsewhere(f: FastestSolver) -> list[str]:
 
 
 def _shared(f: FastestSolver) -> str:
-    """Count the cases on which each solver was fastest, and the ties."""
+    """Count the cases on which each solver was fastest, and ties; at most 4 counts."""
     count = Counter(
         _name(front[0]) if len(front) == 1 else f"a tie of {_named(front, 2)}"
         for front in f.fronts().values()
@@ -293,7 +302,11 @@ def _shared(f: FastestSolver) -> str:
 
 
 def _best_at(swept: Sweeps, error: float) -> str:
-    """Count the cases on which each solver is the fastest at one certified error."""
+    """Count the cases on which each solver is the fastest at one certified error.
+
+    Ties are counted together. Cases on which fewer than two solvers reach the error, or
+    on which a time is only bounded, do not count.
+    """
     count: Counter[str] = Counter()
     for row in swept.values():
         times = {
@@ -311,7 +324,10 @@ def _best_at(swept: Sweeps, error: float) -> str:
 
 
 def _reason(one: Unverified) -> str:
-    """Return the refuting residual and its limit, or the message of a failed solver."""
+    """Return the refuting residual and its limit, or the message of a failed solver.
+
+    The text is empty for all other verdicts.
+    """
     if one.verdict in (Verdict.CRASHED, Verdict.FAILED):
         return clean(one.answers[0].first.message, 60)
     if one.verdict not in (Verdict.INACCURATE, Verdict.WRONG):
@@ -338,9 +354,9 @@ def _reservations(found: Sequence[FastestSolver]) -> list[str]:
 
 
 def own_results(a: Analysis) -> Iterator[Statement | Picture]:
-    """Summarise the growth of iteration counts, condition numbers, parallel speed-up.
+    """Summarise how iterations grow, the condition numbers, and the speed-up on ranks.
 
-    Yield nothing if the suite has several solvers.
+    Yield nothing unless exactly one solver (null arms aside) was run on one rank.
     """
     firsts = (o.first for o in a.evidence.flat)
     cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
@@ -360,7 +376,10 @@ def own_results(a: Analysis) -> Iterator[Statement | Picture]:
 
 
 def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
-    """Yield a sentence on the growth of iterations, and then one for each series."""
+    """Yield a sentence on the growth of iterations in all series.
+
+    If there are several series, a sentence on each of the first `MOST_SERIES` follows.
+    """
     fits = [(s, fit) for s in sizes if (fit := iteration_growth(s, solver))]
     if not fits:
         return

@@ -1,4 +1,4 @@
-"""Sizes above which dualisation pays, and all routes from the mesh to the answer."""
+"""Sizes from which on dualisation pays, and all routes from the mesh to the answer."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def crossover(a: Analysis) -> Iterator[Part]:
 
 
 def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
-    """Compare every dual route with every primal one."""
+    """Compare every dual route with every primal one that has a common size."""
     return [
         (dual, primal, compared)
         for primal in one.routes
@@ -80,10 +80,11 @@ def _comparisons(one: Map) -> list[tuple[Route, Route, Crossover]]:
 
 
 def _answer(one: Map) -> list[tuple[str, int | None, str]]:
-    """Return each primal route with the size (dofs) from which on a dual route pays.
+    """Return (primal route, size, dual route): from this size (dofs) on, the dual pays.
 
-    Only dual routes that reach the largest size of the primal route are considered. The
-    size is None if no such dual route pays.
+    Each primal route has one entry, for the dual route with the smallest such size.
+    Only dual routes that reach the largest size of the primal route are considered. If
+    none of them pays, the size is None and the dual route is empty.
     """
     best = dict[str, tuple[str, int | None, str]]()
     for dual, primal, at in _comparisons(one):

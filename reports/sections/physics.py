@@ -183,7 +183,7 @@ def tractions(a: Analysis) -> Iterator[Part]:
         name = f"tractions-{family}" + f"-{law}" * (law is not None)
         try:
             fields = load_fields(a.evidence.directory, chosen.first.fields or "")
-        except InputError:  # reported by the section `deformed`
+        except InputError:  # the section `deformed` reports that vectors/ is missing
             continue
         if (maps := traction_maps(fields)) is not None:
             rough = fields.contacts[0].friction is not None

@@ -76,7 +76,7 @@ def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
 
 @section(40, "means", "Means over cases")
 def means(a: Analysis) -> Iterator[Part]:
-    """Tabulate the means of every group."""
+    """Tabulate the means of every ranked group, and name the other groups."""
     if a.rankings:
         yield from TEXT.parts("means", any(r.group.forms for r in a.rankings))
     yield from not_compared(a, reasons=True)
@@ -161,7 +161,7 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
 
 @section(42, "ranking", "Dependence of the ranks on conventions")
 def ranking(a: Analysis) -> Iterator[Part]:
-    """Tabulate the ranks of every group under changed conventions."""
+    """Tabulate the ranks of every ranked group under changed conventions."""
     if a.rankings:
         yield from TEXT.parts("ranking")
     yield from not_compared(a)

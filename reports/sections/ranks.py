@@ -62,7 +62,9 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
     modelled = [s for s in strong if s.model is not None]
     asked = [s for s in modelled if predicted(s)]
     uncopied = any(s.several and not s.copies for s in strong)
-    crowded = any(s.crowded(n) for s in strong for n in s.several)
+    crowded = any(s.crowded(n) for s in strong for n in s.several) or any(
+        s.crowded(m.ranks) for s in weak for m in s.members
+    )
     yield from TEXT.parts("prose", strong, weak, uncopied, crowded, modelled)
     solves = [(s, n, s.answers[n]) for s in strong for n in s.answers]
     if strong:

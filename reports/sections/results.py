@@ -67,7 +67,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
 @section(18, "verdicts", "Claims and verdicts")
 def claims(a: Analysis) -> Iterator[Part]:
-    """Tabulate claims and verdicts, and list the refuted claims."""
+    """Tabulate claims and verdicts; list refuted and unproven claims."""
     yield from TEXT.parts("claims")
     yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
     kinds = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
@@ -84,7 +84,7 @@ def claims(a: Analysis) -> Iterator[Part]:
 
 
 def _refutation(outcome: Outcome) -> Cell:
-    """Return a cell with the residual or the distance that refutes a claim."""
+    """Return a cell with the residual or distance that is too large, and its limit."""
     values = {name: outcome.largest(name) for name in RESIDUALS}
     errors = {name: value for name, value in values.items() if value is not None}
     if (error := outcome.largest("optimum_error")) is not None:

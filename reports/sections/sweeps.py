@@ -33,7 +33,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import Interval
 
 TEXT = Sentences(__name__)
-_PANELS = 4  #: largest number of cases that are drawn; all are tabulated
+_PANELS = 4  #: largest number of cases in a figure; all are tabulated
 ERRORS = (1e-2, 1e-4, 1e-6)  #: certified errors at which times are compared
 LEAST = 3  #: minimum number of tolerances in a sweep
 
@@ -50,7 +50,10 @@ Key = tuple[str, float]  #: case, and the accuracy at which answers are judged
     "certified error at three or more tolerances (see suites/accuracy.toml).",
 )
 def accuracy(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw every sweep, by certified errors or else by residuals."""
+    """Tabulate all sweeps; draw the first ones, by certified errors or by residuals.
+
+    Only the sweeps of cases without enough certified errors are drawn by residuals.
+    """
     solvers = a.evidence.solvers
     if certified := certified_sweeps(a.evidence):
         yield from TEXT.parts("certified")
@@ -111,7 +114,7 @@ def _present(
 def _cheapest_of(
     row: Mapping[str, Sequence[Outcome]],
 ) -> dict[str, tuple[Interval, Outcome]]:
-    """Select the fastest verified answer of each solver."""
+    """Select the fastest verified answer of each solver that has one."""
     timed = {
         s: [(t, o) for o in of if o.verified and (t := o.seconds("total"))]
         for s, of in row.items()
@@ -177,10 +180,10 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
 
 
 def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
-    """Return "best" or "tied" for the fastest solvers of a row.
+    """Return "best", "tied" or "" for each solver of a row with an interpolated time.
 
     A time that is only bounded from above gets no entry. Because the true time may be
-    the smallest of the row, no other time of the row is marked as the best.
+    the smallest of the row, no other time of the row is then marked as the best.
     """
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:

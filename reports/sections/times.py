@@ -120,11 +120,11 @@ def ratios(a: Analysis) -> Iterator[Part]:
         return
     fastest = {key: _fastest(row) for key, row in a.evidence.outcomes.items()}
     apart = any(
-        not (o.by_block.keys() & best.by_block.keys())
+        (relative := ratio_of(o.by_block, best.by_block)) and not relative.paired
         for key, row in a.evidence.outcomes.items()
         if (best := fastest[key]) is not None
         for o in row.values()
-        if o.verified
+        if o.verified and o is not best
     )
 
     def ratio(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:

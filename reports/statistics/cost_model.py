@@ -7,9 +7,10 @@ rank repeats work or waits for others (Amdahl [1]_). s is the slowdown of a rank
 the other ranks are busy: the time of simultaneous copies of the job, one per rank,
 divided by the time of a single job. A rank of a shared job uses less memory than a copy
 and may disturb the other ranks less; therefore s is limited to the largest value that
-leaves C ≥ 0, but is at least 1. The other terms are communication [2]_: R reductions
-over all ranks, and M messages with b bytes in total to neighbouring ranks. A reduction
-has the latency α_R, a message has the latency α, and a byte takes β seconds.
+leaves C ≥ 0, or to 1 if this value is smaller. The other terms are communication [2]_:
+R reductions over all ranks, and M messages with b bytes in total to neighbouring ranks.
+A reduction has the latency α_R, a message has the latency α, and a byte takes β
+seconds.
 
 W and C are fitted to measured times; s, α_R, α and β are measured; R, M and b are
 counted. All of this is done on the ranks of the run. Superlinear speed-up cannot be

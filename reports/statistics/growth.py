@@ -2,8 +2,8 @@
 
 Growth is judged by its magnitude. The values change by the factor 10ᵖ when n is
 multiplied by ten; the 95 % interval of this factor is compared with 1 ± `PRACTICAL`. A
-test of the hypothesis p ≤ 0 would report 19, 22, 22, 22, 22 as growth, and would report
-irrelevant growth as significant whenever the counts scatter little.
+test of the hypothesis p ≤ 0 would report irrelevant growth, such as that of the counts
+1000, 1001, 1002, 1003, as significant whenever the counts scatter little.
 
 References
 ----------

@@ -23,7 +23,7 @@ from scipy.special import betainccinv, betaincinv
 
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-POINTS = 200  #: maximum number of points of a curve; curves with more are sampled
+POINTS = 200  #: maximum number of steps of a curve; curves with more are sampled
 
 Array = NDArray[np.float64]
 

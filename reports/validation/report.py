@@ -257,9 +257,9 @@ def _discretisation(meshes: Sequence[Discretisation]) -> Iterator[Part]:
 
 
 def _left_out(data: Data) -> Iterator[Part]:
-    """Tabulate measurements without a claim, and answers that could not be judged."""
+    """Tabulate measurements without a claim of success, and answers not judged."""
     for name, caption in (
-        ("unanswered", "Measurements that ended without a claim."),
+        ("unanswered", "Measurements that ended without a claim of success."),
         ("not_validated", "Stored answers that could not be judged."),
     ):
         grouped: dict[tuple[str, str], list[str]] = {}

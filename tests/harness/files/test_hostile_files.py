@@ -21,7 +21,7 @@ from scipy.sparse import csc_array, csc_matrix
 
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, InputError, no_rows
-from mortarbench.harness.files.datafile import VARIABLE
+from mortarbench.harness.files.datafile import MIB, VARIABLE, check_size
 from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import SerialisableOperator
@@ -268,6 +268,13 @@ HOSTILE_NPZ = [
     (header_only("(" * 110), "not an npz file"),
     (header_only("x" * 60000), "not an npz file"),
 ]
+
+
+def test_a_size_just_above_the_limit_is_not_rounded_down_to_the_limit(monkeypatch):
+    monkeypatch.setenv(VARIABLE, "8")
+    check_size("the file", 8 * MIB)
+    with pytest.raises(InputError, match=r"would take 9 MiB.*at most 8"):
+        check_size("the file", 8 * MIB + 1)
 
 
 def test_an_archive_that_expands_is_refused_before_it_is_read(

@@ -245,3 +245,17 @@ def test_a_report_without_ranks_states_the_requirements(manufactured):
     (absent,) = (s for s in page.sections if s.name == "absent")
     assert any("ranks = [1, 2]" in point for point in absent.points)
     assert "ranks" in [s.name for s in compose(manufactured).sections]
+
+
+def test_weak_scaling_alone_explains_grey_numbers_and_needs_no_model():
+    records = [
+        r
+        for r in rank_records(sizes=[DOFS // 4, DOFS], ranks=[1, 4])
+        if not r.role and (r.ranks == 4) is r.case.endswith("S=100/dual")
+    ]
+    alone = evidence(records, cpus=2)
+    assert weak_series(alone)
+    assert not strong_series(alone)
+    said = " ".join(ranks(Analysis(alone)).prose)
+    assert "Grey numbers are for more ranks" in said
+    assert "There is no cost model" not in said

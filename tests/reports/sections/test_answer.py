@@ -322,6 +322,11 @@ def test_only_a_few_of_many_tolerances_are_described(record, opened):
     ]  # fmt: skip
     assert "5 more tolerances are in the sections below." in statement.remarks
 
+    fewest = [r for r in records if r.tol > 1e-6]
+    assert (
+        "1 more tolerance is in the sections below." in opened(fewest)["dual"].remarks
+    )
+
 
 def test_a_null_arm_does_not_compete(record, opened):
     records = one_case(record, a=1.0, b=2.0)
