@@ -257,7 +257,7 @@ def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]
 
 
 def bodies(params: Mapping[str, Value]) -> ElasticBodies:
-    """Return the stacked blocks, with `lower` and `upper` cells along x (and y)."""
+    """Return the stacked blocks; the keys `lower`, `upper` are cells along x (and y)."""
     p: Any = params
     if p["dim"] == 3:
         return _bodies_in_space(params)

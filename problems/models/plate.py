@@ -5,7 +5,7 @@ of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In s
 subdomains, the modulus is multiplied by `jump`: in every other subdomain
 (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
 contact; therefore, the dual has equality constraints only. Condition numbers of the
-dual measure the scalability of the method independently of load, stopping test and
+dual measure the scalability of the method independently of load, stopping criterion and
 units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
