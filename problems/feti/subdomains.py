@@ -150,7 +150,7 @@ class DecomposedProblem:
         if (positions := self.layout.positions) is None:
             raise InputError(
                 f"cluster={self.cluster} is not built for subdomains that do not form "
-                "a grid; expected no cluster, or a family with structured meshes"
+                "a grid; expected no cluster, or bodies cut into grids of subdomains"
             )
         places = np.column_stack([self.layout.body, positions // self.cluster])
         return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)

@@ -28,7 +28,7 @@ class LocalProblems:
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n), which maps global components to torn unknowns."""
+        """T (N, n), which maps the components of local nodes to torn unknowns."""
         return self.torn.spread
 
     @property
