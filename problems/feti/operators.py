@@ -20,8 +20,8 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel
     B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
 
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
-condensed onto the union g of b and the whole boundary of a subdomain, and the weights W
-= 1 (multiplicity) or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ
+condensed onto the union g of b and the boundary of a subdomain, and the weights W = 1
+(multiplicity) or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ
 singular. Its diagonal block for the equality rows is itself block diagonal, with one
 block per node. The Moore-Penrose inverse of this block keeps λ free of components in
 ker Bᵀ.

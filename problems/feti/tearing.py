@@ -243,8 +243,8 @@ def congruent(
 
     Returns
     -------
-    mask (g,) of the images, and rotations Q (g, dim, dim); for images, x − x̄ =
-    Q (x₁ − x̄₁) up to rounding, where x₁ is the first point set
+    mask (g,) of the images, and rotations Q (g, dim, dim); for images,
+    x − x̄ = Q (x₁ − x̄₁) up to rounding, where x₁ is the first point set
 
     """
     x = points - points.mean(axis=1, keepdims=True)

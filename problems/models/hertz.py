@@ -6,8 +6,8 @@ with the pressure
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
-Bodies are half discs. A uniform pressure acts on the flat side of the upper one, and
-under a tangential force also on that of the lower one. The force is prescribed, since
+Bodies are half discs. A uniform pressure acts on the flat side of the upper body, and
+with a tangential force also on that of the lower body. The force is prescribed, since
 the theory does not determine the approach. Contact alone supports the upper body
 vertically; therefore, the form ``dual-bounds`` does not exist.
 

@@ -91,7 +91,8 @@ from mortarbench.problems.feti.tearing import blocks, grid_positions
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
 STEEL = Material(E=210e9, nu=0.3)
-#: preconditioner and scaling for each spectrum; None means no preconditioner
+#: mapping from the name of a spectrum to its preconditioner and scaling; None means no
+#: preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
     "none": None,
     "lumped": ("lumped", "multiplicity"),

@@ -97,7 +97,7 @@ class NamedMesh(NamedTuple):
 
     points: NDArray[np.float64]  #: (N, dim) positions of the nodes
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in 3D)
+    surfaces: Mapping[str, Nodes]  #: numbers of the cells of each body
     #: edges (k, 2) of each named curve, with the body on their left; in 3D, faces
     #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
