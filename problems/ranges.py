@@ -100,8 +100,7 @@ CLUSTERS = schema(cluster=key(0, 0))
 #: the side of a subdomain, H/h, or 0 for undivided bodies
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
 DIMENSION = schema(dim=choice(2, 3))
-#: keys that three-dimensional families do not support yet, with their only allowed
-#: value
+#: mapping from a key to its only value that three-dimensional families support
 PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
 #: mapping from a friction law to the key of its parameter; empty if the law has no
 #: parameter
@@ -129,7 +128,7 @@ KINEMATICS = schema(
 #: key of the contact stiffness: `geometric` adds the second derivatives of the gaps to
 #: the tangent
 CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
-#: keys that are not supported with finite strain, with their only allowed value
+#: mapping from a key to its only value that is supported with finite strain
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0,
     "parts": 0,
@@ -312,7 +311,7 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
 
 
 def check_dimension(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError if dim=3 is combined with keys of plane problems."""
+    """Raise InputError if dim=3 is combined with a value for plane problems only."""
     if params["dim"] == 3:
         check_plane_only(family, params, "dim=3")
 

@@ -86,8 +86,8 @@ class ContactSides:
 class UnassembledBodies:
     """Bodies without stiffness matrix: mesh, materials, supports, load, contact sides.
 
-    Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
-    divided by `length`, forces (in 2D per thickness) by `force`.
+    Nodes are numbered body by body. f is non-dimensional: forces (in 2D per thickness)
+    are divided by `force`.
 
     Raises
     ------
@@ -157,7 +157,7 @@ class UnassembledBodies:
 
     @property
     def moduli(self) -> Vector:
-        """Young's modulus of each body, (bodies,), non-dimensional like K."""
+        """Young's modulus of each body times l/F₀, the factor of K', (bodies,)."""
         return np.array([m.E for m in self.materials]) * (self.length / self.force)
 
     @property

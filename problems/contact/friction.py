@@ -7,8 +7,8 @@ attains its bound; where |q| is smaller, the sides stick:
 
 with the pressure p, where mu = 0 under Tresca's law and bound = 0 under Coulomb's. The
 force λ_t of a discrete row satisfies  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is
-the length of the slave side assigned to the node of the row, and λ_n is the multiplier
-of the contact row of this node.
+the length (in 3D, the area) of the slave side assigned to the node of the row, and λ_n
+is the multiplier of the contact row of this node.
 
 Coulomb's law does not derive from a potential. It is solved by fixed-point iteration
 over problems with Tresca's law, each with the bound g = mu·λ_n from the solution of its

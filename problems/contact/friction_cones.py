@@ -68,7 +68,7 @@ class FrictionalContact:
     Raises
     ------
     InputError
-        If W is not symmetric, because the problems of the loops would not be convex.
+        If W is not symmetric, because a QP requires a symmetric Hessian.
 
     """
 
@@ -93,7 +93,10 @@ class FrictionalContact:
             object.__setattr__(self, "A", no_rows(self.q.size))
 
     def check_convex(self) -> None:
-        """Raise InputError if W has a negative eigenvalue beyond rounding errors."""
+        """Raise InputError if W has a negative eigenvalue beyond rounding errors.
+
+        If W has more than `MAX_DENSE_ROWS` rows, negative eigenvalues are not detected.
+        """
         least = self._eigenvalues[0]
         if least < -RANK_TOLERANCE * self.stiffness:
             raise InputError(
@@ -146,7 +149,7 @@ class FrictionalContact:
         """Return the scaled natural map, which is zero at solutions.
 
         The result is  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖  with the projector Π onto
-        the friction cones.
+        the friction cones. A denominator that is zero is replaced by 1.
 
         Parameters
         ----------
@@ -216,12 +219,15 @@ def coulomb_steps(
 ) -> list[ConvexStep]:
     """Return the first convex problems of a sequence for Coulomb's law.
 
+    The list ends at convergence. In the loop ``tresca``, it begins with the first
+    problem over ‖r_T‖ ≤ g, after the problem over the cones.
+
     Parameters
     ----------
     loop : name of the sequence, one of `LOOPS`
     solve : function that solves a convex problem and raises ArithmeticError if the
         problem has no solution
-    count : largest number of problems; with 0, the sequence ends at convergence
+    count : largest number of problems; 0 for no limit
 
     Raises
     ------

@@ -81,7 +81,8 @@ def linearisation(
         if not any(part.c.size for part in parts) and not u.any():
             raise InputError(
                 "no node of a slave side faces its master within reach; expected two "
-                "sides that face each other, each with its body on the left"
+                "sides that face each other, each with its body on the left (in 3D, "
+                "with outward normals)"
             )
         if len(parts) == 1:
             return parts[0]

@@ -19,8 +19,8 @@ Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
 The friction forces are −Tᵀλ_t, by analogy with the contact forces −Bᵀλ.
 
-For slave nodes beyond an end of the master, the closest point is the end node of the
-master, and n is the normal of its last segment.
+For slave nodes beyond an end of the master, the closest point is the node at this end,
+and n is the normal of the segment at this end.
 
 A slave node can be assigned to a fixed segment. The node then stays on the outer side
 of the whole line through this segment, irrespective of its closest point. Newton's
@@ -60,16 +60,20 @@ class ContactRows(NamedTuple):
     c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row with friction
     row: Nodes  #: (k,) contact row of each tangential row
-    #: (m_I,) ∫N_j over the slave side, the length in m (2D) or the area in m² (3D) that
-    #: is assigned to the row
+    #: (m_I,) ∫N_j over the slave side (for mortar contact, over its covered part, and
+    #: with the weight |ν| in 2D), the length in m (2D) or the area in m² (3D) that is
+    #: assigned to the row
     share: Vector
-    place: Nodes  #: (m_I,) index of the slave node of each row in the slave chain
+    #: (m_I,) index of the slave node of each row in `ContactPair.slave_nodes`
+    place: Nodes
 
 
 class ClosestPoints(NamedTuple):
     """Closest points of s positions on a chain of nodes."""
 
-    segment: Nodes  #: (s,) first node of the segment with the closest point
+    #: (s,) position in the chain of the first node of the segment that contains the
+    #: closest point
+    segment: Nodes
     xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
     normal: Points  #: (s, 2) outward unit normal of the master at the closest point
 
@@ -142,8 +146,9 @@ def geometric_stiffness(
 
         g'' = a''/L − (a' L'ᵀ + L' a'ᵀ)/L² − a L''/L² + 2a L' L'ᵀ/L³.
 
-    If the closest point is a vertex of the master, the block is set to zero, because
-    the derivative of the averaged normal is not implemented.
+    If the closest point is a vertex of the master and the segment is not fixed, the
+    block is set to zero, because the derivative of the averaged normal is not
+    implemented.
 
     Parameters
     ----------
@@ -203,9 +208,10 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
 def _projections(
     x: Points, line: Surface, fixed_segments: Nodes | None
 ) -> ClosestPoints:
-    """Return closest points of slave nodes x (s, 2), or projections on fixed segments.
+    """Return closest points of slave nodes x (s, 2) on the master.
 
-    On the line of a fixed segment, ξ may be outside [0, 1].
+    A node with a fixed segment is projected onto the line through this segment, where ξ
+    may be outside [0, 1].
     """
     closest = closest_points(x, line)
     if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():

@@ -127,12 +127,12 @@ def friction_quantities(
     """Return counts of friction states, the residual of Coulomb's law and dissipation.
 
     `open`, `stick` and `slip` are the numbers of frictional contact rows that are
-    inactive, active below the bound, and active at the bound. `sliding_without_contact`
-    is the number of inactive rows with shear, which Tresca's law allows; these rows do
-    not count as open. `shear_without_contact` is the fraction of Σ‖λ_t‖ that acts on
-    these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for Coulomb's law and 0 for
-    Tresca's. `dissipation` is the work of friction in this step, Σ g‖Tu − s‖, in J/m (J
-    in 3D).
+    inactive, active and sticking, and active and slipping, see `states`.
+    `sliding_without_contact` is the number of inactive rows with shear, which Tresca's
+    law allows; these rows do not count as open. `shear_without_contact` is the fraction
+    of Σ‖λ_t‖ that acts on these rows. `friction_residual` is ‖g − mu·λ_n‖/‖g‖ for
+    Coulomb's law and 0 for Tresca's. `dissipation` is the work of friction, Σ g‖Tu −
+    s‖, in J/m (J in 3D).
     """
     state = states(primal, s, friction)
     shear = norms(s.z[primal.h.size :][friction.vectors])
@@ -155,13 +155,13 @@ def pair_results(
 ) -> dict[str, dict[str, Any]]:
     """Return the results of each contact pair by its name.
 
-    `force` is the force on each body of the pair in N/m; `largest_pressure` is the
-    largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if bodies
-    overlap, and None if no slave node has a row; `half_width` is half the undeformed
-    length in m of the slave side under pressure (in 3D, `pressed_area` is its area in
-    m²). With friction, `friction_force` is the contribution of friction to the force on
-    the slave in N/m, and `stick` and `slip` are the numbers of sticking and slipping
-    slave nodes.
+    `force` is the force on each elastic body of the pair in N/m; `largest_pressure` is
+    the largest nodal pressure on the slave in Pa; `smallest_gap` in m is negative if
+    bodies overlap, and None if no slave node has a row; `half_width` is half the
+    undeformed length in m of the slave side under pressure (in 3D, `pressed_area` is
+    its area in m²). With friction, `friction_force` is the contribution of friction to
+    the force on the slave in N/m, and `stick` and `slip` are the numbers of sticking
+    and slipping slave nodes.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)
@@ -230,8 +230,9 @@ def contact_forces(
     s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> NDArray[np.float64]:
-    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m.
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim).
 
+    The unit is N/m (N in 3D).
     The sign is that of f − Bᵀλ in eq. (6) of the paper.
     """
     B, _ = contact_rows(primal, friction)
@@ -241,7 +242,7 @@ def contact_forces(
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
     """Recover nodal stresses (N,) by name, Pa, from the displacement u (n,), m.
 
-    The components are sxx, syy and sxy in 2D, with szz = ν(σ_x + σ_y) in plane
+    The components are sxx, syy and sxy in 2D, with szz = ν(sxx + syy) in plane
     strain, and all six in 3D. `von_mises` is computed from the recovered components
     instead of being recovered itself, so that all values are consistent.
     """

@@ -62,7 +62,10 @@ class Reach:
 
 
 class Chords(NamedTuple):
-    """One level of the tree: sub-chains of equally many segments, in chain order."""
+    """One level of the tree: sub-chains in the order of the chain.
+
+    All sub-chains have equally many segments, except that the last may have fewer.
+    """
 
     start: Points  #: (k, 2) position of the first node, m
     edge: Points  #: (k, 2) vector from the first to the last node, m

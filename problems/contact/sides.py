@@ -102,11 +102,11 @@ def contact_sides(
 def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     """Classify tangential vectors (v,) as "open", "stick", "slip" or `SLIDING`.
 
-    A vector of an inactive row is open, or `SLIDING` if its shear is nonzero, which
-    Tresca's law allows and Coulomb's does not. A vector of an active row sticks if its
-    slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, with the bound g, the shear λ_t and the
-    rows T. This value estimates the slip that the unused part of the bound would cause
-    if only the nodes of the row could move.
+    A vector of an inactive row is open, or `SLIDING` if it has a significant shear,
+    which Tresca's law allows and Coulomb's does not. A vector of an active row sticks
+    if its slip is at most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, with the bound g, the shear λ_t
+    and the rows T. This value estimates the slip that the unused part of the bound
+    would cause if only the nodes of the row could move.
     """
     vectors = friction.vectors
     if not vectors.size:
@@ -131,7 +131,7 @@ def active(normal: Vector) -> NDArray[np.bool_]:
 
 
 def pair_names(bodies: Bodies | ContactSides) -> list[str]:
-    """Return the names "SLAVE on MASTER" of all pairs; repeated names are numbered."""
+    """Return the names "SLAVE on MASTER" of all pairs; repetitions get a number > 1."""
     names: list[str] = []
     for pair in bodies.pairs:
         slave, master = bodies_of(bodies, pair)

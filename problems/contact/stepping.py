@@ -127,7 +127,7 @@ class LinearisedProblem(Protocol):
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the bound of `friction`.
 
-        start : solution for another bound, used as initial guess
+        start : solution for another bound, which may serve as initial guess
         """
 
     def normal_multipliers(self, s: Solution) -> Vector:

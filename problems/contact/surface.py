@@ -22,7 +22,9 @@ from mortarbench.problems.fem.mesh import (
 Points = NDArray[np.float64]  #: (…, dim) positions in m, or dimensionless vectors
 
 #: segments shorter than this fraction of the longest segment of their chain count as
-#: points, because their direction is dominated by rounding
+#: points, because their direction is dominated by rounding; likewise, faces with an
+#: area below this fraction of the largest one, and sums of unit normals shorter than
+#: this value count as zero
 MIN_RELATIVE_LENGTH = 1e-12
 
 

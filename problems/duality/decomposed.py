@@ -157,9 +157,9 @@ def distributed_qp_of(
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, if the ranks computed different
-        subdomains, or if the fixed-point iteration for Coulomb's law does not converge
-        or takes fewer iterates than the number that `choice` selects.
+        If there are fewer subdomains (or clusters) than ranks, if the ranks computed
+        different subdomains, or if the fixed-point iteration for Coulomb's law does not
+        converge or takes fewer iterates than the number that `choice` selects.
 
     """
     path = decomposed_path(problem, choice, ranks, reference)

@@ -39,8 +39,8 @@ class Transformed(NamedTuple):
     recover: Callable[[Solution], Solution]
     sign: float  #: primal objective = sign·new objective + constant, at the solutions
     constant: float
-    #: function that returns a primal point (n,), which is valid at the interface only;
-    #: it is cheaper than `recover`
+    #: function that returns a primal point (n,), which may be valid at the interface
+    #: only; for undivided bodies, it is cheaper than `recover`
     interface_displacement: Callable[[Solution], Vector]
 
 

@@ -1,4 +1,4 @@
-"""Load steps of undivided bodies in contact, with one factor of K for all QPs.
+"""Load steps of undivided bodies in contact, with one factor of K per set of supports.
 
 Contact rows are linearised at the displacements of the contact sides. These
 displacements are computed from the dual solution of the previous step by a product with

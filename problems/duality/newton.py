@@ -40,9 +40,9 @@ segments. If the iteration does not converge, pressing nodes (those with multipl
 keeps its segment. It may slide slightly beyond the ends of the segment, along the
 straight line through both ends.
 
-*Convergence*: the iteration stops when `NewtonPath.residual`, evaluated at the new
-iterate with the multipliers of the QP, is at most TOLERANCE plus a bound on its
-rounding error.
+*Convergence*: the iteration stops after a full step if `NewtonPath.residual`, evaluated
+at the new iterate with the multipliers of the QP, is at most TOLERANCE plus a bound on
+its rounding error.
 
 *Load*: if the iteration fails, the load increment is halved, down to the fraction
 2^−MAX_HALVINGS of the load step.
@@ -93,7 +93,9 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.mesh import dofs_of
 
-TOLERANCE = 1e-9  #: largest `NewtonPath.residual` at the end of a load step
+#: largest `NewtonPath.residual`, minus a bound on its rounding error, at the end of a
+#: load step
+TOLERANCE = 1e-9
 #: rounding error of nodal forces relative to |K||u|, which exceeds |Ku| because strains
 #: are differences of displacements
 FORCE_ROUNDING = 2 * float(np.finfo(float).eps)

@@ -128,8 +128,8 @@ class HalfDiscs(_Joined[HalfDisc]):
     def layout(self, size: int) -> Subdivision:
         """Cut each half disc into compact blocks of at most size² cells.
 
-        The aspect ratios of blocks are near 1. The triangles at the centre count as the
-        last ring of cells.
+        The cuts keep the aspect ratios of blocks near 1. The triangles at the centre
+        count as the last ring of cells.
         """
         blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
         return half_discs_in_blocks(self.parts, blocks)

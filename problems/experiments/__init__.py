@@ -1,4 +1,4 @@
-"""Experiments that reproduce the figures and tables of the paper."""
+"""Experiments that reproduce the figures and tables of the paper, and further ones."""
 
 from __future__ import annotations
 

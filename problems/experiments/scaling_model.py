@@ -9,7 +9,7 @@ subsequent projection take
 - *Local products.* One triangle of the block (K⁺)_bb of every subdomain is read from
   memory once; b are the components on the surface of the subdomain. If all
   subdomains of a core are congruent, they share one block, and the floating-point
-  operations determine the time.
+  operations may determine the time.
 - *Joints* of clusters: the product with V M⁺Vᵀ (see docs/feti-space.md). The columns V
   of every subdomain are applied twice, and one triangle of the dense matrix M⁺ of every
   cluster is read once.
@@ -18,7 +18,7 @@ subsequent projection take
   entries on k cores is owned by one of them, which sends the multiplier to the other
   k − 1 cores and receives their contributions: 2(k − 1) numbers in two rounds of
   messages.
-- *Reductions* cost one latency for each level of a binary tree of cores.
+- *Reductions.* Each reduction costs one latency per level of a binary tree of cores.
 - *Coarse problem.* Its unknowns are the rigid modes of every subdomain, or of every
   cluster of m × m × m subdomains. With at most `REPLICATED` unknowns, the rows of the
   explicit inverse are distributed over all cores, or each core solves with a sparse

@@ -1,1 +1,1 @@
-"""Families of contact problems, one per module, with their base classes."""
+"""Families of problems, with their base classes."""

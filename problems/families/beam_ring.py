@@ -28,7 +28,7 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-#: largest number of nodes, due to 32-bit indices of the entries of K
+#: largest number of nodes in the plane, due to 32-bit indices of the entries of K
 MAX_NODES = 50_000_000
 
 

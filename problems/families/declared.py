@@ -78,8 +78,9 @@ class DeclaredFamily(Family):
         return other_decomposition(key, self.keys)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the keys of the case with half the mesh size, or None without a mesh.
+        """Return the keys of the case with half the mesh size.
 
+        Return None if the family declares neither a key `halvings` nor `cells`.
         Refinement may change the polygons that approximate arcs.
 
         Raises

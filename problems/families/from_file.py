@@ -47,7 +47,7 @@ class FromFile(Family):
         return params
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the file exists and has a known format."""
+        """Raise InputError unless the file exists, in a known format and unchanged."""
         if not params["path"]:
             raise InputError(
                 f"{self.name}: path is missing; expected {self.name}:PATH"

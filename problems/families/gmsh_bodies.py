@@ -104,7 +104,7 @@ class GmshBodies(ContactFamily):
         return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Return a remark if contact sides are arcs, otherwise an empty string.
+        """Return a remark if contact sides contain arcs, otherwise an empty string.
 
         Refinement keeps the chords of arcs, and thus the error of the geometry.
         """

@@ -1,7 +1,7 @@
 /* Integrals over single cells, summed into the values of a CSC matrix.
 
-   The functions apply to any number n of nodes and any number dim of coordinates. They
-   are inlined, so that compilers unroll the loops for callers that pass constants. */
+   The functions apply to n <= NODES nodes and dim = 2 or 3 coordinates. They are
+   inlined, so that compilers unroll the loops for callers that pass constants. */
 
 #include <stddef.h>
 

@@ -7,9 +7,9 @@ J. Numer. Anal. 10, 1973; bisection by coordinates as in Gilbert, Miller and Ten
 J. Sci. Comput. 19, 1998). Selected nodes are eliminated last, so that the trailing
 block of the factor is the Cholesky factor of the Schur complement on these nodes.
 
-Leaves and separators, each eliminated as a whole, are the fronts of a multifrontal
-factorisation (`problems.fem.multifrontal`), in postorder: a separator comes after both
-of its halves.
+Leaves, separators and the selected nodes of each connected component, each eliminated
+as a whole, are the fronts of a multifrontal factorisation
+(`problems.fem.multifrontal`), in postorder: a separator comes after both of its halves.
 """
 
 from __future__ import annotations

@@ -189,9 +189,9 @@ def convex_tangent(
     """Assemble K_t; if it is not positive definite, modify the tangents of cells.
 
     Negative eigenvalues of a cell tangent are replaced by a small positive fraction of
-    its largest eigenvalue (in Teran, Sifakis, Irving and Fedkiw 2005, "Robust
-    quasistatic finite elements and flesh simulation", they are replaced by 0). Zero
-    eigenvalues are kept, so that translations remain in the kernel of each cell
+    the largest magnitude of its eigenvalues (in Teran, Sifakis, Irving and Fedkiw 2005,
+    "Robust quasistatic finite elements and flesh simulation", they are replaced by 0).
+    Zero eigenvalues are kept, so that translations remain in the kernel of each cell
     tangent.
 
     Parameters
@@ -229,7 +229,8 @@ def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
 
     Returns
     -------
-    the new matrices, and the number of matrices that had negative eigenvalues
+    the new matrices, and the number of matrices that had negative eigenvalues beyond
+    rounding
 
     """
     values, vectors = np.linalg.eigh(tangents)

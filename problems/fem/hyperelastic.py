@@ -105,7 +105,10 @@ class NeoHooke(Hyperelastic):
     """Compressible neo-Hookean material, W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J."""
 
     def shear(self, F: Floats) -> Derivatives:
-        """Return w = μ/2 (F:F − 2 − 2 ln J) with its derivatives; NaN if J ≤ 0."""
+        """Return w = μ/2 (F:F − 2 − 2 ln J) with its derivatives.
+
+        For J ≤ 0, w is infinite or NaN.
+        """
         mu, back = self.shear_modulus, inverse_transpose(F)
         with np.errstate(invalid="ignore", divide="ignore"):
             log_J = np.log(determinant(F))
@@ -129,7 +132,7 @@ class NeoHooke(Hyperelastic):
         )
 
     def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return U = Λ/2 ln²θ with its derivatives; NaN if θ ≤ 0."""
+        """Return U = Λ/2 ln²θ with its derivatives; infinite or NaN if θ ≤ 0."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log = np.log(theta)
         return (

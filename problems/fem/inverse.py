@@ -140,7 +140,8 @@ def regular_inverse(
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If K_ff is singular. CHOLMOD's error is raised if `interface` is None.
+        If K_ff is not positive definite. CHOLMOD's error is raised if `interface` is
+        None.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)
@@ -160,7 +161,7 @@ def floating_inverse(
     kernels : for each body, an orthonormal basis (n_body, r_body) of its rigid modes
     fixing : for each body, the components of its fixing nodes, numbered within the
         body; no rigid mode may vanish on them, which requires at least two nodes in 2D
-        and three in 3D
+        and three in 3D if the modes include all rotations
     interface : components c for (K⁺)_cc; None to solve once per row of B instead
 
     """

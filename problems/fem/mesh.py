@@ -82,8 +82,8 @@ class Mesh:
 class StructuredGrid:
     """Structured plane grid, any block of which can be generated separately.
 
-    The node in row j and column i has the number j·(nx + 1) + i; cells are numbered in
-    the same way.
+    The node in row j and column i has the number j·(nx + 1) + i; cells are also
+    numbered row by row.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes

@@ -6,7 +6,8 @@ the centroids of linear triangles and tetrahedra. Around each interior node, a l
 polynomial is fitted to these values. At a boundary node, the polynomials of all
 interior nodes that share a cell with the node are averaged. At a boundary node that
 shares no cell with an interior node (the corner of a single triangle), the averages at
-the boundary nodes of its cells are averaged. Bodies have no common nodes, so that no
+the boundary nodes of its cells are averaged; if there are none (in a single layer of
+cells), the stresses of its cells are averaged. Bodies have no common nodes, so that no
 average extends over several bodies.
 """
 

@@ -1,7 +1,8 @@
 /* Product of a dense block with the columns of all subdomains of a class.
 
-   The product is compiled twice, for processors with AVX2 and FMA and for all others. The
-   loader selects one of the two versions when the module is imported. */
+   GCC 12 or newer on x86-64 Linux compiles the product twice, for processors with AVX2 and
+   FMA and for all others, and the loader selects one of the two versions when the module
+   is imported. Elsewhere there is one version. */
 
 #include <string.h>
 
@@ -53,7 +54,8 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
                 Y[r * columns + c] += sum[r][c / 4][c % 4];
 }
 
-/* Y += M X for all rows of M (rows, n); `X`, `w` and `some` as in add_tile. */
+/* Y += M X for all rows of M (rows, depth), which are n doubles apart; `X`, `w` and `some`
+   as in add_tile. */
 INLINE void
 add_strip(in M, Py_ssize_t rows, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y,
           Py_ssize_t columns, Py_ssize_t some)

@@ -22,16 +22,17 @@ cdef extern from "blocks.h" nogil:
 
 ctypedef struct block:
     Py_ssize_t rows, n, members
-    const double *entries  # NULL if the block is an object with `@`
+    const double *entries  # NULL if the block is empty or an object with `@`
     bint is_triangle
 
 
 cdef class BlockDiagonal(LinearMap):
     """Block diagonal map of packed vectors; block M_g (r_g, n_g) acts on S_g subdomains.
 
-    The entries of a vector for one block form a matrix (n_g, S_g), stored by rows.
+    The entries of a vector for one block form a matrix (n_g, S_g), stored by rows; the
+    block maps it to a matrix (r_g, S_g).
 
-    blocks : for each g an array (r_g, n_g) or an object with `@`. If S_g = 1, a
+    blocks : for each g an array (r_g, n_g) or a square object with `@`. If S_g = 1, a
         symmetric block may be replaced by its upper triangle (n_g (n_g + 1)/2,),
         stored by columns
     sizes : n_g for each g
@@ -40,7 +41,7 @@ cdef class BlockDiagonal(LinearMap):
     Raises
     ------
     ValueError
-        If the shape of a block does not match its size and number of members.
+        If the shape of an array does not match its size and number of members.
 
     """
 

@@ -3,7 +3,7 @@
 Each rank p stores some of the subdomains, with their stiffness K_p and their columns
 B_p of B. A rank stores the entries of vectors of multipliers for the rows of B that it
 *owns*. A row of B that touches subdomains of several ranks is owned by one of these
-ranks, chosen round-robin, and is a *ghost* row on all others. Before a product with
+ranks, chosen round-robin, and is a *ghost* row on the others. Before a product with
 B_pᵀ, the owner of a row sends the multiplier of the row to the ranks where it is a
 ghost row. After the product with B_p, these ranks send their contributions back to the
 owner, so that the result is
@@ -15,7 +15,7 @@ columns of B for its subdomains, and the entries of vectors for the rows that to
 these subdomains. Graph partitioning (METIS) distributes the subdomains so that the work
 is balanced and few rows are shared. If a class of congruent subdomains occurs on
 several ranks, one of these ranks computes the explicit blocks of the class and sends
-them to the other ranks.
+them to the others.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def partition(
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks.
+        If there are fewer subdomains (or clusters) than ranks.
 
     """
     S = domains.class_of.size
@@ -141,7 +141,8 @@ def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     return (sizes**2)[domains.class_of]
 
 
-#: largest accepted ratio of the maximum to the mean of the work (or size) of the ranks
+#: work (or sizes) of the ranks count as balanced if the ratio of the maximum to the
+#: mean is at most this value
 MAX_IMBALANCE = 1.1
 METIS_SEEDS = 12  #: number of random seeds tried for METIS
 SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: trial weights of the size relative to the work
@@ -159,7 +160,7 @@ def balanced_partition(
     METIS balances a single weight. The work is tried first. On graded half discs, where
     a few subdomains account for most of the work, the sizes are then out of balance. In
     such cases, several combinations of work and size are tried. A trial replaces the
-    first partition if it keeps the work balanced and has a better balance of sizes.
+    best partition so far if its work is balanced and its sizes are better balanced.
 
     Parameters
     ----------
@@ -233,16 +234,17 @@ def _partitioned(
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """Rows of B that touch a rank: its owned rows, and ghost rows of other ranks.
+    """Rows of B that touch a rank: its owned rows, and ghost rows that others own.
 
-    A message to another rank contains the values of all rows shared with that rank,
-    sorted by row.
+    A message from one rank to another contains the values of the rows that one of them
+    owns and the other stores as ghost rows, sorted by row.
     """
 
     ranks: Ranks
     rows: Nodes  #: (t,) all rows that this rank touches or owns, ascending
     owned: Nodes  #: (o,) indices of the owned rows in `rows`
-    #: (l,) indices in `owned` of the ghost rows of other ranks, ordered by these ranks
+    #: (l,) indices in `owned` of the rows that are ghost rows on other ranks, ordered
+    #: by these ranks; a row occurs once for each of them
     exported: Nodes
     #: (t − o,) indices in `rows` of the ghost rows, ordered by their owners
     ghosts: Nodes
@@ -414,13 +416,16 @@ class RankOperator:
         return rows.times(Y)
 
     def onto_rows(self) -> Product:
-        """Return the orthogonal projector onto the range of B,  x ↦ BBᵀ(BBᵀ)⁺x."""
+        """Return the orthogonal projector onto the range of B,  x ↦ BBᵀ(BBᵀ)⁺x.
+
+        It is exact for B without contact rows; see `_gram_inverse`.
+        """
         packed = self.local.packed
         solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
     def average_forces(self) -> DistributedColumns:
-        """Return a basis of the multipliers with Fλ = 0 as rows (c, o).
+        """Return a basis of the multipliers in range B with Fλ = 0, as rows (c, o).
 
         These multipliers satisfy Bᵀλ = Cᵀμ for some μ, where C is the matrix of
         `Clusters`. Hence the forces Bᵀλ do no work on displacements v with Cv = 0.
@@ -458,8 +463,10 @@ class RankOperator:
         return product
 
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
-        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, with a diagonal matrix W of weights.
+        """Return x ↦ (B W Bᵀ)⁺x on owned rows, with a diagonal matrix W of weights.
 
+        The coupling of contact rows with equality rows is neglected, and the diagonal
+        of the contact rows is increased by the factor 1 + `CONTACT_SHIFT`.
         Most equality rows (all of them if gluing is orthonormal and the copies of each
         node have equal weights) are uncoupled and only require a division. The system
         of the coupled equality rows is solved redundantly on all ranks. Contact rows
@@ -508,7 +515,8 @@ def _coupled(
     share = part.data[beside] / (size[row] * size[column])
     between = halo.is_shared[row] & halo.is_shared[column]
     inside = halo.rows[row[~between & (np.abs(share) > COUPLING_ROUNDING)]]
-    # an entry that couples two shared rows is a sum of contributions of several ranks
+    # an entry that couples two shared rows may be a sum of contributions of several
+    # ranks
     between &= share != 0
     message = [v[between] for v in (halo.rows[row], halo.rows[column], share)]
     rows, columns, shares = map(
@@ -599,9 +607,9 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
     """Assign one rank to the factorisation, and one to the blocks, of each class.
 
     In order of decreasing work, each class is assigned to the rank with the smallest
-    load so far (longest processing time first, Graham 1969). Then the computation of
-    blocks, which follows the factorisation, is reassigned from ranks with high loads to
-    ranks with low loads.
+    load so far, among the ranks with subdomains of the class (longest processing time
+    first, Graham 1969). Then the computation of blocks, which follows the
+    factorisation, is reassigned from ranks with high loads to ranks with low loads.
 
     work : for each rank, a map from the names of its classes to their work
     """
@@ -617,7 +625,7 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
         tasks[name] = Assignment(size[name], have[name], rank, rank)
     for name, task in tasks.items():
         rank, part = min(task.ranks, key=loads.__getitem__), BLOCK_SHARE * task.work
-        # move only if the larger of the two loads decreases by at least `part`
+        # move only if the larger of the two loads decreases by `part`
         if loads[rank] + 2 * part <= loads[task.factor_rank]:
             loads[rank] += part
             loads[task.factor_rank] -= part
@@ -748,7 +756,7 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks.
+        If there are fewer subdomains (or clusters) than ranks.
 
     """
     B, domains = operator.B, operator.domains
@@ -792,7 +800,7 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
 def gather_on_rank_0(halo: Halo, count: int) -> Callable[[Solution], Solution | None]:
     """Return a function that gathers a solution of `count` multipliers on rank 0.
 
-    On all other ranks, this function returns None.
+    On all other ranks, the returned function returns None.
     """
 
     def whole(s: Solution) -> Solution | None:

@@ -63,7 +63,7 @@ from mortarbench.problems.feti.subdomains import (
 class LocalDual:
     """Dual QP on the rows owned by one rank.
 
-    The members communicate; all ranks must evaluate each member together.
+    Most members communicate; all ranks must evaluate each member together.
     """
 
     subdomains: LocalSubdomains
@@ -129,9 +129,9 @@ class LocalDual:
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def sets(self, bound: Vector) -> tuple[Box, DistributedDiscs]:
-        """Return the sets of the multipliers of owned rows: λ_n ≥ 0 and ‖λ_t‖ ≤ g.
+        """Return the sets of the multipliers of owned rows: λ_n ≥ 0, ‖λ_t‖ ≤ g/scale.
 
-        bound : (k,) friction bounds g
+        bound : (k,) friction bounds g for the unscaled rows
         """
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
         contact = self.subdomains.problem.contact
@@ -159,8 +159,8 @@ def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks, or if the ranks computed different
-        subdivisions.
+        If there are fewer subdomains (or clusters) than ranks, or if the ranks computed
+        different subdivisions.
 
     """
     return LocalDual(
@@ -279,7 +279,7 @@ def _replicated_partition(
     ------
     InputError
         If the subdomains or their ranks differ between ranks, or if there are fewer
-        subdomains than ranks.
+        subdomains (or clusters) than ranks.
 
     """
     ranks_of = subdomains_of(problem, ranks.size)

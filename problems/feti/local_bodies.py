@@ -78,8 +78,9 @@ def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolu
     """Recover the local displacement from the multipliers of the dual.
 
     The torn displacement is v = K⁺(f − Bᵀλ) − Rα, where α are the multipliers of
-    RᵀBᵀλ = Rᵀf. The result is the average of v over the copies of each node on all
-    ranks (see `problems.duality.feti_dual`). Eliminated components are zero.
+    RᵀBᵀλ = Rᵀf. With clusters, K̃⁺ and RN replace K⁺ and R (see `Clusters`). The result
+    is the average of v over the copies of each node on all ranks (see
+    `problems.duality.feti_dual`). Eliminated components are zero.
     """
     bodies, multiplicity = _local_bodies(local.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_unit_motions]
@@ -228,8 +229,8 @@ class _Extent(NamedTuple):
     centre: Vector  #: (dim,) centroid of the nodes
     radius: float  #: root mean square distance of the nodes from the centroid
     size: float  #: √N for a body with N nodes
-    #: (k, k) matrix that combines the rotations into orthonormal ones; None in the
-    #: plane
+    #: (3, 3) matrix that combines the rotations into orthonormal ones; None in 2D, with
+    #: at most one rotation
     turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:

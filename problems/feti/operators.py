@@ -20,10 +20,11 @@ Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel
     B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
 
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
-condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
-or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its diagonal
-block for the equality rows is itself block diagonal, with one block per node. The
-Moore-Penrose inverse of this block keeps λ free of components in ker Bᵀ.
+condensed onto the union g of b and the boundary of a subdomain, and the weights W = 1
+(multiplicity) or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ
+singular. Its diagonal block for the equality rows is itself block diagonal, with one
+block per node. The Moore-Penrose inverse of this block keeps λ free of components in
+ker Bᵀ.
 
 Entries of B W Bᵀ that couple contact rows with equality rows are dropped. In
 homogeneous bodies, such entries exist only where contact touches supports. They would
@@ -76,8 +77,9 @@ from mortarbench.problems.feti.subdomain_classes import (
     upper_triangle,
 )
 
-MAX_EXPLICIT_MIB = 2048  #: memory for all explicit blocks of an operator
-#: number of columns per product when an implicit block is evaluated
+#: largest memory (MiB) for all explicit blocks of an operator
+MAX_EXPLICIT_MIB = 2048
+#: number of columns, or of rows, that are evaluated at a time to limit the memory
 STRIP_COLUMNS = 256
 #: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
 #: singular where contact rows are linearly dependent
@@ -86,9 +88,9 @@ CONTACT_SHIFT = 1e-8
 EIGENVALUE_CUTOFF = 1e-10
 #: lower bound on the diagonal of B K̃⁺Bᵀ, relative to that of B K⁺Bᵀ. Residuals are
 #: scaled by 1/√diagonal; with this bound, relative rounding errors of 2⁻⁵³ are
-#: amplified to at most 1e5·2⁻⁵³, far below any tolerance
+#: amplified to at most 1e5·2⁻⁵³, about 1e-11
 LEAST_DIAGONAL = 1e-10
-#: off-diagonal entries of B W Bᵀ below this fraction of the diagonal are rounding
+#: off-diagonal entries of B W Bᵀ below this fraction of the diagonal count as rounding
 #: errors
 COUPLING_ROUNDING = 1e-12
 
@@ -165,7 +167,7 @@ class Packed:
 
 
 def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
-    """Pack the nonzero columns of B (m, N) class by class.
+    """Pack the columns of B (m, N) for the touched components, class by class.
 
     explicit : (classes,) True for classes with explicit blocks
     """
@@ -225,7 +227,7 @@ class DualOperator:
         return self.packed.congruence(self.inverse_map)
 
     def diagonal(self) -> Vector:
-        """Return the diagonal of F, (m,)."""
+        """Return the diagonal of F, (m,); with clusters, see `LEAST_DIAGONAL`."""
         return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Composition:
@@ -313,7 +315,7 @@ class DualOperator:
 
     @property
     def inverses(self) -> list[Any]:
-        """(K⁺)_bb of each group: a dense matrix, or an object with `@`."""
+        """(K⁺)_bb of each group: a matrix, a triangle of it, or an object with `@`."""
         return self._blocks.inverses
 
     @property
@@ -351,7 +353,7 @@ class DualOperator:
 
 
 class _Blocks(NamedTuple):
-    """Local blocks of each group: dense matrices, or objects with `@`."""
+    """Local blocks of each group: matrices, upper triangles, or objects with `@`."""
 
     inverses: list[Any]  #: (K⁺)_bb
     schur: list[Any]  #: S_bb

@@ -52,9 +52,9 @@ def graph_partition(
     Raises
     ------
     InputError
-        If there are more bodies than parts or fewer than two cells per part, if the
-        cells of a body are not connected through facets, or if METIS finds no partition
-        into connected parts.
+        If there are fewer parts than bodies, or more parts than bodies and on average
+        fewer than two cells per part; if the cells of a body are not connected through
+        facets; or if METIS finds no partition into connected parts.
 
     """
     counts = np.bincount(body)

@@ -50,7 +50,7 @@ class Spectrum(NamedTuple):
     largest: float
     smallest_error: float  #: bound on the distance from `smallest` to an eigenvalue
     largest_error: float  #: bound on the distance from `largest` to an eigenvalue
-    steps: int  #: number of products with F
+    steps: int  #: number of Lanczos steps
 
     @property
     def condition(self) -> float:
@@ -135,7 +135,7 @@ def spectra_over_ranks(
     preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
 ) -> list[Spectrum]:
-    """Compute the extreme eigenvalues of F, once for each preconditioner.
+    """Compute the extreme eigenvalues of PFP, or of PMPF for each preconditioner M.
 
     F acts on the multipliers of supports and gluing. All ranks must call this function
     together; the results are equal on all ranks.

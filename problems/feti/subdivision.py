@@ -106,7 +106,10 @@ class Subdivision(Protocol):
         """Number of nodes with m copies, for each m > 1."""
 
     def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """Return pairs of subdomains and the number of nodes they share, all (k,)."""
+        """Return pairs of subdomains and the number of nodes they share, all (k,).
+
+        Pairs that share only a corner may be omitted.
+        """
 
     def glued(self) -> NDArray[np.int64]:
         """Return, for each subdomain (S,), the number of its nodes on interfaces."""

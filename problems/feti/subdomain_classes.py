@@ -465,9 +465,9 @@ class DecomposedBodies:
 
         min ½vᵀKv − fᵀv   subject to   B_E v = c_E,  B_I v ≤ c_I,   K = diag(K_1 … K_S)
 
-    The rows of B are support and gluing rows (E), followed by normal and tangential
-    contact rows (I). Contact rows are multiplied by `scale`, so that the multipliers of
-    the unscaled rows are scale·λ.
+    The rows of B are support and gluing rows (E), followed by normal contact rows (I)
+    and by tangential contact rows, along which friction acts. Contact rows are
+    multiplied by `scale`, so that the multipliers of the unscaled rows are scale·λ.
     """
 
     classes: tuple[SubdomainClass, ...]

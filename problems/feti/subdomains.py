@@ -9,8 +9,9 @@ interfaces. In addition, each rank stores a few numbers for every subdomain of e
 rank. These numbers require about as much memory as a vector of the coarse problem.
 
 B consists of support, gluing and contact rows, in this order (Total FETI, Dostál, Horák
-and Kučera 2006). Every copy of a fixed component has a support row. The m copies
-v_1 … v_m of a free component are glued by one of
+and Kučera 2006). Every copy of a fixed component has a support row, unless fixed
+components are eliminated. The m copies v_1 … v_m of a free component are glued by one
+of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
 * ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
@@ -149,7 +150,7 @@ class DecomposedProblem:
         if (positions := self.layout.positions) is None:
             raise InputError(
                 f"cluster={self.cluster} is not built for subdomains that do not form "
-                "a grid; expected no cluster, or a family with structured meshes"
+                "a grid; expected no cluster, or bodies cut into grids of subdomains"
             )
         places = np.column_stack([self.layout.body, positions // self.cluster])
         return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
@@ -523,7 +524,7 @@ class LocalSubdomains:
         """Return a copy with friction bounds `bound` (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
         copy = replace(self, problem=replace(self.problem, contact=contact))
-        # cached properties remain valid, because none depends on the bound
+        # cached properties remain valid, because none depends on the values of bounds
         vars(copy).update({**vars(self), "problem": copy.problem})
         return copy
 
@@ -560,7 +561,7 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     Raises
     ------
     InputError
-        If there are fewer subdomains than ranks.
+        If there are fewer subdomains (or clusters) than ranks.
 
     """
     of, d = problem.layout, problem.components
@@ -712,7 +713,7 @@ def _local_rows(local: LocalSubdomains) -> _Rows:
 
 
 def _support_rows(local: LocalSubdomains) -> Entries:
-    """Return a support row for each copy of a fixed component, last copy first."""
+    """Return the local support rows: one per copy of a fixed component, last first."""
     problem, d = local.problem, local.problem.components
     node, k = np.divmod(problem.fixed, d)
     multiplicity = problem.layout.multiplicity(node)

@@ -28,7 +28,7 @@ class LocalProblems:
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n), which maps global components to torn unknowns."""
+        """T (N, n), which maps the components of local nodes to torn unknowns."""
         return self.torn.spread
 
     @property
@@ -38,7 +38,7 @@ class LocalProblems:
 
     @cached_property
     def weight(self) -> Vector:
-        """Sum of the diagonal entries of K at each torn node, (N,)."""
+        """Sum of the diagonal entries of K at the node of each torn unknown, (N,)."""
         d, weight = self.components, np.empty(self.spread.shape[0])
         for template, place in self._classes():
             trace = template.K.diagonal().reshape(-1, d).sum(axis=1)
@@ -46,7 +46,7 @@ class LocalProblems:
         return weight
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
-        """Return the diagonal of TᵀKT at global components `at` (k,)."""
+        """Return the diagonal entries of TᵀKT for the columns `at` (k,) of T."""
         d = self.components
         nodes = np.unique(csr_array(self.spread[:, at]).nonzero()[0] // d)
         number = np.full(self.spread.shape[0] // d, -1)
@@ -87,8 +87,8 @@ class LocalProblems:
     def solve(self, b: Vector) -> Vector:
         """Apply PK⁺P, with P of `product`, to b (N,).
 
-        The systems of all subdomains of a class are solved at once, with one column of
-        the right-hand side for each subdomain.
+        The systems of all subdomains of a class where b is nonzero are solved at once,
+        with one column of the right-hand side for each of these subdomains.
         """
         solution, domains = np.zeros_like(b), self.torn.domains
         acting = np.logical_or.reduceat(b != 0, domains.start[:-1])

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
 
-#: largest distance between corresponding points of congruent subdomains, relative to
-#: the radius of the subdomains
+#: largest difference between coordinates of corresponding points of congruent
+#: subdomains after the rigid motion, relative to the radius of the subdomains
 CONGRUENCE_TOL = 1e-11
 
 
@@ -81,13 +81,14 @@ Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
 
 
 def compact_blocks(sides: Sides, most: int) -> list[Block]:
-    """Cut a graded structured mesh into blocks of cells with aspect ratios near one.
+    """Cut a graded structured mesh into blocks that have aspect ratios near one.
 
-    A block of more than most² cells is cut across its longer side, at the grid line
-    nearest to its middle (the first one if two are equally near up to rounding). With
-    equal numbers of cells along both sides, as in `blocks`, a block would have the
-    aspect ratio of its cells, and the bending modes of long subdomains would dominate
-    the condition number of the dual.
+    A block of more than most² cells is cut across its longer side (or across the other
+    side if the longer one consists of a single cell), at the grid line nearest to its
+    middle (the first one if two are equally near up to rounding). With equal numbers of
+    cells along both sides, as in `blocks`, a block would have the aspect ratio of its
+    cells, and the bending modes of long subdomains would dominate the condition number
+    of the dual.
 
     Parameters
     ----------
@@ -213,7 +214,7 @@ def classify(
         remaining = np.array(group)
         spread = np.array([spread_of(points[s]) for s in group])
         # this necessary condition avoids most comparisons: the norms ‖x − x̄‖ of two
-        # images differ by at most √size times the largest distance of their points
+        # images differ by at most √size times the largest difference of coordinates
         off = 2 * CONGRUENCE_TOL * np.sqrt(points[group[0]].size)
         while remaining.size:
             near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
@@ -242,8 +243,8 @@ def congruent(
 
     Returns
     -------
-    mask (g,) of the images, and rotations Q (g, dim, dim) with x − x̄ = Q (x₁ − x̄₁),
-    where x₁ is the first point set
+    mask (g,) of the images, and rotations Q (g, dim, dim); for images,
+    x − x̄ = Q (x₁ − x̄₁) up to rounding, where x₁ is the first point set
 
     """
     x = points - points.mean(axis=1, keepdims=True)

@@ -118,8 +118,7 @@ def read_fclib(path: Path) -> FclibFile:
     Raises
     ------
     InputError
-        If the file is damaged or contains rolling friction, or the problem is not
-        convex.
+        If the file is damaged or contains rolling friction, or if W is not symmetric.
 
     """
     arrays = read_datasets(path)

@@ -1,7 +1,7 @@
 """Formats and digests of QP files.
 
-Text and .mat files may be compressed by gzip; npz and Parquet files are always
-compressed.
+Text and .mat files may be compressed by gzip; npz and Parquet have their own
+compression.
 """
 
 from __future__ import annotations

@@ -97,7 +97,8 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     Raises
     ------
     InputError
-        If a variable is missing or its shape is inconsistent with that of another one.
+        If a variable is missing, its shape is inconsistent with that of another one, or
+        P, A, q or r contains a number that is not finite.
 
     """
     read = partial(_first_named, arrays)

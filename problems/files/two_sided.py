@@ -36,7 +36,7 @@ def one_sided(qp: TwoSidedQP) -> QP:
     Raises
     ------
     InputError
-        If P is not symmetric, or a lower limit exceeds the upper limit.
+        If P is not symmetric, or the limits of a row or variable exclude every value.
 
     """
     P, A = csc_array(qp.P, dtype=float), csr_array(qp.A, dtype=float)

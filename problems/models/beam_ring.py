@@ -160,7 +160,7 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
 
 
 def _tip(shape: Shape) -> tuple[Nodes, Vector]:
-    """Return the loaded components of the upper right corner of the beam.
+    """Return the components of the loaded corner, at the upper right of the beam.
 
     Returns
     -------

@@ -346,7 +346,7 @@ def _check_loads_act(
     loads: Sequence[NDArray[np.float64]],
     fixed: Nodes,
 ) -> None:
-    """Raise InputError if a load acts along an axis in which its nodes are fixed."""
+    """Raise InputError if supports fix all nodes of a load along one of its axes."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
         without_effect, dim = [], load.shape[1]
         for axis, name in enumerate(_AXES[:dim]):

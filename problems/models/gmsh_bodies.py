@@ -54,8 +54,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     Raises
     ------
     InputError
-        If the load of a body cannot be balanced, or if there are several load steps or
-        linearisations although supports and friction allow a rigid motion.
+        If the load of a body cannot be balanced, or if `step` or `relin` is above 1
+        although supports and friction allow a rigid motion.
 
     """
     p: Any = params

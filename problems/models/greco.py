@@ -64,7 +64,7 @@ class Plate(NamedTuple):
     """Plate with the nodes of its sides, and nodal lengths (areas) of loaded sides."""
 
     shape: StructuredGrids | StructuredSolids
-    ground: Nodes  #: contact side y = 0, without its nodes on x = 40 mm
+    ground: Nodes  #: contact side y = 0, in 2D without its node on x = 40 mm
     top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and nodal lengths, m (areas, m²)
     left: tuple[Nodes, Vector]  #: nodes of x = 0 and nodal lengths, m (areas, m²)
     right: Nodes  #: nodes of x = 40 mm

@@ -6,9 +6,10 @@ with the pressure
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
-Bodies are half discs under a uniform pressure on the flat side. The force is
-prescribed, since the theory does not determine the approach. Contact alone supports the
-upper body vertically; therefore, the form ``dual-bounds`` does not exist.
+Bodies are half discs. A uniform pressure acts on the flat side of the upper body, and
+with a tangential force also on that of the lower body. The force is prescribed, since
+the theory does not determine the approach. Contact alone supports the upper body
+vertically; therefore, the form ``dual-bounds`` does not exist.
 
 The keys `n` and `m`, numbers of cells per half width a, refine the contact zone only.
 Outside this zone, cells grow by the factor GROWTH, irrespective of n and m. The key
@@ -24,7 +25,8 @@ are symmetric: contact and friction alone support the upper body, and the suppor
 the lower body have no reactions. Exact tractions are those of
 `problems.models.line_contact`. The key `programme` is
 
-* normal-first: P without friction, then Q, then Q reduced from its peak, one step each;
+* normal-first: P without friction, then the peak of Q, then the reduced Q, in one stage
+  each;
 * proportional: P and Q grow together in steps k = 1, 2, … with friction, with P ∝ k² so
   that a grows by equal increments. If slip is measured from the end of the preceding
   step (quasi-static), the shear traction is (Q/P)p and nothing slips. For a single

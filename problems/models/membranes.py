@@ -239,7 +239,7 @@ def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
 
     The kernel consists of the constants. Nodes are numbered as in `grid_stiffness`.
 
-    h : length of a cell
+    h : length of a cell; in 2D, the stiffness does not depend on it
     """
     # round, because coordinates of nodes on one grid line differ in their last digits
     lines = [np.unique(x.round(9)) for x in (part.points / h).T]

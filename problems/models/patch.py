@@ -257,7 +257,10 @@ def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]
 
 
 def bodies(params: Mapping[str, Value]) -> ElasticBodies:
-    """Return the stacked blocks, with `lower` and `upper` cells along x (and y)."""
+    """Return the stacked blocks, with `lower` and `upper` cells along x.
+
+    In 3D, the numbers of cells along y are the same.
+    """
     p: Any = params
     if p["dim"] == 3:
         return _bodies_in_space(params)

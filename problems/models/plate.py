@@ -5,7 +5,7 @@ of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In s
 subdomains, the modulus is multiplied by `jump`: in every other subdomain
 (``checkerboard``) or in the subdomains at the clamped edge (``column``). There is no
 contact; therefore, the dual has equality constraints only. Condition numbers of the
-dual measure the scalability of the method independently of load, stopping test and
+dual measure the scalability of the method independently of load, stopping criterion and
 units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
@@ -91,7 +91,8 @@ from mortarbench.problems.feti.tearing import blocks, grid_positions
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load: N/m in 2D, N in 3D
 STEEL = Material(E=210e9, nu=0.3)
-#: preconditioner and scaling for each spectrum; None means no preconditioner
+#: mapping from the name of a spectrum to its preconditioner and scaling; None means no
+#: preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
     "none": None,
     "lumped": ("lumped", "multiplicity"),

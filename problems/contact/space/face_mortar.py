@@ -61,14 +61,16 @@ MIN_OVERLAP = 1e-12
 SINGULAR = 1e-10
 #: distances from a line below this fraction of the size of a triangle count as zero
 ON_LINE = 1e-14
-#: number of pairs of triangles clipped at a time; limits the memory to about 100 MB
+#: largest number of pairs of triangles clipped at a time; limits the memory to about
+#: 100 MB
 CHUNK = 2**16
-#: distance from a master face at which the search along a ray ends, in units of the sum
-#: of the radii of both faces. Smaller values require more steps, larger values yield
-#: more candidate faces
+#: distance from the nearest centre of a master face at which the search along a ray
+#: ends, in units of the radius of the slave face plus the largest radius of a master
+#: face. Smaller values require more steps, larger values yield more candidate faces
 CLOSE = 1.5
 #: largest number of steps of the search along a ray. Each step covers at least half of
-#: the remaining distance to a side that is inclined by at most 60° (`Reach.cosine`)
+#: the remaining distance, up to the radii of the faces, to a side that is inclined by
+#: at most 60° (`Reach.cosine`)
 MAX_STEPS = 64
 #: radius, in the units of CLOSE, of a ball about the end of the search that contains
 #: all faces met by rays from a slave face: CLOSE / cos 60° along the ray, tan 60°
@@ -178,8 +180,8 @@ def _facing(
     """Return pairs of faces (k,) that a ray along a slave normal may connect.
 
     From the centre of each slave face, in both directions along its normal, a point is
-    moved repeatedly by its distance from the nearest master face until it is close to
-    a face.
+    moved repeatedly by a lower bound on its distance from the master until it is close
+    to the centre of a master face.
     """
     tree = KDTree(master.centre)
     near = slave.radius + master.radius.max()

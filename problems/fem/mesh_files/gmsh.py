@@ -50,7 +50,8 @@ def read_msh_sets(path: Path) -> FileMesh:
     Raises
     ------
     InputError
-        If the file cannot be read, or contains cells with undefined nodes.
+        If the file cannot be read, contains node numbers below 1, or does not have a
+        tag for every cell.
 
     """
     mesh = _read(path)

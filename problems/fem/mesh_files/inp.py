@@ -111,7 +111,7 @@ class _Sets:
 
     def __init__(self, numbers: Nodes, limit: int) -> None:
         self.numbers = numbers  #: (k,) all node or element numbers in the file, sorted
-        self._limit = limit  #: largest total size of all sets
+        self._limit = limit  #: number of members that may still be added
         self._members: dict[str, tuple[str, Nodes]] = {}
 
     def extend(self, name: str, members: Nodes) -> None:

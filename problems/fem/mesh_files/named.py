@@ -73,7 +73,8 @@ class FileMesh(NamedTuple):
         """Return selected cells of dimension `dim` as a single array (E, c).
 
         Triangles are stored as degenerate quadrilaterals, c = 4. If the file contains
-        solid cells of several kinds, all are stored as degenerate hexahedra, c = 8.
+        solid cells of several kinds, tetrahedra and wedges are stored as degenerate
+        hexahedra, c = 8.
 
         rows : for each block, the rows of the selected cells
         """
@@ -96,7 +97,7 @@ class NamedMesh(NamedTuple):
 
     points: NDArray[np.float64]  #: (N, dim) positions of the nodes
     cells: Nodes  #: (E, c), as in `problems.fem.mesh.Mesh`
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body (volumes in 3D)
+    surfaces: Mapping[str, Nodes]  #: numbers of the cells of each body
     #: edges (k, 2) of each named curve, with the body on their left; in 3D, faces
     #: (k, 4) of each named surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
@@ -154,9 +155,10 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
     Raises
     ------
     InputError
-        If the file contains no volumes and its surfaces are not plane, or if it
-        contains cells without a name, bodies that share cells or nodes, or a body of
-        several disconnected parts.
+        If the file contains no volumes and its nodes are not all at the same z, or if
+        it contains no bodies, cells without a name, flat, folded or non-convex cells,
+        bodies that share cells or nodes, a body of several disconnected parts, or named
+        facets that are not on the boundary of the bodies.
 
     """
     path, points, dim, words = file.path, file.points, file.dim, file.words

@@ -108,7 +108,7 @@ class Influence:
             [scipy.fft.rfft2(K, axes=(1, 0)).real / h for K in kernels]
         )
         self._shape = 1 if nu is None else 2, m0, m1
-        self._places = i * m1 + j  # indices in the bounding grid of m0 × m1 cells
+        self._places = i * m1 + j  # indices in the grid of m0 × m1 cells
 
     def __call__(self, x: Array) -> Array:
         """Multiply F by a vector (n,) or by a matrix (n, k)."""
