@@ -108,8 +108,9 @@ class PDAS:
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="assembly of the penalised matrix (preparing); factorisations of the "
-        "matrices of the faces (solving)",
+        phases="assembly of the penalised matrix and, for a dense P without inequality "
+        "rows, elimination of variables without bounds (preparing); factorisations of "
+        "the matrices of the faces (solving)",
         sequence="starts from the last active set and point",
         limits=(
             "On one-dimensional obstacle problems, the contact front moves by one "
