@@ -82,9 +82,10 @@ class CVXPY:
     a stopping test is the sum of an absolute and a relative term, `tol` is the relative
     tolerance and the absolute tolerance is negligible. A backend without an entry in
     `CALLS` runs with cvxpy's defaults. The objective is scaled to ‖q‖∞ = 1e4, or to
-    ‖q‖∞ = 1 if the backend's test is absolute (HIGHS, DAQP). The adapter declines QPs
-    for backends that would receive them as cone programs. It also declines QPs for
-    ProxQP, because cvxpy cannot enable ProxQP's test of the duality gap.
+    ‖q‖∞ = 1 if the backend's test is absolute (HIGHS, DAQP). The adapter declines all
+    QPs for CVXOPT and ECOS, which would receive them as cone programs, for backends
+    that solve linear programs only, and for ProxQP, because cvxpy cannot enable
+    ProxQP's test of the duality gap.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME

@@ -31,7 +31,7 @@ CLAIMS = {
     -1: Status.ITERATION_LIMIT,
 }  #: claim for each exit flag; all other exit flags count as FAILED
 PRIMAL = 1  #: exit flag with a certificate of infeasibility
-#: eigenvalues of P below this fraction of the largest count as zero
+#: eigenvalues of P that are at most this fraction of the largest one count as zero
 RANK_TOLERANCE = 1e-14
 #: Units of the corrections, relative to ‖x‖∞, four per decade. The adapter tries the
 #: units in this order until the residual is at most tol, because the best unit depends

@@ -78,9 +78,10 @@ class HiGHS:
             "residual of 1 (HiGHS 1.15.1); the conformance check 'finds where a "
             "membrane of 400 nodes touches' tests for this error.",
             "Without highspy-extras, HiGHS silently runs qpasm instead of hipo; the "
-            "adapter then reports a failure.",
+            "adapter therefore raises ImportError, and the QP is declined.",
             "qpasm stores a dense Hessian on the null space of the active rows. A QP "
-            "is declined if this Hessian would not fit into memory.",
+            "is declined if a dense Hessian of all variables would not fit into "
+            "memory.",
         ),
     )
 

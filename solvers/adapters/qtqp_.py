@@ -41,8 +41,8 @@ class QTQP:
     passed unchanged.
 
     In sequences, QTQP shifts the last point into the interior and starts there if the
-    residuals are small enough; otherwise it uses its default starting point. The count
-    `accepted_starts` is 1 if QTQP used the last point, otherwise 0.
+    residuals are small enough; otherwise it uses its default starting point. If a last
+    point was passed, the count `accepted_starts` is 1 if QTQP used it, otherwise 0.
     """
 
     linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"

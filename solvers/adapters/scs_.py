@@ -57,7 +57,7 @@ class SCS:
         phases="equilibration and factorisation (preparing); iterations (solving)",
         sequence="`update` replaces vectors and keeps the factors; starts from the "
         "last point",
-        limits=("SCS needs a row or a bound, because it rejects an empty cone.",),
+        limits=("SCS needs a constraint, because it rejects an empty cone.",),
     )
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class SCS:
     def declines(self, qp: QP) -> str | None:
         rows = ("equalities", "inequalities", "bounds")
         if len(qp.sets) == 1 and not any(qp.sizes[k] for k in rows):
-            return "needs a row or a bound, because SCS rejects an empty cone"
+            return "needs a constraint, because SCS rejects an empty cone"
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:

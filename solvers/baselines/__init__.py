@@ -1,1 +1,1 @@
-"""In-house solvers for comparison: active sets, projected gradients, least squares."""
+"""In-house solvers other than SMALBE, for comparison with SMALBE and libraries."""

@@ -17,11 +17,12 @@ from mortarbench.solvers.common.conversion import csc, dense
 #: δᵢ/Dᵢ: weight δᵢ of the proximal term of xᵢ, relative to the curvature Dᵢ = Pᵢᵢ; a
 #: typical curvature replaces a negligible Pᵢᵢ, see `penalise`
 DELTA = 1e-9
-#: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to the curvature of the objective
-#: along a
+#: ρ·aD⁻¹aᵀ: penalty ρ of a row a of A or G, relative to 1/(aD⁻¹aᵀ), an estimate of the
+#: curvature of the objective along a
 KAPPA = 1e4
 #: Largest number of consecutive changes of the active set that do not reduce the number
-#: of wrong constraints. Afterwards, constraints are exchanged one at a time.
+#: of wrong constraints. Afterwards, constraints are exchanged one at a time until this
+#: number falls below its minimum.
 PATIENCE = 10
 #: relative errors of multiplier signs and of bounds below this value count as rounding
 #: errors
@@ -55,12 +56,12 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """QP, with proximal weights and a function that factorises its Newton systems."""
+    """QP with proximal weights, penalties and a function that factorises faces."""
 
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) diagonal of P, with its mean in place of negligible entries
+    D: Vector  #: (n,) diagonal of P; a typical curvature replaces negligible entries
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise
@@ -77,15 +78,17 @@ class Problem:
 def penalise(
     qp: QP, counts: Counter[str], factorise: Factorise, kappa: float = KAPPA
 ) -> Problem:
-    """Return the problem with row weights κ/(a D⁻¹aᵀ); factorise the common block.
+    """Return the problem with row weights κ/(a D⁻¹aᵀ).
 
-    The common block consists of the components that are free on every face.
+    If P is dense and there are no inequality rows, `factoriser` also factorises the
+    block of the components that are free on every face.
 
     Raises
     ------
-    numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If this factorisation breaks down because P is not positive semidefinite. A
-        later factorisation of a face may raise the same errors for such a P.
+    numpy.linalg.LinAlgError
+        If this factorisation breaks down because P is not positive semidefinite. For
+        such a P, a later factorisation of a face may raise the same error, or
+        sksparse.cholmod.CholmodNotPositiveDefiniteError if P is sparse.
 
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc

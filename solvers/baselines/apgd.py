@@ -85,7 +85,7 @@ class _State(NamedTuple):
     g_y: Vector  #: Py + q
     weight: float  #: θ, which determines β; 1 at the start and after a restart
     L: float
-    most: float  #: largest curvature dᵀPd/dᵀd so far
+    most: float  #: initial L, or a larger curvature dᵀPd/dᵀd found so far
 
 
 def _start(problem: Problem) -> _State:

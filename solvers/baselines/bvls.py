@@ -1,10 +1,11 @@
 """Bounded-variable least squares (scipy), applied to a Cholesky factor of P.
 
 With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖².  A strictly convex QP with
-bounds is therefore a least-squares problem. If every component has a lower bound and
-none has an upper bound, this problem is solved by the active-set method of Lawson and
-Hanson (Solving Least Squares Problems, 1974, Chapter 23). With other bounds, it is
-solved by the extension of this method by Stark and Parker (Comput. Stat. 10, 1995).
+bounds is therefore a least-squares problem. If every variable that is not fixed has a
+lower bound and none of them has an upper bound, this problem is solved by the
+active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974, Chapter
+23). For other bounds, it is solved by the extension of this method by Stark and Parker
+(Comput. Stat. 10, 1995).
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ CLAIM_FACTOR = 5.0
 class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") for other bounds.
 
-    Both routines return an active set, for which the free components are recomputed by
-    a direct solve. The tolerance passed to bvls is min(tol, 1e-10). The solver claims a
-    solution if all KKT residuals are at most 5·tol. Fixed variables are eliminated. The
-    objective is scaled, because the stopping test of bvls is absolute. scipy reports
-    the number of iterations for bvls but not for nnls.
+    The free components of the resulting active set are recomputed by a direct solve.
+    The tolerance passed to bvls is min(tol, 1e-10). The solver claims a solution if all
+    KKT residuals are at most 5·tol. Fixed variables are eliminated. The objective is
+    scaled, because the stopping test of bvls is absolute. scipy reports the number of
+    iterations for bvls but not for nnls.
     """
 
     max_iter: int = 10_000

@@ -47,9 +47,10 @@ def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
 
     Raises
     ------
-    numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        If M is not positive definite. The returned function may also raise these
-        errors.
+    numpy.linalg.LinAlgError
+        If the block of M that is factorised in advance is not positive definite. If the
+        matrix of a face is not positive definite, the returned function raises this
+        error, or sksparse.cholmod.CholmodNotPositiveDefiniteError for a sparse M.
 
     """
     if not isinstance(M, np.ndarray):

@@ -50,7 +50,7 @@ Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
 #: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
-#: the solve fails if its stopping bound falls below this factor times tol
+#: the solve fails if its reduced tolerance falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
 #: the solve fails after this number of consecutive steps if none of them halved the
 #: smallest ‖w‖ so far
@@ -58,8 +58,8 @@ PATIENCE = 100
 STAGNATED = (
     "no further progress because of rounding, or the objective is unbounded below"
 )
-#: rows count as dependent if the ratio of a pivot of GQGᵀ to the largest pivot is below
-#: this value
+#: for Q = I, rows count as dependent if the ratio of the smallest to the largest pivot
+#: of GGᵀ is at most this value
 MIN_PIVOT = 1e-13
 BATCH = 256  #: number of columns of Gᵀ per application of the preconditioner
 

@@ -1,13 +1,15 @@
-"""Interior-point method whose linear systems multigrid with a contact filter solves.
+"""Interior-point method with CG preconditioned by multigrid and a contact filter.
 
 The linear systems are those of the contact miniapp of MFEM (Petrides et al., AMG with
 filtering: an efficient preconditioner for interior point methods in large-scale contact
 mechanics optimization, arXiv:2505.18576, 2025). Inequality rows and finite bounds are
 collected in Cx + s = d with s ≥ 0. All rows c of C and of A are divided by √(c D⁻¹cᵀ),
-where D is the diagonal of P. Each iteration takes these steps:
+where D is the diagonal of P, with a typical curvature in place of negligible entries.
+Fixed variables (lb = ub) have no rows in C; they keep their value. Each iteration takes
+these steps:
 
 1. Proximal method of multipliers (Rockafellar 1976; for interior points: Schwan, Jiang,
-   Kuhn and Jones, PIQP, CDC 2023), with its centre in the current point. The Newton
+   Kuhn and Jones, PIQP, CDC 2023), with its centre at the current point. The Newton
    step then exists even if P is singular or rows are repeated:
 
        (P + δD)dx + Aᵀdy + Cᵀdz = −(Px + q + Aᵀy + Cᵀz)
@@ -20,9 +22,9 @@ where D is the diagonal of P. Each iteration takes these steps:
        H = P + δD + κAᵀA + CᵀWC,   W = (S Z⁻¹ + 1/κ_C)⁻¹.
 
 3. Mehrotra's predictor (σ = 0), the centring σ = (μ_aff/μ)³, and the corrector.
-4. Conjugate gradients for both right-hand sides. At the solution, W is large at active
-   rows and small at all others, and multigrid alone would fail. With the V-cycle B for
-   H and the components F that occur in rows, the preconditioner is
+4. Conjugate gradients for both right-hand sides. Near the solution, W is large at
+   active rows and small at all others, and multigrid alone would fail. With the V-cycle
+   B for H and the components F that occur in rows of A or G, the preconditioner is
 
        z ← H_FF⁻¹ r_F,   z ← z + B(r − Hz),   z ← z + H_FF⁻¹ (r − Hz)_F.
 """
@@ -66,7 +68,7 @@ MAX_CG = 1000  #: largest number of CG steps per solve; contact cases need 5 to 
 TO_BOUNDARY = 0.995
 #: When the products sz are below the tolerance, the remaining residuals come from
 #: rounding and from inexact solves. The method then ends after this number of
-#: iterations that did not halve the smallest residual.
+#: consecutive iterations, none of which halved the smallest residual so far.
 PATIENCE = 10
 #: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
@@ -87,7 +89,7 @@ class Problem:
 
     qp: QP
     P: csr_array
-    D: Vector  #: (n,) diagonal of P, with its mean in place of negligible entries
+    D: Vector  #: (n,) diagonal of P; a typical curvature replaces negligible entries
     A: csr_array
     b: Vector
     A_norms: Vector  #: (m,) factors by which the rows of A were divided
@@ -97,7 +99,7 @@ class Problem:
     upper: NDArray[np.intp]  #: components with a finite upper bound
     lower: NDArray[np.intp]
     fixed: Mask  #: (n,) components with lb = ub, which have no rows in C
-    filter: NDArray[np.intp]  #: components that occur in the rows of A or G
+    filter: NDArray[np.intp]  #: components in rows of A or G that are not fixed
     kernel: NDArray[np.float64]  #: (n, k) near-kernel vectors
 
     def gradient(self, at: Point) -> Vector:
@@ -126,8 +128,8 @@ class IPMAMG:
 
     P must be sparse. The iteration stops when the KKT residuals of the QP are at most
     tol. If rounding prevents further progress, the solver also claims a point with
-    residuals of at most 5·tol. It counts conjugate-gradient steps, and multigrid setups
-    as factorisations. The solver does not detect infeasible QPs.
+    residuals of at most 5·tol. It counts conjugate-gradient steps, and it counts each
+    multigrid setup as a factorisation. The solver does not detect infeasible QPs.
     """
 
     max_iter: int = 100
@@ -144,7 +146,8 @@ class IPMAMG:
         limits=(
             "The near-kernel does not contain rotations, because a QP contains no "
             "coordinates.",
-            "Infeasible and unbounded QPs end at the limit of iterations.",
+            "Infeasible and unbounded QPs are not detected: the solver ends at its "
+            "limit of iterations, or it fails.",
         ),
     )
 
@@ -222,7 +225,8 @@ def _iterate(
             break
     if best_worst <= CLAIM_FACTOR * tol:
         return best
-    return replace(best, status=Status.ITERATION_LIMIT, message="no further progress")
+    message = "step limit, or no further progress"
+    return replace(best, status=Status.ITERATION_LIMIT, message=message)
 
 
 def _start(problem: Problem, tol: float, counts: Counter[str]) -> Point:
@@ -240,7 +244,7 @@ def _start(problem: Problem, tol: float, counts: Counter[str]) -> Point:
     y = KAPPA * (problem.A @ x - problem.b)
     s = problem.d - problem.C @ x
     s, z = s + max(-1.5 * s.min(initial=0.0), 0), max(1.5 * s.max(initial=0.0), 0) - s
-    if p and not s @ z > 0:  # no constraint is active at x
+    if p and not s @ z > 0:  # every slack at x is zero
         unit = np.sqrt(np.abs(qp.q @ x)) or 1.0
         s, z = s + unit, z + unit
     if p:

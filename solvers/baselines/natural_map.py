@@ -19,7 +19,7 @@ from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 
 #: largest KKT residual of a point that is claimed as a solution, relative to tol
 CLAIM_FACTOR = 5.0
-#: the solve fails if its stopping bound falls below this factor times tol
+#: the solve fails if its reduced tolerance falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
 
 
@@ -36,7 +36,7 @@ class Iterate(Protocol):
 
     @property
     def most(self) -> float:
-        """Largest curvature dᵀPd/dᵀd so far, used as L."""
+        """Largest curvature dᵀPd/dᵀd so far, or an initial estimate; used as L."""
 
 
 I = TypeVar("I", bound=Iterate)
@@ -75,9 +75,10 @@ class Problem:
     ) -> Solution:
         """Take steps until all KKT residuals are at most 5·tol; return the solution.
 
-        The residuals are evaluated when the norm of the natural map falls below
-        tol·‖q‖. If the residuals are too large, the loop continues with a smaller
-        bound. The status is SOLVED only if all residuals are at most 5·tol.
+        The residuals are evaluated when the norm of the natural map is at most tol·‖q‖;
+        if q = 0, ‖q‖ is replaced by the initial ‖g‖. If the residuals are too large,
+        the loop continues with a smaller bound. The status is SOLVED only if all
+        residuals are at most 5·tol.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x

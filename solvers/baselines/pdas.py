@@ -14,16 +14,17 @@ set no longer changes. Three extensions handle QPs on which this iteration fails
    where the equation of z applies to active rows. The system of a face then has a
    solution even if P is singular, rows are repeated, or there are more active rows than
    free components. When the active set no longer changes, the centre (x_k, y_k, z_k)
-   moves to the solution, and the factor of the last face is reused. The weights δᵢ =
-   1e-9·Pᵢᵢ are small, and the penalty ρ = 1e4/(a D⁻¹aᵀ) of a row a, with D = diag P, is
-   large. Therefore the active set for the first centre is usually the final active set.
-   If the residuals decrease too slowly, ρ is increased. The increase is necessary for a
-   row in which all free variables are stiff.
+   moves to the solution, and the factor of the last face is reused. Let D be the
+   diagonal of P, with a typical curvature in place of negligible entries. The weights
+   δᵢ = 1e-9·Dᵢ are small, and the penalty ρ = 1e4/(a D⁻¹aᵀ) of a row a is large.
+   Therefore the active set for the first centre is usually the final active set. If the
+   residuals decrease too slowly, ρ is increased. The increase is necessary for a row in
+   which all free variables are stiff.
 2. Block principal pivoting (Júdice and Pires 1994, Comput. Oper. Res. 21). After ten
-   changes of the active set that did not reduce the number of wrong constraints, only
-   the last wrong constraint is changed (Murty's rule), until the number of wrong
-   constraints falls below its previous minimum. This procedure terminates, because the
-   systems of extension 1 belong to a strictly convex problem.
+   consecutive changes of the active set that did not reduce the number of wrong
+   constraints, only the last wrong constraint is changed (Murty's rule), until the
+   number of wrong constraints falls below its previous minimum. This procedure
+   terminates, because the systems of extension 1 belong to a strictly convex problem.
 3. Certificates of infeasibility. After each change of the centre, the difference of the
    last two centres is tested (`solvers.baselines.infeasibility_certificate`).
 """
@@ -91,7 +92,7 @@ class PDAS:
     The iteration stops when the KKT residuals of the QP are at most tol. If rounding
     prevents further progress, the solver also claims a point with residuals of at most
     5·tol. The solver reports the number of linear solves as iterations. It counts
-    factorisations (one per face, plus one if the block of unbounded variables is
+    factorisations (one per face, plus one if the block of variables without bounds is
     eliminated in advance), constraints that entered or left the active set, steps that
     exchanged a single constraint, proximal centres, and products with P.
 
@@ -107,8 +108,9 @@ class PDAS:
         licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="assembly of the penalised matrix (preparing); factorisations of the "
-        "matrices of the faces (solving)",
+        phases="assembly of the penalised matrix and, for a dense P without inequality "
+        "rows, elimination of variables without bounds (preparing); factorisations of "
+        "the matrices of the faces (solving)",
         sequence="starts from the last active set and point",
         limits=(
             "On one-dimensional obstacle problems, the contact front moves by one "

@@ -99,7 +99,8 @@ class _State(NamedTuple):
     alpha: float
     #: objectives of the last M iterates, relative to the objective of the first iterate
     costs: tuple[float, ...]
-    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if no curvature was positive
+    #: largest curvature dᵀPd/dᵀd so far; at least 1 if the first curvature was ≤ 0
+    most: float
 
 
 def _start(problem: Problem) -> _State:

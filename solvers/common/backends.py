@@ -78,7 +78,7 @@ def reason_unavailable(
 
 
 def _missing_packages(adapter: Path) -> list[str]:
-    """Return the imports of an adapter file that are not installed."""
+    """Return the packages that an adapter file imports but that are not installed."""
     return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 

@@ -29,7 +29,7 @@ NEGLIGIBLE = 1e-14
 #: types of sets that have a conic form
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: A claimed solution counts as diverged if ‖x‖∞ exceeds this value: the terms of its
-#: residuals are then so large that every relative residual is small.
+#: residuals may then be so large that the relative residuals are small.
 DIVERGED = 1e12
 #: ‖q‖∞ after scaling, for solvers that divide residuals by max(1, size). With sizes of
 #: about 1e4, the 1 has no effect, and the stopping criteria of these solvers are
@@ -38,7 +38,7 @@ OBJECTIVE_SIZE = 1e4
 
 
 def needs_dense(qp: QP, copies: float) -> str | None:
-    """Return a reason to decline `qp` if its dense matrices are too large, or None.
+    """Return a reason to decline `qp` if P is an operator or too large, or None.
 
     copies : largest number of dense matrices, each as large as P, that the solver
         stores at the same time
@@ -50,7 +50,7 @@ def needs_independent_rows(qp: QP) -> str | None:
     """Return a reason to decline `qp` if its equality rows are dependent, or None."""
     # The eigenvalues of AAᵀ are the squared singular values of A. Therefore rows count
     # as dependent if the ratio of the smallest to the largest singular value of A is
-    # below about √(machine precision).
+    # below about √(mε) for m rows and the machine precision ε.
     gram = dense(csc(qp.A) @ csc(qp.A).T)
     if not gram.size or np.linalg.matrix_rank(gram, hermitian=True) == len(gram):
         return None
@@ -86,7 +86,7 @@ def has_bound(qp: QP) -> NDArray[np.bool_]:
 
 
 def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
-    """Return R, low and high with low ≤ Rx ≤ high, for rows of A and G and bounds."""
+    """Return the rows R of A, G and bounds, with low and high in low ≤ Rx ≤ high."""
     box = has_bound(qp)
     rows = vstack([csc(qp.A), csc(qp.G), eye_array(qp.q.size, format="csr")[box]])
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf), qp.lb[box]])
@@ -117,7 +117,8 @@ class ConicForm:
     The components of s are, in this order:
 
     - zeros (rows of A, and variables that a disc or cone fixes at 0),
-    - nonnegative numbers (rows of G, x ≤ ub, −x ≤ −lb),
+    - nonnegative numbers (rows of G, x ≤ ub, −x ≤ −lb, and −x_N ≤ 0 for cones of slope
+      0),
     - blocks (t, w) with ‖w‖ ≤ t: (radius, x_I) for a disc of variables I, and
       (slope·x_N, x_T) for a cone with normal component x_N and tangential part x_T.
 
@@ -267,7 +268,7 @@ def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
 
 
 def same_cones(one: QP, other: QP) -> bool:
-    """Return True if the QPs have no discs and cones, or the same conic rows."""
+    """Return True if neither QP has discs or cones, or if the conic rows are equal."""
     if len(one.sets) == len(other.sets) == 1:
         return True
     R, S = to_cone(one), to_cone(other)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: packages called by adapters, and their backends and factorisation libraries
+#: packages that solvers call, their backends, and factorisation libraries
 PACKAGES = (
     "clarabel", "cvxopt", "cvxpy", "daqp", "ecos", "highspy", "highspy-extras", "osqp",
     "piqp", "proxsuite", "py-mkl-pardiso", "pyamg", "qoco", "qpalm", "qpsolvers",

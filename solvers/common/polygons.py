@@ -22,7 +22,8 @@ class PolygonalQP:
     """Approximation of a QP in which polygons replace discs and sections of cones."""
 
     qp: QP  #: QP without discs and cones; G has one additional row per polygon side
-    #: 1 − cos(π/k) for k sides; each polygon contains the disc with (1 − error)·radius
+    #: 1 − cos(π/k) for k sides; each polygon contains the concentric disc of radius
+    #: (1 − error)·radius
     error: float
     #: Maps a point of `qp` to a point of the original QP. The resulting `z_box` is
     #: normal to the polygons rather than to the circles, so the residuals of the point

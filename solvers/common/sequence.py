@@ -15,8 +15,8 @@ class Session(NamedTuple):
     """Operations on a library's solver object that was set up for one QP."""
 
     solve: Callable[[], Solution]
-    #: replaces the vectors of the QP; the new QP must have the same matrices and the
-    #: same set of bounded variables; None if every QP needs a new session
+    #: replaces the vectors of the QP if `only_vectors_differ`; None if every QP needs a
+    #: new session
     update: Callable[[QP], None] | None = None
     #: sets the starting point of the next solve; None if the library does not accept a
     #: starting point
@@ -38,10 +38,11 @@ def tightening(
 ) -> Callable[[QP, float], Callable[[], Solution]]:
     """Return the `prepare` function for a sequence with a tolerance for each QP.
 
-    If only vectors differ from the previous QP, the session is updated, and a library
-    that supports warm starts continues from its last point. Otherwise `begin` creates a
-    new session. The new session starts from the last point if the library accepts a
-    starting point and the sizes match. A new tolerance also requires a new session,
+    If the session has `update` and only vectors differ from the previous QP, the
+    session is updated, and a library that supports warm starts continues from its last
+    point. Otherwise `begin` creates a new session. The new session starts from the last
+    point if the library accepts a starting point, and if the sizes, the bounded
+    variables and the conic rows match. A new tolerance also requires a new session,
     unless the session has `tighten`.
     """
     session: Session | None = None
@@ -81,7 +82,9 @@ def tightening(
 def only_vectors_differ(one: QP, other: QP) -> bool:
     """Return True if two QPs have equal matrices and bounds on the same variables.
 
-    Discs and cones may differ only in the right-hand sides of their conic rows.
+    Lower and upper bounds are compared separately, and the matrices must be stored in
+    the same way (dense or sparse). Discs and cones may differ only in the right-hand
+    sides of their conic rows.
     """
     matrices = ((one.P, other.P), (one.A, other.A), (one.G, other.G))
     bounds = ((one.lb, other.lb), (one.ub, other.ub))

@@ -39,7 +39,7 @@ RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
 #: penalty of rows of A relative to all other penalties, as in OSQP
 EQUALITY_PENALTY = 1e3
 MAX_PENALTY_CHANGE = 10.0  #: largest ratio of the penalties of two successive rounds
-DIFFERENCE_STEP = 2.0**-26  #: √ε, the step of difference quotients relative to t
+DIFFERENCE_STEP = 2.0**-26  #: √ε, the step of difference quotients relative to ‖t‖∞
 #: relative diagonal shift of the Newton matrix, which regularises dependent rows; it
 #: perturbs the steps, but not the zero of (1)
 SHIFT = 1e-15
@@ -142,9 +142,9 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
 def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vector:
     """Iterate t ← step(t) `count` times, with an acceleration every `MEMORY` steps.
 
-    An accelerated point is used only if its residual ‖step(t) − t‖ is not larger than
-    the last residual. The residual of plain steps never increases, because `step` is an
-    averaged operator.
+    The image of an accelerated point replaces t only if the residual ‖step(t) − t‖ of
+    this point is not larger than the last residual. The residual of plain steps never
+    increases, because `step` is an averaged operator.
     """
     images, changes = list[Vector](), list[Vector]()
     for _ in range(count // MEMORY):

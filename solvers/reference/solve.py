@@ -54,11 +54,11 @@ OUTLIER_FACTOR = 1e4
 def reference_solution(qp: QP) -> Solution:
     """Return a solution of a convex QP, usually accurate to rounding.
 
-    The field `iterations` contains the number of interior-point steps, if that method
-    ran. The remaining residual is then caused by the rounding of x to double precision.
-    This residual is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for
-    the displacements of stiff bodies. The function does not check that P is positive
-    semidefinite.
+    In this case, the remaining residual is caused by the rounding of x to double
+    precision. It is about 1e-16·|P||x| relative to |Px|, which is a few times 1e-12 for
+    the displacements of stiff bodies. The field `iterations` contains the number of
+    interior-point steps, if that method ran. The function does not check that P is
+    positive semidefinite.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
 
 
 def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
-    """Yield points computed with a smaller δ.
+    """Yield points that were refined with a smaller δ.
 
     If P has weak curvature or rows are nearly parallel, a smaller δ is necessary.
     """

@@ -58,7 +58,7 @@ class Direct:
         method="augmented Lagrangian with an exact inner active-set method",
         linear_solver="dense Cholesky factor, updated when the active set changes",
         phases="orthonormalisation of the equality rows and factorisation of the block "
-        "of unbounded variables (preparing); iterations (solving)",
+        "of variables without bounds (preparing); iterations (solving)",
         limits=(
             "QPs with inequality rows are declined; dual forms have no inequality "
             "rows.",
@@ -136,7 +136,10 @@ class _Task:
         )
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
-        """Return the minimiser a of ‖(g + Cᵀa)_F‖ on the free components F."""
+        """Return the minimiser of ‖(g + Cᵀa)_F‖ on the free components F.
+
+        If it is not unique, return the minimiser nearest to the argument `a`.
+        """
         C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
         missing = g[free] + C.T[free] @ a
         change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)

@@ -19,7 +19,7 @@ typedef struct {
     const double *radius;
     const double *slack; /* rounding error of ‖x_I + c_I‖ */
     const double *centre; /* (n,) c, NULL if c = 0; the centre is −c */
-    const Py_ssize_t *range; /* (2 ranges,) first and last variable without a disc */
+    const Py_ssize_t *range; /* (2 ranges,) intervals [a, b) of variables without a disc */
 } discs;
 
 #define FIRST(D, i, d) ((d) ? (d) * (i) : (D)->start[i])

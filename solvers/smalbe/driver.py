@@ -58,7 +58,7 @@ EPS = float(np.finfo(float).eps)
 #: feasible_set.pxi. With 16 EPS times the radius alone,
 #: `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-#: smallest value of the limit on Lanczos steps; applies to small problems
+#: smallest limit on Lanczos steps, unless the option `lanczos_steps` is smaller
 MIN_LANCZOS_STEPS = 5
 #: default penalty ρ. Because the models contain ρQ exactly, a large ρ costs no
 #: products. With 1e4, two or three outer iterations usually suffice
@@ -177,8 +177,8 @@ def _with_second_attempt(
 def _on_discs(qp: QP, options: Options) -> Options:
     """Replace options that are not valid for QPs with discs.
 
-    Models can be minimised only over boxes. A step along −β, which is tangent to the
-    boundary of a disc, would leave the disc.
+    The model of H can be minimised only over boxes. A step along −β, which is tangent
+    to the boundary of a disc, would leave the disc.
     """
     kind = resolved_preconditioner(qp, options.preconditioner)
     return replace(
@@ -400,9 +400,9 @@ def _solve_to_tolerance(
 ) -> tuple[Solution, Callable[[], Carry | None]]:
     """Tighten the outer loop until the KKT residuals of the original QP are ≤ tol.
 
-    Residuals of up to CLAIM_FACTOR·tol are accepted. If they exceed tol, the tolerance
-    of the outer loop is tightened once or twice more, and the point with the smallest
-    residual is returned.
+    Residuals of up to CLAIM_FACTOR·tol are accepted. If they exceed tol and the
+    expansion is 'model', the tolerance of the outer loop is tightened once or twice
+    more, and the point with the smallest residual is returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
     if at is None or task.options.expansion != "model":
@@ -611,8 +611,10 @@ COLUMNS = (
     "free_gradient",  # ‖φ‖
     "chopped_gradient",  # ‖β‖
     "infeasibility",  # ‖Cν‖/‖x̃‖; for x̃ = 0, ‖Cν‖/‖ν‖
-    "active",  # number of components at bounds
-    "two_sided",  # active components with two bounds; omitted if no component has two
+    "active",  # number of components at bounds or on the boundary of a disc
+    # number of active components with a lower and an upper bound; omitted if no
+    # component has both
+    "two_sided",
     "cost",  # value of the augmented Lagrangian
     "seconds",  # time since the start of `prepare`
 )

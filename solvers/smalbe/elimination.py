@@ -1,8 +1,9 @@
 """Elimination of the free variables from a QP, and recovery of their values.
 
 A variable is free if it has no bounds and belongs to no disc. Let E be the free
-variables and I the other variables. The stationarity
-conditions of E and the equality rows that involve E,
+variables and I the other variables. The equality rows are orthonormalised and combined
+such that as few of them as possible involve E. The stationarity conditions of E and the
+rows that involve E,
 
     [P_EE G_Eᵀ] [x_E]   [−q_E − P_EI x_I]
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
@@ -90,7 +91,7 @@ class _Saddle:
 def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
     """Eliminate the free variables; return None if this is not possible.
 
-    Elimination requires an explicit P with positive definite P_EE, free and other
+    Elimination requires an explicit P with positive definite P_EE, both free and other
     variables, and consistent equality rows. After orthonormalisation, each
     singular value of these rows restricted to E must be either zero up to rounding or
     far above rounding. A QP with inequality rows is not reduced.

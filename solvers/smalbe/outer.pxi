@@ -1,10 +1,11 @@
 # The outer loop, and the recovery of x and its multipliers.
 
 
-# Largest penalty. At this value, the rounding error 2⁻⁵³ρ‖ν‖ of ρQν reaches 1e-6·‖ν‖;
-# with larger values, it would dominate the gradient. Without a limit, models become
-# indefinite (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With
-# 1e3, `test_a_stalled_multiplier_increases_the_penalty` fails.
+# Largest penalty to which the safeguards of the outer loop increase ρ. At this value,
+# the rounding error 2⁻⁵³ρ‖ν‖ of ρQν reaches 1e-6·‖ν‖; with larger values, it would
+# dominate the gradient. Without a limit, models become indefinite
+# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`). With 1e3,
+# `test_a_stalled_multiplier_increases_the_penalty` fails.
 cdef double MAX_RHO = 1e10
 # Limit of the total number of products, relative to the number of products at which the
 # gradient is small enough. The reduction of the energy error may therefore take a

@@ -10,7 +10,7 @@ preconditioners are
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
 
 where the index b denotes the displacements that occur in B, and i all other
-displacements. B_D = (BWBᵀ)⁻¹BW has the compliances W = diag(K_bb)⁻¹ as weights, so that
+displacements. B_D = (BWBᵀ)⁻¹BW has the weights W = diag(K_bb)⁻¹, so that
 the softer of two bodies takes the larger part of a jump (Rixen and Farhat 1999). An
 operator P may provide its own preconditioners (`harness.operators.Preconditioned`).
 
@@ -64,8 +64,8 @@ MIN_DIFFICULTY = 50.0
 #: smallest spread for which a factor is used for any number of levels; journal bearings
 #: with an eccentricity of 0.9 have spreads of 2000 to 7000
 MIN_SPREAD = 1000.0
-#: largest spread for which variables are not scaled before a factorisation, because
-#: scaling takes as long as several products
+#: largest spread for which variables are not scaled, because scaling takes as long as
+#: several products
 MAX_UNSCALED = 2.0
 #: smallest spread·n for which variables are scaled if no factor is used; below this
 #: value, as in journal bearings of 100 to 400 unknowns, scaling takes longer than the
@@ -98,7 +98,7 @@ class Sparsity(NamedTuple):
 
 
 def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Replace ``auto`` by dirichlet if available, incomplete if faster, else model."""
+    """Replace ``auto`` by the kind that `resolved` selects."""
     return resolved(qp, kind)[0]
 
 
@@ -108,7 +108,8 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
     A CG step with an incomplete factor costs four to seven times as much as a step
     without a factor. The factor therefore saves time if CG without a factor takes more
     than about 150 steps. This number of steps grows with `Sparsity.levels` and with the
-    fourth root of `Sparsity.spread`.
+    fourth root of `Sparsity.spread`. The choice of ``auto`` is dirichlet if P is an
+    operator that provides it, otherwise incomplete if it saves time, otherwise model.
     """
     if kind not in ("auto", "incomplete"):
         return kind, False

@@ -33,7 +33,10 @@ class Spectrum(NamedTuple):
     ritz: Ritz | None  #: upper Ritz pairs; None if they were not computed
 
     def orthogonal_to(self, rows: Rows) -> Spectrum:
-        """Return the spectrum with Ritz vectors projected onto the kernel of `rows`."""
+        """Return the spectrum with Ritz vectors projected onto the kernel of `rows`.
+
+        For sparse rows, the spectrum is returned unchanged.
+        """
         if self.ritz is None or not isinstance(rows, DenseRows):
             return self
         V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
@@ -107,7 +110,7 @@ def projected_problem(
 ) -> Projected:
     """Homogenise, project and normalise a QP.
 
-    This takes one product in addition to the products of `find`.
+    If x̃ ≠ 0, this takes one product in addition to the products of `find`.
 
     find : function that returns the spectrum of 𝒫F𝒫, such as `by_lanczos` or `by_power`
     """

@@ -25,7 +25,7 @@ cdef bint step_by_factor(MPRGP at) except -1:
     one component in a step, because −g points into the set only at adjacent components.
     Therefore neighbours in the graph of P, up to a distance of `layers` edges, are also
     released; a neighbour that the step would move out of the set stays at its bound. If
-    most of the neighbours leave their bounds, the number of layers is doubled,
+    at least half of the neighbours leave their bounds, the number of layers is doubled,
     otherwise halved. The number is reset to zero after an expansion. The step is
     accepted only if the cost decreases by at least `gain_of_projection`; otherwise a
     gradient projection step is taken, which costs one more product.

@@ -54,9 +54,11 @@ from mortarbench.solvers.smalbe import compiled
 Mask: TypeAlias = NDArray[np.bool_]
 SparseColumns: TypeAlias = Any  #: a sparse array, `LocalRows` or `DistributedColumns`
 
-CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to ‖x̃‖∞ + ‖e‖∞
+#: largest error of consistent rows, relative to ‖x̃‖∞ + ‖e‖∞, for normalised rows
+CONSISTENCY_TOL = 1e-8
 RANK = 1e-13  #: squared pivots of normalised rows below this value count as rounding
-FREE_RANK = 1e-10  #: singular values of C on a face below this value count as zero
+#: singular values of C on a face below this fraction of the largest one count as zero
+FREE_RANK = 1e-10
 #: largest number of rows with entries in bounded components, whose block is dense
 MAX_BORDER = 2000
 #: a sparse G stays sparse if m·n exceeds this value
@@ -509,7 +511,7 @@ def rows_over_ranks(
 
 
 def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:
-    """Return G_F G_Fᵀ for a mask F (n,) of columns; a small result is dense."""
+    """Return G_F G_Fᵀ for a mask F (n,) of columns; dense for few `LocalRows`."""
     if isinstance(G, DistributedColumns):
         return G.gram(columns)
     if isinstance(G, LocalRows):

@@ -20,7 +20,7 @@ from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diag
 from mortarbench.solvers.smalbe.preconditioner import MAX_UNSCALED
 from mortarbench.solvers.smalbe.projected import Spectrum
 
-#: smallest entry of D relative to the largest one
+#: over discs, smaller entries of D are replaced by this factor times the largest one
 SMALLEST_DIAGONAL = 1e-10
 #: a negative sum Σⱼ Pᵢⱼwⱼ counts as zero if its absolute value is at most this factor
 #: times Pᵢᵢwᵢ
@@ -33,7 +33,8 @@ class Scaled:
 
     original: QP
     qp: QP  #: QP in y = D¹ᐟ²x; `original` if D is nearly constant
-    root: Vector  #: (n,) D¹ᐟ², or ones
+    #: (n,) D¹ᐟ², over discs rounded to powers of two; ones if D is nearly constant
+    root: Vector
 
     @classmethod
     def over_discs(cls, qp: QP) -> Scaled:
@@ -82,7 +83,8 @@ class ScaledSparse(Scaled):
 
     P: Matrix  #: P of `original`, in CSR or CSC format with sorted indices
     diagonal: Vector  #: (n,) diagonal of P
-    #: upper bound on the norm of the matrix H of `qp`: the largest row sum Σⱼ|Hᵢⱼ|
+    #: upper bound on the norm of the matrix H of `qp`, from the largest sum Σⱼ|Sᵢⱼ| of
+    #: S = D⁻¹ᐟ²PD⁻¹ᐟ²
     norm: float
     weights: Vector  #: (n,) w > 0; Pw ≥ 0 up to rounding if `has_weights`
     has_weights: bool

@@ -41,9 +41,9 @@ class SMALBE(Options):
     are first eliminated by a Cholesky factor.
 
     `tol` bounds ‖g^P‖/‖b‖, where g^P is the projected gradient of the projected
-    problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only, the default options test the
-    KKT residuals instead. The solver claims a solution only if the KKT residuals of the
-    original QP are also at most 5·tol.
+    problem, and ‖Gx − e‖/‖e‖. For QPs with bounds only and a known diagonal of P, the
+    default options test the KKT residuals instead. The solver claims a solution only if
+    the KKT residuals of the original QP are also at most 5·tol.
     """
 
     about: ClassVar[About] = About(

@@ -37,10 +37,11 @@ def random_start(n: int) -> Vector:
 
 
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:
-    """Estimate ‖H‖ to 1e-4 by PERMON's power method, with at most 50 products.
+    """Estimate ‖H‖ by PERMON's power method, with at most 50 products.
 
-    The iteration starts from a vector of ones. The last Rayleigh quotient is a lower
-    bound on ‖H‖ and is used without a safety factor, as in PERMON.
+    The iteration starts from a vector of ones and ends when a step changes the Rayleigh
+    quotient by less than 1e-4, relative to the quotient. The last Rayleigh quotient is
+    a lower bound on ‖H‖ and is used without a safety factor, as in PERMON.
     """
     v = np.full(n, 1 / np.sqrt(n))
     estimate = 0.0

@@ -94,6 +94,12 @@ def test_an_infeasible_problem_ends_without_a_claim():
     assert IPMAMG().prepare(qp, 1e-8)().status is Status.ITERATION_LIMIT
 
 
+def test_the_limit_of_iterations_is_named_in_the_message():
+    s = IPMAMG(max_iter=1).prepare(mb.build("cube-wall/n=2/primal").qp, 1e-8)()
+    assert s.status is Status.ITERATION_LIMIT
+    assert s.message.startswith("step limit")
+
+
 def test_conjugate_gradients_that_do_not_converge_end_the_solve(monkeypatch):
     monkeypatch.setattr(ipm_amg, "MAX_CG", 1)
     s = IPMAMG().prepare(mb.build("cube-wall/n=4/primal").qp, 1e-8)()
