@@ -165,6 +165,12 @@ def preconditioned(P: Any) -> Preconditioned | None:
     return product if hasattr(product, "preconditioner") else None
 
 
+def is_semidefinite(P: Any) -> bool:
+    """Return True if P or its map declares a kernel by its attribute `semidefinite`."""
+    product = P.build() if isinstance(P, SerialisableOperator) else P
+    return bool(getattr(product, "semidefinite", False))
+
+
 def linear_map(P: Any) -> LinearMap | None:
     """Return x ↦ Px as a compiled map, or None if no compiled map is available."""
     product = P.build() if isinstance(P, SerialisableOperator) else P

@@ -404,9 +404,7 @@ class ParallelSolver:
             return reason_to_decline(self._solver, self._emitted.share().qp)
         product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else None
         if not isinstance(product, Distributable):
-            return (
-                "P cannot be shared by ranks; expected a case divided into subdomains"
-            )
+            return "P cannot be distributed over ranks; expected a case in subdomains"
         if product.parts < self._ranks.size:
             return (
                 f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "

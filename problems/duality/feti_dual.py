@@ -52,7 +52,7 @@ def feti_dual(
     m_I = primal.h.size
     bound = friction.bound / scale[m_I:]
     qp = QP(
-        P=dual_operator(B, bodies.domains, m_E, bodies.clusters),
+        P=dual_operator(B, bodies.domains, m_E, bodies.clusters, bodies.redundant),
         q=bodies.c - B @ free,
         A=csr_array((B @ R).T),
         b=R.T @ f,

@@ -185,8 +185,8 @@ def balanced_partition(
         graph, work, size = csr_array(sums.T @ graph @ sums), work @ sums, size @ sums
     if work.size < ranks:
         raise InputError(
-            f"{ranks} ranks for {work.size} {name}s; expected at most one rank per "
-            f"{name}"
+            f"{ranks} ranks for {work.size} {name}{'s' * (work.size > 1)}; expected at "
+            f"most one rank per {name}"
         )
     if ranks == 1:
         return np.zeros(work.size if cluster is None else cluster.size, dtype=np.int64)
@@ -387,6 +387,11 @@ class RankOperator:
 
     local: DualOperator  #: contribution of the local subdomains, on all touched rows
     halo: Halo
+
+    @property
+    def semidefinite(self) -> bool:
+        """True if Fλ = 0 for some λ ≠ 0; equal on all ranks."""
+        return self.local.semidefinite
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -781,6 +786,7 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         partial(condense_over_ranks, ranks=ranks),
         operator.clusters
         and operator.clusters.restrict(subdomains, classes, local_domains),
+        operator.redundant,
     )
     owned = halo.rows[halo.owned]
     q, lb, ub = (distributed(v[owned], ranks) for v in (qp.q, qp.lb, qp.ub))

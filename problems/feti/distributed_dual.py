@@ -116,6 +116,7 @@ class LocalDual:
             rows.equalities,
             partial(condense_over_ranks, ranks=ranks),
             clusters and replace(clusters, domains=unfactored),
+            self.subdomains.problem.redundant,
         )
         qp = QP(
             P=RankOperator(local, self.halo),

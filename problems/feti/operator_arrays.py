@@ -43,6 +43,7 @@ def dual_operator(
     domains: Subdomains,
     equalities: int,
     clusters: Clusters | None = None,
+    redundant: bool = False,
 ) -> SerialisableOperator:
     """Return F = BK⁺Bᵀ as a serialisable operator; each class is stored once.
 
@@ -50,6 +51,7 @@ def dual_operator(
     ----------
     equalities : number of equality rows of B, which come first
     clusters : clusters whose K̃⁺ replaces K⁺; None if averages join no subdomains
+    redundant : True if the equality rows may be linearly dependent
 
     """
     classes = domains.classes
@@ -73,6 +75,8 @@ def dual_operator(
     }
     for name in _BY_CLASS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
+    if redundant:
+        arrays["redundant"] = np.array(True)
     if clusters is not None:
         faces = csc_array(block_diag(clusters.faces, format="csc"))
         arrays |= {
@@ -111,7 +115,12 @@ def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
     clusters = _clusters(arrays, domains) if "cluster" in arrays else None
     return StoredOperator(
-        B, domains, arrays["explicit"], int(arrays["equalities"]), clusters=clusters
+        B,
+        domains,
+        arrays["explicit"],
+        int(arrays["equalities"]),
+        clusters=clusters,
+        redundant="redundant" in arrays,
     )
 
 

@@ -216,6 +216,12 @@ class DualOperator:
         condense_groups
     )
     clusters: Clusters | None = None  #: None if averages join no subdomains
+    redundant: bool = False  #: True if the equality rows may be linearly dependent
+
+    @property
+    def semidefinite(self) -> bool:
+        """True if Fλ = 0 for some λ ≠ 0."""
+        return self.redundant or self.clusters is not None
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""

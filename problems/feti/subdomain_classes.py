@@ -479,6 +479,7 @@ class DecomposedBodies:
     f: Vector  #: (N,) torn load; Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first
     clusters: Clusters | None = None  #: None if averages join no subdomains
+    redundant: bool = False  #: True if rows of supports and gluing may be dependent
 
     @property
     def units(self) -> Subdomains | Clusters:

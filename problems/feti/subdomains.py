@@ -135,6 +135,11 @@ class DecomposedProblem:
     glue: str  #: name of the gluing, one of `GLUE`
     cluster: int = 0  #: number of subdomains per side of a cluster; 0: no clusters
 
+    @property
+    def redundant(self) -> bool:
+        """True if rows of supports and gluing may be linearly dependent."""
+        return self.glue == "redundant"
+
     @cached_property
     def clusters(self) -> NDArray[np.int64] | None:
         """Cluster of each subdomain (S,), numbered body by body; None without clusters.
@@ -518,6 +523,7 @@ class LocalSubdomains:
             f=self.f,
             equalities=rows.equalities,
             clusters=self.clusters,
+            redundant=self.problem.redundant,
         )
 
     def with_bound(self, bound: Vector) -> LocalSubdomains:

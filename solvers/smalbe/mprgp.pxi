@@ -14,14 +14,18 @@ cdef double NOISE = 1e-13
 # these directions. Without this limit,
 # `test_rounding_along_previous_directions_is_removed` fails.
 cdef double MIN_SLOPE_RATIO = 0.5
-# CG with a structural preconditioner M is *spent* on a face if φᵀz has fallen to the
-# square of the rounding unit, relative to its largest value, or if φᵀz exceeds its
-# smallest value by the factor MAX_GROWTH. In exact arithmetic, φᵀz grows by no more than
-# the condition number of MF, so such directions are rounding errors. With a
-# semidefinite F, as in hybrid FETI and with redundant rows, they approach the kernel of
-# F, and x grows without limit (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
+# For a semidefinite F, as in hybrid FETI and with redundant rows, CG is *spent* on a
+# face if φᵀz has fallen to the square of the rounding unit, relative to its largest
+# value, or if φᵀz or, after a sufficient decrease of φᵀz, the length of the CG step
+# exceeds its smallest value by the factor MAX_GROWTH. In exact arithmetic, the condition
+# number of MF on the range of F limits both factors, so such directions are rounding
+# errors. They approach the kernel of F, and x would grow without limit
+# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
 cdef double MIN_DECREASE = 2.0 ** -104
 cdef double MAX_GROWTH = 1e6
+# x is stored at the smallest φᵀz if φᵀz has decreased by this factor on the face, so that
+# steps along spent directions can be undone.
+cdef double STORED_DECREASE = 2.0 ** -26
 
 cdef enum:
     # Largest number of CG directions stored for a face. Two passes over 200 directions
@@ -295,9 +299,13 @@ cdef class MPRGP:
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` of this run
+    cdef bint is_semidefinite  # True if F has a kernel
     # smallest and largest φᵀz on this face, see `is_spent`
     cdef double least_slope
     cdef double most_slope
+    cdef double least_length  # smallest length of a CG step on this face
+    cdef double *best  # x at `least_slope`, if `has_best`
+    cdef bint has_best
     cdef Model B  # model of H; ᾱ = 1/τ is the length of gradient projection steps
     # model inverted on the face; None without preconditioning
     cdef Model preconditioner
@@ -324,7 +332,7 @@ cdef class MPRGP:
     cdef int make_room(self) except -1:
         """Allocate the vectors."""
         cdef Py_ssize_t n = self.n, r = self.rows.r
-        self.room = Room(17 * n + 3 * r)
+        self.room = Room(18 * n + 3 * r)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -335,7 +343,8 @@ cdef class MPRGP:
         self.face_set = FeasibleSet.of(at, at + n, n, self.over)
         self.rhs, self.g0, self.marked = at + 2 * n, at + 3 * n, at + 4 * n
         self.x0 = self.z  # z is recomputed after each expansion
-        at += 5 * n
+        self.best = at + 5 * n
+        at += 6 * n
         self.Cv, self.Cw, self.Cx = at, at + r, at + 2 * r
         return 0
 
@@ -344,8 +353,8 @@ cdef class MPRGP:
     cdef bint minimise(self, long most, bytearray trace, note) except -1:
         """Run MPRGP from x and g; return True if `stops` ended the run.
 
-        The run returns False after `most` steps, if no step is possible, if CG is spent
-        and the gradient cannot be improved (`refresh`), or if the run *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
+        The run returns False after `most` steps, if no step is possible or CG is spent
+        and a recomputed gradient is no better (`refresh`), or if the run *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
         cost decreased by no more than the rounding of its terms. The first check is
         made after `FIRST_CHECK` steps, and each further check after twice as many
         steps.
@@ -415,14 +424,12 @@ cdef class MPRGP:
                     self.lengths_of_next(gamma)
                 else:
                     self.lengths_along(self.p, self.Hp)
-                if isinf(fmin(self.line.cg, self.line.feasible)):
-                    return 0
+                if isinf(fmin(self.line.cg, self.line.feasible)) or self.is_spent():
+                    if not self.is_semidefinite or not self.refresh():
+                        return 0
+                    inside, gamma = 0, 0.0
+                    continue
                 if self.line.cg <= self.line.feasible:
-                    if self.M is not None and self.is_spent():
-                        if not self.refresh():
-                            return 0
-                        inside = 0
-                        continue
                     # 5. Conjugate gradient step, and the next direction.
                     gamma = self.minimise_along_p()
                     self.record_step(b"c", trace, note)
@@ -461,26 +468,41 @@ cdef class MPRGP:
         raise NotImplementedError
 
     cdef bint is_spent(self) noexcept:
-        """Return True if the CG direction of `line` consists of rounding errors."""
+        """Return True if the CG direction of `line` consists of rounding errors.
+
+        `best` stores x at the smallest φᵀz, once φᵀz has decreased enough.
+        """
         cdef double slope = fabs(self.line.slope)  # φᵀz, apart from rounding
-        self.least_slope = fmin(self.least_slope, slope)
+        if not self.is_semidefinite or self.line.cg > self.line.feasible:
+            return False
         self.most_slope = fmax(self.most_slope, slope)
+        if slope < self.least_slope:
+            self.least_slope = slope
+            if slope <= STORED_DECREASE * self.most_slope:
+                self.has_best = True
+                memcpy(self.best, self.x, self.n * sizeof(double))
+        self.least_length = fmin(self.least_length, self.line.cg)
         return (
             slope > MAX_GROWTH * self.least_slope
             or slope <= MIN_DECREASE * self.most_slope
+            or (self.has_best and self.line.cg > MAX_GROWTH * self.least_length)
         )
 
     cdef int refresh(self) except -1:
-        """Recompute the gradient from x and restart CG; takes one product.
+        """Return to `best`, recompute the gradient from x and restart CG.
 
         Updates of the gradient retain rounding errors of its first, large values. The
-        function returns 0 if ‖φ‖ has not been halved since the last call.
+        function takes one product. It returns 0, without a restart, if ‖φ‖ has not been
+        halved since the last call.
         """
+        if self.has_best:
+            memcpy(self.x, self.best, self.n * sizeof(double))
+        self.gradient(self.x, self.g)
+        self.split()
+        self.knows_Cx = False
         if 4 * self.parts.phi_square > self.phi_square_at_refresh:
             return 0
         self.phi_square_at_refresh = self.parts.phi_square
-        self.gradient(self.x, self.g)
-        self.split()
         self.directions.begin(self.free)
         self.first_direction()
         return 1
@@ -521,7 +543,8 @@ cdef class MPRGP:
 
     cdef int first_direction(self) except -1:
         """Prepare the preconditioner for the face and set p to z."""
-        self.least_slope, self.most_slope = INFINITY, 0.0
+        self.least_slope = self.least_length = INFINITY
+        self.most_slope, self.has_best = 0.0, False
         if self.in_two:
             # φ is added later, in the pass that computes the product
             memset(self.p, 0, self.n * sizeof(double))

@@ -67,6 +67,7 @@ cdef class SMALBE(MPRGP):
         cdef const double *upper
         spectrum, bounds = problem.spectrum, problem.bounds
         self.F, self.M, self.counts = problem.F, M, problem.counts
+        self.is_semidefinite = problem.semidefinite
         self.M_map = M if isinstance(M, LinearMap) else None
         self.n, self.over = self.F.n, self.F.over
         self.norm = self.M_scale = spectrum.norm

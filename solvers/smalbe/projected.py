@@ -12,6 +12,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Discs, Status, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector, distributed
+from mortarbench.harness.operators import is_semidefinite
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product, Reduction
@@ -65,6 +66,7 @@ class Projected:
     #: stopping test by KKT residuals of the original QP; None if the test is on ‖g^P‖
     judge: compiled.Judge | None = None
     discs: tuple[Discs, ...] = ()  #: discs of x, not of ν
+    semidefinite: bool = False  #: True if F has a kernel, see `is_semidefinite`
 
     @property
     def hull(self) -> tuple[Vector, Vector]:
@@ -132,7 +134,18 @@ def projected_problem(
     )
     if norm != spectrum.norm:
         spectrum = spectrum._replace(norm=norm)
-    return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal, discs=discs)
+    return Projected(
+        F,
+        rows,
+        C,
+        spectrum,
+        b,
+        bounds,
+        qp.q,
+        diagonal,
+        discs=discs,
+        semidefinite=is_semidefinite(qp.P),
+    )
 
 
 def _diagonal(qp: QP) -> Vector:

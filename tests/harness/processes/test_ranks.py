@@ -293,7 +293,11 @@ def test_more_ranks_than_subdomains_are_declined():
 @pytest.mark.parametrize(
     ("case", "solver", "message"),
     [
-        ("beam-ring/Nr=2/Nh=2/steps=1/dual", "smalbe", "cannot be shared by ranks"),
+        (
+            "beam-ring/Nr=2/Nh=2/steps=1/dual",
+            "smalbe",
+            "cannot be distributed over ranks",
+        ),
         pytest.param(
             CASE, "clarabel", "runs in one process only", marks=pytest.mark.slow
         ),

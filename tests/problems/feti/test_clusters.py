@@ -9,6 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
+import mortarbench as mb
 from mortarbench.harness import InputError, Status, kkt_residuals, no_rows
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.verdicts import certified
@@ -22,6 +23,7 @@ from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models import plate
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.threads import on_threads, without_lock
 
 pytestmark = pytest.mark.together
@@ -287,9 +289,7 @@ def test_the_diagonal_is_that_of_the_operator():
 
 def test_more_ranks_than_clusters_are_refused():
     qp = built("plate/Sx=2/Sy=2/n=2/cluster=2").qp
-    with pytest.raises(
-        InputError, match="2 ranks for 1 clusters; expected at most one"
-    ):
+    with pytest.raises(InputError, match="2 ranks for 1 cluster; expected at most one"):
         partition(*(getattr(qp.P.build(), k) for k in ("B", "domains")), 2,
                   qp.P.build().clusters)  # fmt: skip
 
@@ -329,6 +329,7 @@ def test_clusters_that_are_not_built_are_refused_by_name(name, message):
     [
         "contact-patch/lower=6/upper=7/slave=lower/ratio=0.01/feti=1/cluster=2",
         "plate/dim=3/Sx=3/Sy=2/Sz=2/n=1/pattern=checkerboard/jump=100/cluster=2",
+        "plate/Sx=3/Sy=2/n=1/pattern=checkerboard/jump=100/cluster=4/glue=chain",
         "hertz-sphere/n=2/feti=1/glue=redundant",
         pytest.param(
             "contact-patch/lower=12/upper=14/ratio=0.001/feti=2/cluster=2",
