@@ -100,7 +100,7 @@ class Problem:
     lower: NDArray[np.intp]
     fixed: Mask  #: (n,) components with lb = ub, which have no rows in C
     filter: NDArray[np.intp]  #: components in rows of A or G that are not fixed
-    kernel: NDArray[np.float64]  #: (n, k) near-kernel vectors
+    V_cycle: Callable[[csr_array], LinearOperator]  #: sets up multigrid for a matrix
 
     def gradient(self, at: Point) -> Vector:
         """Return Px + q + Aᵀy + Cᵀz."""
@@ -201,7 +201,7 @@ def _scale(qp: QP) -> Problem:
         lower=lower,
         fixed=fixed,
         filter=np.flatnonzero(occurs & ~fixed),
-        kernel=near_kernel(P),
+        V_cycle=multigrid(near_kernel(P)),
     )
 
 
@@ -294,7 +294,7 @@ def _solver(
     # keep fixed components as uncoupled rows, so that every node keeps its rows
     free = diags_array(1.0 * ~fixed)
     H = csr_array(free @ H @ free + diags_array(np.where(fixed, D, 0.0)))
-    V_cycle = multigrid(H, problem.kernel)
+    V_cycle = problem.V_cycle(H)
     counts["factorisations"] += 1
     if F.size:
         factor = cholesky(csc_array(H[F][:, F]))

@@ -8,6 +8,8 @@ used, because a QP contains no coordinates.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, csr_matrix
@@ -46,19 +48,31 @@ def near_kernel(P: Matrix) -> NDArray[np.float64]:
     return np.ones((n, 1))
 
 
-def multigrid(M: csr_array, kernel: NDArray[np.float64]) -> LinearOperator:
-    """Return one V-cycle for the positive definite matrix M (n, n), as an operator.
+def multigrid(
+    kernel: NDArray[np.float64],
+) -> Callable[[csr_array], LinearOperator]:
+    """Return a function that sets up one V-cycle for a positive definite matrix (n, n).
 
-    kernel : near-kernel vectors (n, d); M is divided into blocks of d rows
+    kernel : near-kernel vectors (n, d); matrices are divided into blocks of d rows
+
+    Raises
+    ------
+    ImportError
+        If pyamg is not installed.
+
     """
     import pyamg  # imported here because it is optional and slow to import
 
     d = kernel.shape[1]
-    levels = pyamg.smoothed_aggregation_solver(
-        csr_matrix(M) if d == 1 else bsr_array(M, blocksize=(d, d)),
-        B=kernel,
-        symmetry="symmetric",
-        max_coarse=COARSEST,
-        coarse_solver="splu",  # the default pseudo-inverse took seconds
-    )
-    return levels.aspreconditioner()
+
+    def V_cycle(M: csr_array) -> LinearOperator:
+        levels = pyamg.smoothed_aggregation_solver(
+            csr_matrix(M) if d == 1 else bsr_array(M, blocksize=(d, d)),
+            B=kernel,
+            symmetry="symmetric",
+            max_coarse=COARSEST,
+            coarse_solver="splu",  # the default pseudo-inverse took seconds
+        )
+        return levels.aspreconditioner()
+
+    return V_cycle

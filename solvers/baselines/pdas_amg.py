@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse.linalg import LinearOperator, cg
 
 from mortarbench.harness import QP, About, Matrix, Solution, Vector
 from mortarbench.solvers.baselines.face import (
@@ -85,11 +84,11 @@ class PDASAMG(PDAS):
         return reporting
 
     def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
-        kernel, rtol = near_kernel(qp.P), CG_SHARE * tol
+        V_cycle, rtol = multigrid(near_kernel(qp.P)), CG_SHARE * tol
 
         def make(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
             del always_free
-            return _multigrid(csr_array(M), csr_array(G), rho, kernel, rtol, counts)
+            return _multigrid(csr_array(M), csr_array(G), rho, V_cycle, rtol, counts)
 
         return make
 
@@ -98,7 +97,7 @@ def _multigrid(
     M: csr_array,
     G: csr_array,
     rho: Vector,
-    kernel: NDArray[np.float64],
+    V_cycle: Callable[[csr_array], LinearOperator],
     rtol: float,
     counts: Counter[str],
 ) -> Faces:
@@ -107,7 +106,7 @@ def _multigrid(
         # keep fixed components as uncoupled rows, so that every node keeps d rows
         inside = diags_array(1.0 * free)
         F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
-        precondition = multigrid(F, kernel)
+        precondition = V_cycle(csr_array(F))
 
         def step(_: object) -> None:
             counts["cg"] += 1

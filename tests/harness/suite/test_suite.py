@@ -205,7 +205,8 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (f"time_limit = {400 * '9'}\n" + MINIMAL, "time_limit = 999"),
         (
             MINIMAL + f"params = {{ n = {20 * '9'} }}",
-            "problems[0]: well: n=99999999999999999999; expected an integer, such as 4",
+            "problems[0]: well: n=99999999999999999999; expected an integer of at most "
+            "64 bits",
         ),
         (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),

@@ -179,7 +179,9 @@ def test_a_case_without_mechanics_is_certified_by_its_operator(offers):
 
 def test_rows_and_nan_are_refused():
     planted = ExactProblem({"touching"}, 1)
-    with pytest.raises(UncertifiableError, match="the QP has rows; expected bounds"):
+    with pytest.raises(
+        UncertifiableError, match="the QP has rows; expected only bounds"
+    ):
         certify_by_eigenvalue(planted.qp, planted.solution, 1.0)
     bad = WithoutRows(set(), 1)
     nan = replace(bad.solution, x=bad.solution.x * np.nan)
