@@ -52,6 +52,9 @@ PATIENCE = 10
 CG_REDUCTION = 1e-6  #: reduction of the projected residual in each round of CG
 MAX_CG_ROUNDS = 3  #: largest number of CG rounds on a face
 MAX_CG_STEPS = 300  #: largest number of CG steps in a round
+#: largest ratio of wᵀMw to its smallest value in a round, with the residual w; in exact
+#: arithmetic, the condition number of MF limits this ratio
+MAX_GROWTH = 1e6
 #: no further CG round starts if the norm of the projected residual is at most this
 #: factor times the norm of the projected q
 ROUNDING_RESIDUAL = 1e-14
@@ -297,10 +300,16 @@ class _Task:
         precondition: Callable[[Vector], Vector],
         bent: Callable[[Vector], Vector],
     ) -> Vector:
-        """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG."""
+        """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG.
+
+        The result is d at the smallest wᵀMw if wᵀMw grows by MAX_GROWTH, which exact
+        arithmetic excludes. With clusters or redundant rows, F is semidefinite, and
+        directions that consist of rounding errors approach its kernel.
+        """
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
         p = y = precondition(w)
         wy = self.total(float(w @ y))
+        best, least = d.copy(), wy
         for _ in range(MAX_CG_STEPS):
             Fp = self.F(p) + bent(p)
             self.products += 1
@@ -314,6 +323,10 @@ class _Task:
                 break
             y = precondition(w)
             wy, before = self.total(float(w @ y)), wy
+            if wy < least:
+                best, least = d.copy(), wy
+            elif wy > MAX_GROWTH * least:
+                return best
             p = y + (wy / before) * p
         return d
 
