@@ -350,8 +350,8 @@ def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
     """
     if params["kinematics"] == "finite":
         raise InputError(
-            f"{family}: the discretisation error with kinematics=finite is not built; "
-            "expected kinematics=linear"
+            f"{family}: the discretisation error is not available with "
+            "kinematics=finite; expected kinematics=linear"
         )
 
 

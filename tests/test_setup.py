@@ -13,7 +13,7 @@ import pytest
 
 from tests.support import ROOT
 
-#: replacements of system programs; apt-get and sudo append their commands to `calls`
+#: replacements for system programs; apt-get and sudo append their commands to `calls`
 STUBS = {
     "dpkg-query": "exit 1",
     "apt-get": 'echo "apt-get $*" >> "$CALLS"; exit 1',
@@ -21,7 +21,7 @@ STUBS = {
     '[ "$1" != -n ] || shift; exec "$@"',
     "id": "echo 1000",
 }
-#: replacement of the environment's Python, which records the constraints given to pip
+#: replacement for the environment's Python, which records the constraints given to pip
 PYTHON = """#!/bin/sh
 case "$*" in
     *install*) printf '%s\\n' "$PIP_CONSTRAINT" "$PIP_BUILD_CONSTRAINT" > "$CALLS" ;;

@@ -219,7 +219,7 @@ def coulomb_steps(
 ) -> list[ConvexStep]:
     """Return the first convex problems of a sequence for Coulomb's law.
 
-    The list ends at convergence. In the loop ``tresca``, it begins with the first
+    The list ends at convergence, or after `count` problems. In the loop ``tresca``, it begins with the first
     problem over ‖r_T‖ ≤ g, after the problem over the cones.
 
     Parameters
@@ -232,7 +232,8 @@ def coulomb_steps(
     Raises
     ------
     InputError
-        If a problem has no solution, or if the sequence does not converge.
+        If a problem has no solution even with a proximal term, or if the sequence does
+        not converge.
 
     """
     steps, errors, method = (
