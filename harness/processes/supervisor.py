@@ -106,7 +106,7 @@ class Clock:
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """Result of a request: the worker's answer, or a diagnosis of the worker's end."""
+    """Result of a request: the worker's answer, or the reason why there is none."""
 
     answer: Mapping[str, Any] | None = None
     #: verdict on the end of the worker; None if there is an answer or a fault

@@ -373,8 +373,8 @@ def supported_and_floating(
 class Balance(NamedTuple):
     """Equilibrium equations Gᵀλ = load − bent, with the magnitudes of their terms.
 
-    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps or
-    slip.
+    The equations state Rᵀ(f − Bᵀλ − Ku) = 0 for the rigid motions R that change gaps
+    or tangential displacements.
     """
 
     G: Extended  #: (m, p)  BR

@@ -33,9 +33,10 @@ from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 
-#: residual ‖g − mu·λ_n‖/‖g‖ at which the fixed-point iteration counts as converged
+#: the fixed-point iteration has converged if `Friction.residual` is at most this value
 FIXED_POINT_TOLERANCE = 1e-10
-MAX_ITERATES = 1000  #: largest number of Tresca problems per fixed-point iteration
+#: number of Tresca problems after which the fixed-point iteration is abandoned
+MAX_ITERATES = 1000
 #: the iteration is abandoned after this many Tresca problems without a new smallest
 #: residual
 MAX_STAGNATION = 30

@@ -219,8 +219,8 @@ def coulomb_steps(
 ) -> list[ConvexStep]:
     """Return the first convex problems of a sequence for Coulomb's law.
 
-    The list ends at convergence, or after `count` problems. In the loop ``tresca``, it begins with the first
-    problem over ‖r_T‖ ≤ g, after the problem over the cones.
+    The list ends at convergence, or after `count` problems. In the loop ``tresca``, it
+    begins with the first problem over ‖r_T‖ ≤ g, after the problem over the cones.
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ class StructuredSolids:
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """Unstructured mesh; METIS cuts it into `size` subdomains."""
+    """Unstructured mesh, which METIS cuts into the number of parts given to `layout`."""
 
     mesh: Mesh
     body: NDArray[np.int64]

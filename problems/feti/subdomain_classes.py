@@ -118,7 +118,7 @@ class SubdomainClass:
         return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def blocks(self, b: Nodes, L: Dense) -> Condensed:
-        """Return both blocks of `condense` from the factor L of `border_factor`."""
+        """Return (K⁺)_bb and S_bb, see `condense`, from the factor L of the border."""
         g, h = np.union1d(self.boundary, b), self.border(b)
         places_b, places_fixing = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, places_b])[places_b]

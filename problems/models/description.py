@@ -324,7 +324,9 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
         lengths = np.linalg.norm(np.diff(named.points[facets], axis=1)[:, 0], axis=1)
         np.add.at(weights, facets, lengths[:, None] / 2)
     elif kinds == ["traction"]:
-        raise InputError("traction acts on a point; expected a boundary, or force")
+        raise InputError(
+            "traction acts on a point; expected traction on a boundary, or a force"
+        )
     else:
         weights[nodes] = 1.0
     if kinds == ["force"]:

@@ -50,7 +50,8 @@ _ACTIVE = (
     1e-6  #: fraction of the largest force above which a contact node counts as loaded
 )
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
-#: colour of arrows; dark also on dark pages, because bodies are coloured
+#: colour of frames, letters, and arrows of frictionless pairs; dark even on dark pages,
+#: because they are drawn on coloured bodies
 _ARROW = "#101214"
 #: colours of arrows by friction state; arrows of frictionless pairs are dark
 FRICTION = {
