@@ -122,7 +122,8 @@ class Friction:
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) part of the bound that does not depend on λ_n, a force
     mu: Vector  #: (k,) coefficient of friction
-    #: `residual` at the solution of the problem with this bound; 0 if unknown
+    #: `residual` at the solution of the problem with this bound; 0 if it was not
+    #: computed, or if the fixed-point iteration has converged
     unsettled: float = 0.0
 
     @property

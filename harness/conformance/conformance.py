@@ -90,8 +90,9 @@ class Result(NamedTuple):
 
     grade: Grade
     message: str = ""
-    #: ratio of the numbers of iterations for the changed and the unchanged formulation;
-    #: None for other checks
+    #: number of iterations for a changed formulation, divided by the number for the
+    #: unchanged one; None if the check compares no formulations, if it failed, or if the
+    #: solver does not report iterations
     work: float | None = None
 
 

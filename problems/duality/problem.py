@@ -191,7 +191,7 @@ class StructuredSolids:
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """Unstructured mesh, which METIS cuts into the number of parts given to `layout`."""
+    """Unstructured mesh; METIS cuts it into as many parts as `layout` receives."""
 
     mesh: Mesh
     body: NDArray[np.int64]

@@ -68,10 +68,11 @@ BATCH = 256  #: number of columns of Gᵀ per application of the preconditioner
 class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
-    The iteration stops when ‖P_Qᵀ(d − Fx)‖ is at most tol times its initial value. If a
-    KKT residual exceeds 5·tol at this point, the iteration continues with a smaller
-    bound. The solver claims a solution only if all KKT residuals are at most 5·tol. It
-    reports the number of CG steps as iterations, and counts all products with P.
+    The iteration stops when the gradient Px + q, projected onto the kernel of the
+    equality rows, is at most tol times its initial value. If a KKT residual exceeds
+    5·tol at this point, the iteration continues with a smaller bound. The solver claims
+    a solution only if all KKT residuals are at most 5·tol. It reports the number of CG
+    steps as iterations, and counts all products with the Hessian P.
     """
 
     #: preconditioner M; "auto" selects "dirichlet" if P provides it, otherwise "none"

@@ -1,4 +1,4 @@
-"""Runs on a Dask scheduler with certificates from Dask's own configuration."""
+"""Tests of runs over TLS on Dask, with certificates of Dask's configuration."""
 
 import subprocess
 import sys

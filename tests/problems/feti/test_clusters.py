@@ -96,7 +96,7 @@ def dense(local, side):
 
 
 def eliminated(K, C):
-    """Return K̃⁺ and a basis of ker K ∩ ker C by elimination in the null space of C."""
+    """Return K̃⁺ and a basis of ker K ∩ ker C, computed by restriction to ker C."""
     Z = null_space(C) if len(C) else np.eye(len(K))
     inside = Z.T @ K @ Z
     size, modes = np.linalg.eigh(inside)
