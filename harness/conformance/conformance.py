@@ -91,7 +91,7 @@ class Result(NamedTuple):
     grade: Grade
     message: str = ""
     #: number of iterations for a changed formulation, divided by the number for the
-    #: unchanged one; None if the check compares no formulations, if it failed, or if the
+    #: unchanged one; None if the check compares no formulations or failed, or if the
     #: solver does not report iterations
     work: float | None = None
 
