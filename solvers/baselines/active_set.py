@@ -93,9 +93,7 @@ def penalise(
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc
     P, A, G = store(qp.P), store(qp.A), store(qp.G)
-    D = np.array(P.diagonal())
-    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
-    D = np.where(D > 1e-12 * usual, D, usual)
+    D = curvatures(qp)
     rho, sigma = kappa / row_norms(A, D) ** 2, kappa / row_norms(G, D) ** 2
     M = P + (A.T * rho) @ A if store is dense else P + A.T @ diags_array(rho) @ A
     M += np.diag(DELTA * D) if store is dense else diags_array(DELTA * D)
@@ -104,6 +102,16 @@ def penalise(
         counts["factorisations"] += 1
     faces = factorise(M, G, sigma, unbounded)
     return Problem(qp, A, G, D, rho, sigma, factorise, faces, counts)
+
+
+def curvatures(qp: QP) -> Vector:
+    """Return diag P (n,), with a typical curvature in place of negligible entries.
+
+    The typical curvature is the mean of the positive entries, else ‖q‖∞, else 1.
+    """
+    D = np.array(qp.P.diagonal())
+    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
+    return np.where(D > 1e-12 * usual, D, usual)
 
 
 def row_norms(M: Matrix, D: Vector) -> Vector:

@@ -39,16 +39,18 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, vstack
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse.linalg import LinearOperator
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
-from mortarbench.solvers.baselines.active_set import row_norms
+from mortarbench.solvers.baselines.active_set import curvatures, row_norms
 from mortarbench.solvers.baselines.face import InnerSolveError, Mask
 from mortarbench.solvers.baselines.multigrid import (
+    cg_on_free,
     multigrid,
     near_kernel,
     needs_sparse,
+    on_free,
 )
 from mortarbench.solvers.common.conversion import check_positive
 
@@ -63,7 +65,6 @@ CG_RTOL = 1e-4
 #: conjugate gradients also end at a residual of this factor times tol·‖q‖; the error of
 #: the step is a part of the next dual residual
 CG_SHARE = 0.01
-MAX_CG = 1000  #: largest number of CG steps per solve; contact cases need 5 to 60
 #: share of the distance to the boundary s = 0 or z = 0 that a step may cover
 TO_BOUNDARY = 0.995
 #: When the products sz are below the tolerance, the remaining residuals come from
@@ -175,9 +176,7 @@ class IPMAMG:
 def _scale(qp: QP) -> Problem:
     """Collect and scale the rows."""
     P, A, G = csr_array(qp.P), csr_array(qp.A), csr_array(qp.G)
-    D = P.diagonal()
-    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
-    D = np.where(D > 1e-12 * usual, D, usual)
+    D = curvatures(qp)
     fixed = qp.lb == qp.ub
     upper = np.flatnonzero(np.isfinite(qp.ub) & ~fixed)
     lower = np.flatnonzero(np.isfinite(qp.lb) & ~fixed)
@@ -291,9 +290,8 @@ def _solver(
     A, C, D, fixed, F = problem.A, problem.C, problem.D, problem.fixed, problem.filter
     H = problem.P + diags_array(DELTA * D) + KAPPA * (A.T @ A)
     H = H + C.T @ (diags_array(W) @ C)
-    # keep fixed components as uncoupled rows, so that every node keeps its rows
-    free = diags_array(1.0 * ~fixed)
-    H = csr_array(free @ H @ free + diags_array(np.where(fixed, D, 0.0)))
+    free = ~fixed
+    H = on_free(H, free, D)
     V_cycle = problem.V_cycle(H)
     counts["factorisations"] += 1
     if F.size:
@@ -311,21 +309,4 @@ def _solver(
     precondition = LinearOperator(H.shape, matvec=filtered, dtype=float)
     atol = CG_SHARE * tol * float(np.linalg.norm(problem.qp.q))
 
-    def count(_: object) -> None:
-        counts["cg"] += 1
-
-    def solve(r: Vector) -> Vector:
-        dx, failed = cg(
-            H,
-            np.where(fixed, 0.0, r),
-            rtol=CG_RTOL,
-            atol=atol,
-            maxiter=MAX_CG,
-            M=precondition,
-            callback=count,
-        )
-        if failed:
-            raise InnerSolveError(f"no convergence in {MAX_CG} steps of CG")
-        return np.where(fixed, 0.0, dx)
-
-    return solve
+    return cg_on_free(H, free, precondition, counts, rtol=CG_RTOL, atol=atol)

@@ -8,20 +8,23 @@ used, because a QP contains no coordinates.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array, csr_matrix
-from scipy.sparse.linalg import LinearOperator
+from scipy.sparse import bsr_array, csr_array, csr_matrix, diags_array
+from scipy.sparse.linalg import LinearOperator, cg
 
-from mortarbench.harness import QP, Matrix, needs_matrices
+from mortarbench.harness import QP, Matrix, Vector, needs_matrices
+from mortarbench.solvers.baselines.face import InnerSolveError, Mask, Solve
 
 #: a translation t counts as an element of the kernel if ‖Pt‖∞ is at most this factor
 #: times ‖P‖∞
 KERNEL_ROUNDING = 1e-8
 #: largest number of unknowns on the coarsest level
 COARSEST = 100
+MAX_CG = 1000  #: largest number of CG steps per solve; contact cases need 5 to 80
 
 
 def needs_sparse(qp: QP) -> str | None:
@@ -76,3 +79,51 @@ def multigrid(
         return levels.aspreconditioner()
 
     return V_cycle
+
+
+def on_free(H: Matrix, free: Mask, diagonal: Vector) -> csr_array:
+    """Return the matrix H (n, n) on the free components.
+
+    Other components keep uncoupled rows with entries `diagonal` (n,), so that every
+    node keeps its block.
+    """
+    mask = diags_array(1.0 * free)
+    return csr_array(mask @ H @ mask + diags_array(np.where(free, 0.0, diagonal)))
+
+
+def cg_on_free(
+    H: csr_array,
+    free: Mask,
+    precondition: LinearOperator,
+    counts: Counter[str],
+    *,
+    rtol: float,
+    atol: float = 0.0,
+) -> Solve:
+    """Return r (n,) ↦ H⁻¹r by preconditioned CG; zero where components are not free.
+
+    H : result of `on_free`
+    counts : its entry "cg" is increased by the number of steps
+    rtol, atol : CG ends at a residual of at most max(rtol·‖r‖, atol)
+
+    The returned function raises `InnerSolveError` after `MAX_CG` steps.
+    """
+
+    def count(_: object) -> None:
+        counts["cg"] += 1
+
+    def solve(r: Vector) -> Vector:
+        dx, failed = cg(
+            H,
+            np.where(free, r, 0.0),
+            rtol=rtol,
+            atol=atol,
+            maxiter=MAX_CG,
+            M=precondition,
+            callback=count,
+        )
+        if failed:
+            raise InnerSolveError(f"no convergence in {MAX_CG} steps of CG")
+        return np.where(free, dx, 0.0)
+
+    return solve

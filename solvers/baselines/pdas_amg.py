@@ -12,22 +12,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness import QP, About, Matrix, Solution, Vector
 from mortarbench.solvers.baselines.face import (
     Faces,
     Factorise,
-    InnerSolveError,
     Mask,
     Solve,
 )
 from mortarbench.solvers.baselines.multigrid import (
+    cg_on_free,
     multigrid,
     near_kernel,
     needs_sparse,
+    on_free,
 )
 from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
@@ -35,9 +35,6 @@ from mortarbench.solvers.baselines.pdas import PDAS, Carry
 #: 1e-3 instead, the number of solves did not change (13 on beam-ring, 6 on
 #: cube-wall/n=16), but 17 to 34 % more CG steps were necessary.
 CG_SHARE = 0.1
-#: largest number of CG steps per solve; small beam-ring and cube-wall cases need 9 to
-#: 80 steps
-MAX_CG = 1000
 
 
 @dataclass(frozen=True)
@@ -103,23 +100,7 @@ def _multigrid(
 ) -> Faces:
     def face(free: Mask, active: Mask) -> Solve:
         F = M + G[active].T @ (diags_array(rho[active]) @ G[active])
-        # keep fixed components as uncoupled rows, so that every node keeps d rows
-        inside = diags_array(1.0 * free)
-        F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
-        precondition = V_cycle(csr_array(F))
-
-        def step(_: object) -> None:
-            counts["cg"] += 1
-
-        def solve(r: Vector) -> Vector:
-            b = np.where(free, r, 0.0)
-            dx, failed = cg(
-                F, b, rtol=rtol, maxiter=MAX_CG, M=precondition, callback=step
-            )
-            if failed:
-                raise InnerSolveError(f"no convergence in {MAX_CG} steps of CG")
-            return np.asarray(np.where(free, dx, 0.0))
-
-        return solve
+        F = on_free(F, free, M.diagonal())
+        return cg_on_free(F, free, V_cycle(F), counts, rtol=rtol)
 
     return face

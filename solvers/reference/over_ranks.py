@@ -41,6 +41,7 @@ from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
 from mortarbench.harness import QP, Discs, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
+from mortarbench.harness.operators import is_semidefinite
 from mortarbench.harness.sets.blocks import norms
 
 Mask = NDArray[np.bool_]
@@ -161,6 +162,7 @@ class _Task:
     upper: Vector
     discs: Discs  #: discs of local components
     length: Vector  #: (k,) γ of each disc, in units of x divided by units of z
+    has_kernel: bool  #: True if F is semidefinite
     products: int = 0
 
     @classmethod
@@ -182,6 +184,7 @@ class _Task:
             upper,
             discs,
             1 / diagonal[discs.index].mean(axis=1),
+            is_semidefinite(qp.P),
         )
 
     def zero_point(self) -> _Point:
@@ -302,9 +305,9 @@ class _Task:
     ) -> Vector:
         """Return d in the face with a small 𝒫(w − Fd − bent(d)), computed by CG.
 
-        The result is d at the smallest wᵀMw if wᵀMw grows by MAX_GROWTH, which exact
-        arithmetic excludes. With clusters or redundant rows, F is semidefinite, and
-        directions that consist of rounding errors approach its kernel.
+        With clusters or redundant rows, F is semidefinite, and directions that consist
+        of rounding errors approach its kernel. Therefore the result is then d at the
+        smallest wᵀMw if wᵀMw grows by MAX_GROWTH, which exact arithmetic excludes.
         """
         d, enough = np.zeros(w.size), CG_REDUCTION * self.norm(w)
         p = y = precondition(w)
@@ -325,7 +328,7 @@ class _Task:
             wy, before = self.total(float(w @ y)), wy
             if wy < least:
                 best, least = d.copy(), wy
-            elif wy > MAX_GROWTH * least:
+            elif self.has_kernel and wy > MAX_GROWTH * least:
                 return best
             p = y + (wy / before) * p
         return d

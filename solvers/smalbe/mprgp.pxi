@@ -17,14 +17,16 @@ cdef double MIN_SLOPE_RATIO = 0.5
 # For a semidefinite F, as in hybrid FETI and with redundant rows, CG is *spent* on a
 # face if φᵀz has fallen to the square of the rounding unit, relative to its largest
 # value, or if φᵀz or, after a sufficient decrease of φᵀz, the length of the CG step
-# exceeds its smallest value by the factor MAX_GROWTH. In exact arithmetic, the condition
-# number of MF on the range of F limits both factors, so such directions are rounding
-# errors. They approach the kernel of F, and x would grow without limit
-# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`).
+# exceeds its smallest value by the factor MAX_GROWTH. In exact arithmetic, the
+# condition number of MF on the range of F limits both factors, so such directions are
+# rounding errors. They approach the kernel of F, and x would grow without limit
+# (`test_a_semidefinite_dual_ends_at_its_rounding_errors`). For other F, the rules are
+# not used: with moduli 1 : 1e8, φᵀz legitimately falls by 38 orders of magnitude
+# (`test_rounding_along_previous_directions_is_removed`).
 cdef double MIN_DECREASE = 2.0 ** -104
 cdef double MAX_GROWTH = 1e6
-# x is stored at the smallest φᵀz if φᵀz has decreased by this factor on the face, so that
-# steps along spent directions can be undone.
+# x is stored at the smallest φᵀz if φᵀz has decreased by this factor on the face, so
+# that steps along spent directions can be undone.
 cdef double STORED_DECREASE = 2.0 ** -26
 
 cdef enum:
@@ -298,7 +300,7 @@ cdef class MPRGP:
     cdef double z_Hp
     cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
     cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
-    cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` of this run
+    cdef double phi_square_at_refresh  # ‖φ‖² at the last `refresh` on this face
     cdef bint is_semidefinite  # True if F has a kernel
     # smallest and largest φᵀz on this face, see `is_spent`
     cdef double least_slope
@@ -354,10 +356,10 @@ cdef class MPRGP:
         """Run MPRGP from x and g; return True if `stops` ended the run.
 
         The run returns False after `most` steps, if no step is possible or CG is spent
-        and a recomputed gradient is no better (`refresh`), or if the run *stagnates*: since the previous check, the smallest ‖g^P‖ was not halved and the
-        cost decreased by no more than the rounding of its terms. The first check is
-        made after `FIRST_CHECK` steps, and each further check after twice as many
-        steps.
+        and a recomputed gradient is no better (`refresh`), or if the run *stagnates*:
+        since the previous check, the smallest ‖g^P‖ was not halved and the cost
+        decreased by no more than the rounding of its terms. The first check is made
+        after `FIRST_CHECK` steps, and each further check after twice as many steps.
 
         trace : receives the letters of the steps
         note : function called with the letter, x and g after each step, or None
@@ -449,7 +451,7 @@ cdef class MPRGP:
             # 7. Restart CG on the new face with the preconditioned free gradient. After
             # a spectral step, restart only if CG begins on this face.
             inside, began, gamma = 0, self.parts.phi_square, 0.0
-            self.phi_square_at_drift = INFINITY
+            self.phi_square_at_drift = self.phi_square_at_refresh = INFINITY
             begun = self.expansion != SPECTRAL
             if begun:
                 self.directions.begin(self.free)

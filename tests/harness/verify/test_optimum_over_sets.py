@@ -174,7 +174,7 @@ def search(seed, tries, each=40):
 @pytest.mark.parametrize(
     ("tries", "each", "least"),
     [
-        (40, 20, 5),
+        (40, 20, 6),
         *(pytest.param(*n, 15, marks=pytest.mark.slow) for n in ((100, 20), (400, 40))),
     ],
 )

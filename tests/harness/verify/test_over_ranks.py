@@ -56,7 +56,7 @@ def marked(*cases):
     ]
 
 
-SHORT = (5, 2, ("membranes/S=3/n=2/dual", "disc under rollers"))
+SHORT = (8, 2, ("membranes/S=3/n=2/dual", "disc under rollers"))
 #: modules that the default tests run on the same two ranks
 BY_DEFAULT = (("evaluated_on_ranks", *QUICK), ("fooled_on_ranks", SHORT[0], *SHORT[2]))
 

@@ -5,7 +5,7 @@ import pytest
 
 import mortarbench as mb
 from mortarbench.harness import Status
-from mortarbench.solvers.baselines import pdas_amg
+from mortarbench.solvers.baselines import multigrid
 from mortarbench.solvers.baselines.pdas import PDAS
 from mortarbench.solvers.baselines.pdas_amg import PDASAMG
 
@@ -44,6 +44,6 @@ def test_dense_problems_are_declined():
 
 
 def test_conjugate_gradients_that_do_not_converge_end_the_solve(monkeypatch):
-    monkeypatch.setattr(pdas_amg, "MAX_CG", 1)
+    monkeypatch.setattr(multigrid, "MAX_CG", 1)
     s = PDASAMG().prepare(mb.build("cube-wall/n=4/primal").qp, 1e-8)()
     assert (s.status, s.message) == (Status.FAILED, "no convergence in 1 steps of CG")
