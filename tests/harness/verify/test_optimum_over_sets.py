@@ -172,17 +172,13 @@ def search(seed, tries, each=40):
 
 
 @pytest.mark.parametrize(
-    ("tries", "each", "least"),
-    [
-        (40, 20, 6),
-        *(pytest.param(*n, 15, marks=pytest.mark.slow) for n in ((100, 20), (400, 40))),
-    ],
+    ("tries", "each"), [(100, 20), pytest.param(400, 40, marks=pytest.mark.slow)]
 )
-def test_no_verdict_is_wrong_in_a_short_search_over_sets(tries, each, least):
+def test_no_verdict_is_wrong_in_a_short_search_over_sets(tries, each):
     wrong, refuted, verified, proven = search(271828, tries, each)
 
     assert (wrong, refuted) == ([], [])
-    assert verified > least
+    assert verified > 15
     assert proven > 0.8
 
 
