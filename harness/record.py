@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 
 #: Version of a journal line, which increases whenever the meaning of a field changes.
 #: Version 2 changed the scales of the four residuals (docs/verdicts.md).
-SCHEMA = 2
+#: Version 3 judges by the rule of `harness.verify.kkt`; earlier versions are refused.
+SCHEMA = 3
 #: An answer counts as verified if its residuals are at most this multiple of the
 #: tolerance.
 VERIFIED_FACTOR = 10.0
-READABLE = (1, 2)  #: versions that `Record.from_json` accepts
+READABLE = (3,)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
 LARGEST_INTEGER = 2**63 - 1  #: largest integer that 64-bit formats (Parquet) can store
 #: smallest and largest valid measured time in s; 0 is also valid
@@ -45,17 +46,21 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 class Verdict(StrEnum):
     """Verdict on a measurement: states whether the claim of the solver is true."""
 
-    #: `optimum_error` if it is known, otherwise every residual, is ≤ min(10·tol, 0.1)
+    #: every residual is ≤ min(10·tol, 0.1)
     VERIFIED = "verified"
-    #: the solver claimed infeasibility, which is proven; see
+    #: the solver claimed infeasibility, and a Farkas certificate holds; see
     #: `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
+    #: the solver claimed an unbounded objective, and a ray and a feasible point hold
+    VERIFIED_UNBOUNDED = "verified_unbounded"
     #: the solver claimed a solution, which is not verified but has at least half of the
     #: requested digits
     INACCURATE = "inaccurate"
     WRONG = "wrong"  #: the solver claimed a solution, but the claim is refuted
-    #: the solver claimed infeasibility, but no proof was found
+    #: the solver claimed infeasibility, but no certificate was found
     INFEASIBLE_CLAIM = "infeasible_claim"
+    #: the solver claimed an unbounded objective, but no ray or feasible point was found
+    UNBOUNDED_CLAIM = "unbounded_claim"
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     MEMORY_LIMIT = "memory_limit"
@@ -70,13 +75,24 @@ class Verdict(StrEnum):
 
     @property
     def is_verified(self) -> bool:
-        """True if a solution was verified or infeasibility was proven.
+        """True if a solution, or a claim that none exists, was verified.
 
         >>> from mortarbench import Verdict
         >>> [v.value for v in Verdict if v.is_verified]
-        ['verified', 'verified_infeasible']
+        ['verified', 'verified_infeasible', 'verified_unbounded']
         """
-        return self in (Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE)
+        return self.value.startswith("verified")
+
+
+#: Verdicts on claims that a QP has no solution, verified by a certificate.
+PROVEN = (Verdict.VERIFIED_INFEASIBLE, Verdict.VERIFIED_UNBOUNDED)
+#: Verdicts on claims that are not true, or not proven.
+REFUTED = (
+    Verdict.INACCURATE,
+    Verdict.WRONG,
+    Verdict.INFEASIBLE_CLAIM,
+    Verdict.UNBOUNDED_CLAIM,
+)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -174,11 +190,8 @@ class Record(Measurement):
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: basis of the verdict: "residuals", "reference" for `optimum_error`, or
-    #: "certificate" for a proof of infeasibility
-    decided_by: str = "residuals"
-    #: error relative to a proven optimum, see `harness.verify.optimum`
-    optimum_error: float | None = None
+    #: True if P has no diagonal, so that the residuals are relative to estimated scales
+    approximate_scale: bool = False
     #: certified bound on the relative error in the energy norm
     energy_bound: float | None = None
     #: relative components of `energy_bound`; see `harness.verify.verdicts.certified`
@@ -218,8 +231,8 @@ class Record(Measurement):
 
     @property
     def claims_answer(self) -> bool:
-        """True if a solution is claimed, or if a claim of infeasibility is proven."""
-        return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
+        """True if a solution is claimed, or if a certificate verifies another claim."""
+        return self.claimed == "solved" or self.verdict.is_verified
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with the fields in `changes` replaced."""
@@ -332,7 +345,6 @@ _NOT_NEGATIVE = (
     "complementarity",
     "gap",
     "energy_bound",
-    "optimum_error",
 )
 _SECONDS = tuple(name for name in _NOT_NEGATIVE if name.endswith("_seconds"))
 _texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)

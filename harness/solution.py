@@ -45,11 +45,15 @@ class Status(StrEnum):
     SOLVED = "solved"  #: the solver claims that its point satisfies the tolerance
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
-    #: the solver claims that the feasible set is empty or the objective is unbounded
-    #: below
-    INFEASIBLE = "infeasible"
+    INFEASIBLE = "infeasible"  #: the solver claims that the feasible set is empty
+    #: the solver claims that the objective is unbounded below
+    UNBOUNDED = "unbounded"
     FAILED = "failed"  #: the solver stopped without a solution, or raised an exception
     DECLINED = "declined"  #: the solver was not started; `message` states the reason
+
+
+#: claims that the QP has no solution
+NO_SOLUTION = (Status.INFEASIBLE, Status.UNBOUNDED)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

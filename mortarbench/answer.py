@@ -49,7 +49,6 @@ from mortarbench.harness.verify.kkt import (
     verdict,
 )
 from mortarbench.harness.verify.multipliers import with_multipliers
-from mortarbench.harness.verify.optimum import decided, proves
 from mortarbench.harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.registries import TURN, Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
@@ -509,18 +508,13 @@ class Verification:
     #: multipliers passed to `verify`; those left out are computed
     multipliers: Multipliers
     objective: float  #: ½xᵀPx + qᵀx
-    #: error relative to a proven optimum if this error decided the verdict, else None
-    optimum_error: float | None
     #: additional error measures for discs and cones; None if the QP has no such sets
     normality: Normality | None
     tol: float  #: relative KKT accuracy, as passed to `verify`
 
     def __repr__(self) -> str:
-        if self.optimum_error is not None:
-            error = f"error {self.optimum_error:.2g} relative to the proven optimum"
-        else:
-            values = self.residuals._asdict().items()
-            error = ", ".join(f"{name} {value:.2g}" for name, value in values)
+        values = self.residuals._asdict().items()
+        error = ", ".join(f"{name} {value:.2g}" for name, value in values)
         return f"<{self.verdict}: {error}; allowed {allowed(self.tol):.2g}>"
 
 
@@ -575,13 +569,11 @@ def verify(
         s = with_multipliers(problem, **vectors)
         with np.errstate(all="ignore"):  # x may contain NaN or 1e300
             residuals, objective = kkt_residuals(problem, s), problem.objective(s.x)
-        error = decided(problem, s, residuals, tol, proves(case.registries.reference))
     return Verification(
-        verdict=verdict(s.status, residuals, tol, error=error),
+        verdict=verdict(s.status, residuals, tol),
         residuals=residuals,
         multipliers=Multipliers(s.y, s.z, s.z_box),
         objective=objective,
-        optimum_error=error,
         normality=normality(problem, s, allowed(tol)),
         tol=tol,
     )

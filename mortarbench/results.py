@@ -20,7 +20,7 @@ from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
 from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text
-from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.record import REFUTED, Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import keep_environment, refuse_links
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 
 #: verdicts that refute the solver's claim
-REFUTED = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

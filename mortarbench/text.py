@@ -194,7 +194,6 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
             (f"{name} residual", _text(_none_if_nan(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
-        ("error to optimum", _text(_none_if_nan(r.optimum_error), digits=2)),
         ("solver error", _bound(r)),
         ("objective", _text(_none_if_nan(r.objective))),
         *(

@@ -42,8 +42,8 @@ from mortarbench.harness.conformance.metamorphic import shift_unknowns
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
+from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import (
     ReasonError,
@@ -266,8 +266,10 @@ def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
         raise ContractError("claims to have solved a QP without a solution")
     if not s.message:
         raise ContractError(f"ended as {s.status} without a message; expected a reason")
-    if s.status is Status.INFEASIBLE and infeasibility_margin(qp, s) is not None:
-        return Result(Grade.PASS, "verified infeasible")
+    if s.status in NO_SOLUTION:
+        holds, reason = certificate_of(qp, s, 1e-9)
+        if holds:
+            return Result(Grade.PASS, f"verified {s.status}: {reason}")
     return Result(Grade.PASS, f"ended as {s.status}: {s.message}")
 
 

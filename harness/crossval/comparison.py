@@ -2,9 +2,8 @@
 
 The reference is a point with an error bound (`harness.crossval.ground_truth`), which is
 computed independently of the solvers under test if the reference solve succeeds. A
-claim of success is refuted if a residual is too large or, if an optimum is proven, if
-the error relative to this optimum is too large. It is also refuted if a multiplier is
-inadmissible, or if the distance of the answer to the reference, minus the error bound
+claim of success is refuted if a residual is too large, if a multiplier is inadmissible,
+or if the distance of the answer to the reference, minus the error bound
 of the reference, exceeds the error that the claim permits
 (`harness.crossval.assessment`). Agreement of several answers is not used as evidence.
 If two answers differ by more than the sum of the permitted errors, and neither answer
@@ -39,7 +38,6 @@ from mortarbench.harness.plugin import Reference
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.solution import Status
 from mortarbench.harness.verify.kkt import allowed, verdict
-from mortarbench.harness.verify.optimum import Proves, decided, proves
 from mortarbench.harness.verify.verdicts import note_of
 
 #: An answer is an outlier if its error exceeds this multiple of the median error of the
@@ -64,9 +62,7 @@ class Answer:
     verdict: Verdict  #: verdict on the stored point, evaluated again
     #: the four residuals of `harness.verify.kkt` by name
     residuals: Mapping[str, float]
-    #: error relative to a proven optimum, which decides instead of the residuals
-    optimum_error: float | None
-    allowed: float  #: largest residual (or `optimum_error`) of a verified answer
+    allowed: float  #: largest residual of a verified answer
     energy_allowed: float  #: largest permitted relative error in the energy norm
     energy_bound: float | None  #: certified error bound that the run stored
     doubt: float | None  #: bound on the relative error of the reference point
@@ -130,10 +126,9 @@ def compare_answers(
     solve : function that solves a QP accurately
     references : folder in which reference points are cached; None to disable the cache
     """
-    prove = proves(solve)
     truth = ground_truth_of(answers, solve, references)
     if isinstance(truth, str):
-        unassessed = tuple(_answer(g, None, None, prove) for g in answers)
+        unassessed = tuple(_answer(g, None, None) for g in answers)
         return Problem(
             name=name,
             truth="",
@@ -150,10 +145,10 @@ def compare_answers(
             assessment, deviation = truth.assess(g)
         except Exception as e:  # raised by code of the family
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
-            judged.append(_answer(g, None, None, prove))
+            judged.append(_answer(g, None, None))
             continue
         deviations.append((len(judged), deviation))
-        judged.append(_answer(g, assessment, truth.doubt, prove))
+        judged.append(_answer(g, assessment, truth.doubt))
     pairs = _pairs(judged, deviations, truth)
     unresolved = [
         p
@@ -177,11 +172,10 @@ def compare_answers(
 
 
 def _answer(
-    g: StoredAnswer, assessment: Assessment | None, doubt: float | None, prove: Proves
+    g: StoredAnswer, assessment: Assessment | None, doubt: float | None
 ) -> Answer:
     """Determine the verdict on one answer, and the reasons why its claim is false."""
     r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
-    error = decided(g.case.qp, g.solution, residuals, tol, prove)
     answer = Answer(
         run_id=r.run_id,
         repeats=g.repeats,
@@ -191,9 +185,8 @@ def _answer(
         tol=tol,
         claimed=r.claimed or "",
         stored=r.verdict,
-        verdict=verdict(g.solution.status, residuals, tol, error=error),
+        verdict=verdict(g.solution.status, residuals, tol),
         residuals=residuals._asdict(),
-        optimum_error=error,
         allowed=allowed(tol),
         energy_allowed=energy_allowed(tol),
         energy_bound=r.energy_bound,
@@ -232,10 +225,7 @@ def _refutations(a: Answer) -> Iterable[str]:
     """Yield the reasons why a claim of success is false; nothing for other claims."""
     if a.claimed != Status.SOLVED:
         return
-    if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
-        most = brief(a.allowed)
-        yield f"error relative to the proven optimum {brief(a.optimum_error)} > {most}"
-    elif a.verdict is not Verdict.VERIFIED:
+    if a.verdict is not Verdict.VERIFIED:
         name = max(a.residuals, key=lambda n: nan_last(a.residuals[n]))
         yield f"{name} residual {brief(a.residuals[name])} > {brief(a.allowed)}"
     if a.assessment is None or a.doubt is None:

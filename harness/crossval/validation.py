@@ -35,8 +35,8 @@ from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.stored_run import rebuild
-from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
+from mortarbench.harness.verify.infeasibility import certificate_of
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
@@ -192,11 +192,11 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     # the run did not store the certificate of the solver: search for a new one
     for r in claims:
         qp = cases[r.case].qp
-        claim = Solution.without_point(qp, Status.INFEASIBLE)
-        if infeasibility_margin(qp, claim) is not None:
+        claim = Solution.without_point(qp, Status(r.claimed or "infeasible"))
+        if certificate_of(qp, claim, r.judged_at)[0]:
             contradictory.add(r.run_id)
     lost += [
-        _listed(r, "the proof of infeasibility could not be repeated")
+        _listed(r, "the certificate could not be computed again")
         for r in claims
         if r.run_id not in contradictory
     ]
@@ -302,8 +302,8 @@ def _stored_answers(
 
 
 def _is_proven(r: Record) -> bool:
-    """Return True if the run proved the solver's claim of infeasibility."""
-    return r.verdict is Verdict.VERIFIED_INFEASIBLE
+    """Return True if the run proved the claim that the QP has no solution."""
+    return r.verdict.is_verified and r.verdict is not Verdict.VERIFIED
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
@@ -315,7 +315,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
     """
     if r.claimed == Status.SOLVED and not r.vectors:
         return "claims success without a finite point"
-    if r.claimed == Status.INFEASIBLE and solved is not None:
+    if r.claimed in NO_SOLUTION and solved is not None:
         return (
             f"claims that there is no solution; the {solved.truth} is one, with an "
             f"error of at most {brief(solved.doubt or 0.0)}"

@@ -34,7 +34,6 @@ from mortarbench.harness.record import (
 )
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import Residuals
-from mortarbench.harness.verify.optimum import Proves, proves
 from mortarbench.harness.verify.verdicts import (
     certified,
     has_point,
@@ -84,7 +83,6 @@ def measure_and_judge(
     *,
     time_limit: float,
     memory_limit: float,
-    prove: Proves,
 ) -> JudgedMeasurement:
     """Measure once with a worker process, and complete `record` with costs and verdict.
 
@@ -93,8 +91,6 @@ def measure_and_judge(
     request : request to the worker, see `harness.processes.worker`; the tolerance and
         the memory limit are added. The worker writes the point to the file ``out``
     time_limit, memory_limit : limits in s and MiB
-    prove : computes a proven optimum if the residuals alone do not decide the verdict,
-        see `harness.verify.optimum`
 
     Raises
     ------
@@ -156,7 +152,7 @@ def measure_and_judge(
     elif is_pointless:
         record = judged(record, qp, solution, values=_NO_POINT)
     else:
-        record = judged(record, whole() if by_ranks else qp, solution, prove)
+        record = judged(record, whole() if by_ranks else qp, solution)
     record = _check_memory(memory_limit, noted(record, reply.message, *notes)).replace(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
@@ -362,7 +358,6 @@ def measure_once(
             request,
             time_limit=inf,
             memory_limit=inf,
-            prove=proves(reference),
         )
         try:
             record, solution, needs_evaluation = once()

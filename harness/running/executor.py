@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import chain
 from math import inf
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
 from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
+from mortarbench.harness.files.store import point_arrays, read_arrays
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.processes.case_folder import StoredCase, find_or_build
 from mortarbench.harness.processes.measurement import case_request, measure_and_judge
@@ -32,9 +31,8 @@ from mortarbench.harness.results.work_unit import (
     Result,
     WorkUnit,
 )
-from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS
-from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
 _MAX_STORED_OPTIMA = 1000  #: largest number of small QPs whose optima are cached
@@ -62,8 +60,6 @@ class Executor:
     # reason why the sequence has fewer cases than requested steps; else empty
     _end_reason: str = ""
     _loaded: dict[str, QP] = field(default_factory=dict)  # QPs of `_entries`, by digest
-    # proven optima of small QPs by digest; None if there is no proof
-    _optima: dict[str, Optimum | None] = field(default_factory=dict)
     # limit exceeded while building the cases of the current block; None otherwise
     _limit_hit: _BuildLimitError | None = None
     # True if ranks can emit the QP of a case, by name of the case
@@ -162,9 +158,6 @@ class Executor:
                 self._build(block, turn)
                 return self._qp(self._entries[step])
 
-            def proven(qp: QP, step: int = step) -> Optimum | None:
-                return self._optimum(self._entries[step], qp)
-
             record, solution, needs_evaluation = measure_and_judge(
                 self._worker(turn[0].solver),
                 whole,
@@ -172,7 +165,6 @@ class Executor:
                 request,
                 time_limit=block.time_limit,
                 memory_limit=block.memory_limit,
-                prove=proven,
             )
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self.scratch, "")  # a full disk may be the cause
@@ -342,35 +334,6 @@ class Executor:
                 answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
             )
         return reply.answer
-
-    def _optimum(self, entry: StoredCase, qp: QP) -> Optimum | None:
-        """Return the proven optimum of a case's QP; None if there is no proof."""
-        if entry.digest not in self._optima:
-            optimum = proven_optimum(qp, partial(self._reference, entry))
-            while len(self._optima) >= _MAX_STORED_OPTIMA:
-                del self._optima[next(iter(self._optima))]
-            self._optima[entry.digest] = optimum
-        return self._optima[entry.digest]
-
-    def _reference(self, entry: StoredCase, qp: QP) -> Solution:
-        """Solve the QP of a case with the reference solver, in the case worker.
-
-        Raises
-        ------
-        ArithmeticError
-            If the reference solver fails.
-        FaultError
-            If the case worker does not answer.
-
-        """
-        point = self.scratch / "reference.npz"
-        request = {"solve": str(entry.qp), "point": str(point)}
-        reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
-        if reply.answer is None:
-            raise FaultError(f"the reference solve failed: {reply.message}")
-        if not reply.answer["found"]:
-            raise ArithmeticError("the reference solve found no solution")
-        return read_point(point, Status.SOLVED)
 
     def _worker(self, label: str) -> WorkerProcess:
         if label not in self._workers:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.sets.convex import Vector
@@ -89,6 +90,14 @@ class Blocks(ABC):
         """Return the distance (k,) of z from the normal cone at x in each block.
 
         tol : largest relative slack for which x counts as a point of the boundary
+        """
+
+    @abstractmethod
+    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+        """Return outward unit normals (n, j) at x (n,), and the slack (j,) of each.
+
+        Nonnegative combinations of the normals with zero slack span the normal cones,
+        up to the discretisation of curved cones.
         """
 
     def arrays(self) -> dict[str, NDArray[Any]]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.sets.convex import Limits, Sum, Vector
+from mortarbench.harness.sets.convex import Limits, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +64,15 @@ class Box:
     def limits(self, x: Vector) -> list[Limits]:
         """Return the slacks of finite lower bounds, then of finite upper bounds."""
         size, limits = np.abs(x), list[Limits]()
-        for bound, sign in ((self.lower, 1), (self.upper, -1)):
-            is_finite = np.isfinite(bound)
-            if is_finite.any():
-                at = bound[is_finite]
-                limits.append(
-                    Limits(
-                        sign * (x[is_finite] - at),
-                        np.abs(at),
-                        size[is_finite],
-                        partial(_selected, is_finite),
-                    )
-                )
+        for name, bound, sign in (
+            ("lower bound", self.lower, 1),
+            ("upper bound", self.upper, -1),
+        ):
+            finite = np.flatnonzero(np.isfinite(bound))
+            if finite.size:
+                at = bound[finite]
+                slack = sign * (x[finite] - at)
+                limits.append(Limits(name, slack, np.abs(at), size[finite], finite))
         return limits
 
     def admissible(self, z: Vector) -> Vector:
@@ -85,18 +81,17 @@ class Box:
         below = np.where(np.isfinite(self.lower), np.maximum(-z, 0), 0)
         return above - below
 
-    def support(self, z: Vector) -> Sum:
+    def support(self, z: Vector) -> float:
         """Evaluate ubᵀmax(z, 0) − lbᵀmax(−z, 0) over the finite bounds."""
-        sides = [*self._sides(z)]
-        return Sum(
-            sum(sign * (bound @ part) for bound, part, sign in sides),
-            sum(np.abs(bound) @ part for bound, part, _ in sides),
-        )
+        sides = self._sides(z)
+        return float(sum(sign * (bound @ part) for bound, part, sign in sides))
 
-    def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
+    def support_gaps(
+        self, x: Vector, z: Vector, limits: Sequence[Limits]
+    ) -> list[Vector]:
         """Return the products of slack and multiplier of all finite bounds."""
         return [
-            Sum(part * limit.slack, part * (limit.terms + limit.size))
+            part * limit.slack
             for (_, part, _), limit in zip(self._sides(z), limits, strict=True)
         ]
 
@@ -120,7 +115,3 @@ class Box:
             is_finite = np.isfinite(bound)
             if is_finite.any():
                 yield bound[is_finite], np.maximum(sign * z, 0)[is_finite], sign
-
-
-def _selected(mask: NDArray[np.bool_], v: Vector) -> Vector:
-    return v[mask]

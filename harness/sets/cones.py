@@ -8,9 +8,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from mortarbench.harness.sets.blocks import Blocks, norms
-from mortarbench.harness.sets.convex import Limits, Sum, Vector
+from mortarbench.harness.sets.convex import Limits, Vector
+
+_ANGLES = np.arange(16) * np.pi / 8
+#: (16, 2) tangential directions of the normals at the apex of a cone in 3D; their hull
+#: contains 98 % of the directions of the polar cone in each plane
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +77,10 @@ class Cones(Blocks):
         """Return the slacks μx_N − ‖x_T‖ of all cones, followed by the slacks x_N."""
         normal, tangents = x[self.index[:, 0]], norms(x[self.index[:, 1:]])
         pull, zero = self.slope * normal, np.zeros_like(normal)
+        first = self.index[:, 0]
         return [
-            Limits(pull - tangents, zero, np.abs(pull) + tangents, self._terms),
-            Limits(normal, zero, np.abs(normal), self._normal),
+            Limits("cone", pull - tangents, zero, np.abs(pull) + tangents, first),
+            Limits("normal of a cone", normal, zero, np.abs(normal), first),
         ]
 
     def admissible(self, z: Vector) -> Vector:
@@ -86,14 +93,15 @@ class Cones(Blocks):
         part[self.index[:, 0]], part[self.index[:, 1:]] = -against, along
         return part
 
-    def support(self, z: Vector) -> Sum:
+    def support(self, z: Vector) -> float:
         """Return 0, the supremum of zᵀy over the cones, for z in the polar cones."""
-        return Sum(0.0, 0.0)
+        return 0.0
 
-    def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
+    def support_gaps(
+        self, x: Vector, z: Vector, limits: Sequence[Limits]
+    ) -> list[Vector]:
         """Evaluate −zᵀx for each cone, with the admissible part of z."""
-        work = (self.admissible(z) * x)[self.index]
-        return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
+        return [-(self.admissible(z) * x)[self.index].sum(axis=1)]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the Euclidean distances (k,) of z from the normal cones of cones at x.
@@ -117,6 +125,30 @@ class Cones(Blocks):
         off_polar = norms((z - self.admissible(z))[self.index])
         return np.where(is_apex, off_polar, rest)
 
+    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+        """Return outward normals (n, j) at x (n,), and their slacks (j,).
+
+        They are the directions (−μ, t)/√(1 + μ²), where t is x_T/‖x_T‖ or one of the
+        `_DIRECTIONS`. All of them are normal at the apex. The slack is that of a plane
+        that touches the cone, (μx_N − tᵀx_T)/√(1 + μ²).
+        """
+        k, d = self.index.shape
+        tangents = x[self.index[:, 1:]]
+        sizes = norms(tangents)[:, None]
+        along = tangents / np.where(sizes > 0, sizes, 1)
+        fixed = _DIRECTIONS if d == 3 else np.vstack([np.eye(d - 1), -np.eye(d - 1)])
+        t = np.stack([along, *np.broadcast_to(fixed[:, None], (len(fixed), k, d - 1))])
+        mu = np.broadcast_to(self.slope[None, :, None], (len(t), k, 1))
+        outward = np.concatenate([-mu, t], axis=2) / np.hypot(1, mu)
+        outward[np.broadcast_to(mu == 0, outward.shape)] = 0  # slope 0: −x_N alone
+        outward[..., 0] = np.where(mu[..., 0] == 0, -1, outward[..., 0])
+        index = np.broadcast_to(self.index, outward.shape)
+        column = np.repeat(np.arange(len(t) * k), d)
+        normals = coo_array(
+            (outward.ravel(), (index.ravel(), column)), shape=(x.size, len(t) * k)
+        )
+        return normals, -(normals.T @ x)
+
     def substituted(self, T: Any, a: Vector) -> Cones:
         """Return the cones of all x' such that x = T x' + a is in these cones.
 
@@ -132,14 +164,6 @@ class Cones(Blocks):
         if (tangents != tangents[:, :1]).any() or (normal < 0).any():
             raise ValueError("Cones cannot be scaled unevenly or reversed")
         return Cones(columns, self.slope * normal / tangents[:, 0])
-
-    def _terms(self, v: Vector) -> Vector:
-        part: Vector = self.slope * v[self.index[:, 0]] + norms(v[self.index[:, 1:]])
-        return part
-
-    def _normal(self, v: Vector) -> Vector:
-        part: Vector = v[self.index[:, 0]]
-        return part
 
 
 def _projection(

@@ -14,7 +14,7 @@ is, of the products of multiplier and distance to the bound.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -27,18 +27,13 @@ S = TypeVar("S", bound="ConvexSet")
 class Limits(NamedTuple):
     """Scalar constraints at a point, which are satisfied if their slack is ≥ 0."""
 
-    slack: Vector  #: distance to the limit, negative if violated
-    size: Vector  #: absolute value of the limit
-    #: sum of the absolute values of those terms of the slack that contain variables
+    name: str  #: for instance "lower bound"
+    slack: Vector  #: (k,) distance to the limit, negative if violated
+    size: Vector  #: (k,) absolute value of the limit
+    #: (k,) sum of the absolute values of the terms of the slack that contain variables
     terms: Vector
-    sized: Callable[[Vector], Vector]  #: maps absolute values (n,) to `terms`
-
-
-class Sum(NamedTuple):
-    """A sum, and the sum of the absolute values of its terms."""
-
-    value: Any
-    terms: Any
+    #: (k,) a variable of each constraint, in whose unit the slack is measured
+    variable: NDArray[np.int64]
 
 
 @runtime_checkable
@@ -64,12 +59,12 @@ class ConvexSet(Protocol):
     def admissible(self, z: Vector) -> Vector:
         """Return the part of z (n,) that is normal to the set at some point."""
 
-    def support(self, z: Vector) -> Sum:
+    def support(self, z: Vector) -> float:
         """Evaluate the support function σ at an admissible z (n,)."""
 
     def support_gaps(
         self, x: Vector, z: Vector, limits: Sequence[Limits]
-    ) -> Sequence[Sum]:
+    ) -> Sequence[Vector]:
         """Return the contribution of each bound or block to σ(z) − zᵀx at x, z (n,).
 
         limits : result of `limits` at x

@@ -8,9 +8,10 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
 
 from mortarbench.harness.sets.blocks import Blocks, norms
-from mortarbench.harness.sets.convex import Limits, Sum, Vector
+from mortarbench.harness.sets.convex import Limits, Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,8 @@ class Discs(Blocks):
     def limits(self, x: Vector) -> list[Limits]:
         """Return the slack r − ‖x_I‖ of each disc."""
         sizes = self._norms(x)
-        return [Limits(self.radius - sizes, self.radius, sizes, self._norms)]
+        first = self.index[:, 0]
+        return [Limits("disc", self.radius - sizes, self.radius, sizes, first)]
 
     def admissible(self, z: Vector) -> Vector:
         """Return z (n,) with the components outside the blocks set to zero."""
@@ -75,16 +77,15 @@ class Discs(Blocks):
         part[self.index] = z[self.index]
         return part
 
-    def support(self, z: Vector) -> Sum:
+    def support(self, z: Vector) -> float:
         """Evaluate Σ r‖z_I‖ over all discs."""
-        value = self.radius @ self._norms(z)
-        return Sum(value, value)
+        return float(self.radius @ self._norms(z))
 
-    def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
+    def support_gaps(
+        self, x: Vector, z: Vector, limits: Sequence[Limits]
+    ) -> list[Vector]:
         """Evaluate r‖z_I‖ − z_Iᵀx_I for each disc."""
-        work = (z * x)[self.index]
-        value = self.radius * self._norms(z)
-        return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
+        return [self.radius * self._norms(z) - (z * x)[self.index].sum(axis=1)]
 
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the Euclidean distances (k,) of z from the normal cones of discs at x.
@@ -98,6 +99,14 @@ class Discs(Blocks):
         is_active = self.radius - sizes <= tol * self.radius
         rest = norms(force - (along * is_active)[:, None] * outward)
         return np.where(self.radius > 0, rest, 0 * rest)
+
+    def normals(self, x: Vector) -> tuple[coo_array, Vector]:
+        """Return outward normals (n, k) at x (n,), and the slacks r − ‖x_I‖ (k,)."""
+        sizes, (k, d) = self._norms(x), self.index.shape
+        outward = x[self.index] / np.where(sizes > 0, sizes, 1)[:, None]
+        places = self.index.ravel(), np.repeat(np.arange(k), d)
+        normals = coo_array((outward.ravel(), places), shape=(x.size, k))
+        return normals, self.radius - sizes
 
     def substituted(self, T: Any, a: Vector) -> Self:
         """Return the discs of all x' such that x = T x' + a is in these discs.

@@ -5,24 +5,31 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, hstack
+from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.failures import run_collectively
 from mortarbench.harness.distributed.vectors import (
     DistributedQP,
     Ranks,
+    distributed,
 )
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
-from mortarbench.harness.qp import QP
+from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES, SolverSpec
-from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import ConvexSet
+from mortarbench.harness.sets.discs import Discs
+from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.certificate import (
     Certificate,
     EigenvalueCertificate,
@@ -30,9 +37,14 @@ from mortarbench.harness.verify.certificate import (
     certify,
     certify_by_eigenvalue,
 )
-from mortarbench.harness.verify.infeasibility import infeasibility_margin
-from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
-from mortarbench.harness.verify.optimum import Proves, decided
+from mortarbench.harness.verify.infeasibility import certificate_of
+from mortarbench.harness.verify.kkt import (
+    Residuals,
+    diagnosis,
+    kkt_residuals,
+    scaling_of,
+    verdict,
+)
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
 #: Version of the data from which a run_id is computed, independent of the schema of
@@ -95,13 +107,10 @@ def judged(
     record: Record,
     qp: QP,
     s: Solution,
-    prove: Proves | None = None,
     values: Mapping[str, Any] | None = None,
 ) -> Record:
     """Complete a record with the claim of an answer `s`, its residuals and the verdict.
 
-    prove : returns the proven optimum of `qp`; called if residuals do not decide the
-        verdict, or if P is a small operator
     values : residuals and objective that ranks have evaluated; None to evaluate them in
         this function
     """
@@ -122,29 +131,21 @@ def judged(
         with np.errstate(all="ignore"):  # a point may contain NaN, inf, or 1e300
             residuals = kkt_residuals(qp, s)
             objective = qp.objective(s.x)
-    tol, error, margin = record.judged_at, None, None
-    if s.status is Status.INFEASIBLE and values is None:
-        margin = infeasibility_margin(qp, s)
-        record = noted(
-            record,
-            "no certificate of infeasibility was found"
-            if margin is None
-            else f"no feasible point: Farkas certificate with a margin of {margin:.1e}",
-        )
-    elif s.status is Status.INFEASIBLE:
-        record = noted(
-            record, "claims of infeasibility are not examined for distributed QPs"
-        )
-    if prove is not None and margin is None:
-        error = decided(qp, s, residuals, tol, prove)
-    decided_by = "residuals" if error is None else "reference"
+    tol = record.judged_at
+    outcome = verdict(s.status, residuals, tol)
+    if s.status in NO_SOLUTION:
+        if values is not None:
+            holds, reason = False, f"claims of {s.status} QPs are not examined on ranks"
+        else:
+            holds, reason = certificate_of(qp, s, tol)
+        outcome = Verdict(f"verified_{s.status}") if holds else outcome
+        record = noted(record, reason)
+    elif s.status is Status.SOLVED and not outcome.is_verified and values is None:
+        record = noted(record, diagnosis(qp, s, tol))
     return record.replace(
-        verdict=verdict(
-            s.status, residuals, tol, error=error, infeasible=margin is not None
-        ),
+        verdict=outcome,
         objective=objective,
-        decided_by=decided_by if margin is None else "certificate",
-        optimum_error=error,
+        approximate_scale=values is None and scaling_of(qp).is_approximate,
         **residuals._asdict(),
     )
 
@@ -224,7 +225,9 @@ def evaluated_by_ranks(
         "notes": list[str](),
     }
     try:
-        found["values"] = run_collectively(ranks, lambda: _values_by_ranks(emitted, s))
+        found["values"] = run_collectively(
+            ranks, lambda: _values_by_ranks(emitted, s, ranks)
+        )
         if found["values"] is None:
             return found
         answered = run_collectively(ranks, lambda: emitted.answer(s))
@@ -247,22 +250,52 @@ def evaluated_by_ranks(
     return found
 
 
-def _values_by_ranks(emitted: DistributedQP, s: Solution) -> dict[str, float] | None:
-    """Evaluate objective and residuals; return None if they are not finite.
-
-    The result is also None if a scale of energy requires the whole QP. In this case, an
-    operation that needs more than the local slice of a distributed vector raises
-    TypeError.
-    """
-    qp = emitted.share().qp
-    try:
-        with np.errstate(all="ignore"):
-            residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
-    except TypeError:
-        return None
+def _values_by_ranks(
+    emitted: DistributedQP, s: Solution, ranks: Ranks
+) -> dict[str, float] | None:
+    """Evaluate objective and residuals; return None if they are not finite."""
+    share = emitted.share().qp
+    qp, s = gathered(share, s, ranks)
+    with np.errstate(all="ignore"):
+        residuals, objective = kkt_residuals(qp, s), qp.objective(s.x)
     if not np.isfinite([*residuals, objective]).all():
         return None
     return {"objective": float(objective), **residuals._asdict()}
+
+
+def gathered(share: QP, s: Solution, ranks: Ranks) -> tuple[QP, Solution]:
+    """Return the whole QP and solution on every rank, given the slices of all ranks.
+
+    Variables are in the order of the ranks, of which residuals are independent. P
+    remains distributed: a product is collective.
+    """
+    counts = ranks.comm.allgather(share.q.size)
+    start, n = sum(counts[: ranks.rank]), sum(counts)
+    here = slice(start, start + counts[ranks.rank])
+
+    def whole(part: Any) -> Vector:
+        return np.concatenate(ranks.comm.allgather(np.asarray(part)))
+
+    def product(x: Vector) -> Vector:
+        return whole(share.P @ distributed(x.ravel()[here], ranks))
+
+    P = LinearOperator((n, n), matvec=product, dtype=float)
+    diagonal = share.diagonal()
+    if diagonal is not None:
+        total = whole(diagonal)
+        P.diagonal = lambda: total
+    sets: list[ConvexSet] = [Box(whole(share.lb), whole(share.ub))]
+    discs = [one for one in share.sets[1:] if isinstance(one, Discs)]
+    parts = ranks.comm.allgather(
+        [(one.index + start, np.asarray(one.radius)) for one in discs]
+    )
+    for same in zip(*parts, strict=True):
+        index, radius = (np.concatenate(arrays) for arrays in zip(*same, strict=True))
+        if radius.size:
+            sets.append(Discs(index, radius))
+    A = csr_array(hstack(ranks.comm.allgather(share.A.part)))
+    qp = QP(P=P, q=whole(share.q), A=A, b=share.b, G=no_rows(n), h=share.h, sets=sets)
+    return qp, replace(s, x=whole(s.x), z_box=whole(s.z_box))
 
 
 #: module that loads slowly, needed by `certify` for some bodies

@@ -26,7 +26,6 @@ from mortarbench.reports.compare.conditions import environments, options, settin
 from mortarbench.reports.compare.figure import ratios_figure
 from mortarbench.reports.data.cells import (
     answer_columns,
-    explained,
     iterations_cell,
     source,
     verdict_cell,
@@ -224,7 +223,7 @@ def _listed(
 ) -> Iterator[Table]:
     """Yield a table of the items; yield nothing without items."""
     if items:
-        yield explained(Table.of(caption, items, columns, text_columns=2))
+        yield Table.of(caption, items, columns, text_columns=2)
 
 
 def conditions_that_differ(c: Comparison) -> Iterator[Part]:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
 from mortarbench.reports.document.layout import Cell, Column, Table, sources
-
-#: mark after a verdict that is based on a proven optimum and contradicts the residuals
-BY_OPTIMUM = "⋆"
 
 
 def source(*outcomes: Outcome) -> str:
@@ -26,8 +22,6 @@ def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
     message : message of the solver, shown on hovering
     """
     symbol, words = VERDICTS[outcome.verdict]
-    if outcome.against_residuals:
-        words += f" {BY_OPTIMUM}"
     alike = sum(r.verdict is outcome.verdict for r in outcome.records)
     if alike < len(outcome.records):
         words += f" ({alike} of {plural(len(outcome.records), 'repeat')})"
@@ -46,19 +40,6 @@ def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
     if its is None:
         return Cell(kind=kind, title=title)
     return Cell(text=form.format(span(its)), value=its[0], kind=kind, title=title)
-
-
-def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
-    """Return a note on the mark `BY_OPTIMUM` if a verdict in the rows carries it."""
-    kinds = {verdict.value for verdict in VERDICTS}
-    marked = any(c.kind in kinds and BY_OPTIMUM in c.text for row in rows for c in row)
-    note = f"{BY_OPTIMUM}: the proven optimum of a small QP overrules the residuals."
-    return (note,) if marked else ()
-
-
-def explained(table: Table) -> Table:
-    """Append a note on the mark `BY_OPTIMUM` if a verdict in the table carries it."""
-    return replace(table, notes=(*table.notes, *legend(table.rows)))
 
 
 def answer_columns(
@@ -103,4 +84,4 @@ def grid(
         for row in evidence.outcomes.values()
     )
     heads = ("case", "tol", *(clean(s, 40) for s in evidence.solvers))
-    return explained(Table(caption=caption, columns=heads, rows=rows))
+    return Table(caption=caption, columns=heads, rows=rows)

@@ -13,7 +13,7 @@ from typing import Any
 from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
-from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
 from mortarbench.harness.results.faults import Fault, read_faults, remaining_faults
 from mortarbench.harness.results.folder import environment_of, times_compare
 from mortarbench.harness.results.journal import read_journal
@@ -33,13 +33,14 @@ SEVERITY = (
     Verdict.WRONG,
     Verdict.INACCURATE,
     Verdict.INFEASIBLE_CLAIM,
+    Verdict.UNBOUNDED_CLAIM,
     Verdict.CRASHED,
     Verdict.FAILED,
     Verdict.MEMORY_LIMIT,
     Verdict.TIME_LIMIT,
     Verdict.ITERATION_LIMIT,
     Verdict.DECLINED,
-    Verdict.VERIFIED_INFEASIBLE,
+    *PROVEN,
     Verdict.VERIFIED,
 )
 
@@ -101,18 +102,6 @@ class Outcome:
     def verified(self) -> bool:
         """True if every repeat was verified."""
         return self.verdict.is_verified
-
-    @cached_property
-    def against_residuals(self) -> bool:
-        """True if a proven optimum decided a verdict that the residuals contradict."""
-        return any(
-            r.decided_by == "reference"
-            and r.verdict in (Verdict.VERIFIED, Verdict.INACCURATE, Verdict.WRONG)
-            and None not in (values := [getattr(r, name) for name in RESIDUALS])
-            and (max(values) <= allowed(r.judged_at, self.factor))
-            is not (r.verdict is Verdict.VERIFIED)
-            for r in self.records
-        )
 
     @cached_property
     def claims(self) -> tuple[str, ...]:
@@ -340,14 +329,10 @@ def _one_name_per_qp(records: list[Record]) -> list[Record]:
 def _warn_of_contradictions(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
-    """Warn about verified records whose residuals are too large for that verdict.
-
-    If a proven optimum decided, the error relative to the optimum is examined instead.
-    """
+    """Warn about verified records whose residuals are too large for that verdict."""
     wrong = []
     for r in records:
-        names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
-        values = [v for name in names if (v := getattr(r, name)) is not None]
+        values = [v for name in RESIDUALS if (v := getattr(r, name)) is not None]
         if r.verdict is Verdict.VERIFIED and max(values, default=0) > allowed(
             r.judged_at
         ):

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from mortarbench.harness import Verdict
-from mortarbench.reports.data.cells import legend, source, verdict_cell
+from mortarbench.reports.data.cells import source, verdict_cell
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.figure import (
     INK,
@@ -194,7 +194,7 @@ def fleet_table(evidence: Evidence, form: str) -> Table:
     return Table(
         caption=f"Form {form}: median time by the size m of the dual, and the exponent "
         "p of t = c·mᵖ fitted to the verified sizes.",
-        notes=(TIMED, *legend(rows)),
+        notes=(TIMED,),
         columns=("", *(f"m = {m}" for m in sizes), "p [95 %]"),
         rows=tuple(rows),
     )

@@ -332,13 +332,11 @@ def _reason(one: Unverified) -> str:
         return clean(one.answers[0].first.message, 60)
     if one.verdict not in (Verdict.INACCURATE, Verdict.WRONG):
         return ""
-    off = [(e, o) for o in one.answers if (e := o.largest("optimum_error")) is not None]
-    errors = off or [(e, o) for o in one.answers if (e := o.worst) is not None]
+    errors = [(e, o) for o in one.answers if (e := o.worst) is not None]
     if not errors:
         return ""
     error, worst = max(errors, key=lambda each: each[0])
-    quantity = "distance from the proven optimum" if off else "residual"
-    return f"{quantity} {power(error)}, allowed {power(worst.allowed)}"
+    return f"residual {power(error)}, allowed {power(worst.allowed)}"
 
 
 def _reservations(found: Sequence[FastestSolver]) -> list[str]:

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 
 from mortarbench.harness import Verdict
+from mortarbench.harness.record import PROVEN, REFUTED
 from mortarbench.reports.data.cells import (
     answer_columns,
     case_cells,
-    explained,
     grid,
     iterations_cell,
     source,
@@ -70,8 +70,7 @@ def claims(a: Analysis) -> Iterator[Part]:
     """Tabulate claims and verdicts; list refuted and unproven claims."""
     yield from TEXT.parts("claims")
     yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
-    kinds = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
-    refuted = [o for o in a.evidence.flat if o.verdict in kinds]
+    refuted = [o for o in a.evidence.flat if o.verdict in REFUTED]
     if refuted:
         columns = (
             *answer_columns(),
@@ -80,15 +79,13 @@ def claims(a: Analysis) -> Iterator[Part]:
             ("message of the solver", lambda o: Cell.label(o.first.message, 60)),
         )
         caption = TEXT("refuted_caption")
-        yield explained(Table.of(caption, refuted, columns, text_columns=2))
+        yield Table.of(caption, refuted, columns, text_columns=2)
 
 
 def _refutation(outcome: Outcome) -> Cell:
     """Return a cell with the residual or distance that is too large, and its limit."""
     values = {name: outcome.largest(name) for name in RESIDUALS}
     errors = {name: value for name, value in values.items() if value is not None}
-    if (error := outcome.largest("optimum_error")) is not None:
-        errors = {"distance from the proven optimum": error}
     if not errors:
         return Cell(text="no point", title=source(outcome))
     name = max(errors, key=lambda n: errors[n])
@@ -100,8 +97,8 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
     after = [power(outcome.worst)] if outcome.worst is not None else []
     refuted = outcome.verdict in (Verdict.INACCURATE, Verdict.WRONG)
     expected = "solved" if outcome.verified or refuted else outcome.verdict.value
-    if outcome.verdict is Verdict.VERIFIED_INFEASIBLE:
-        expected = "infeasible"
+    if outcome.verdict in PROVEN:
+        expected = outcome.verdict.value.removeprefix("verified_")
     claimed = [c for c in outcome.claims if c != expected]
     if claimed and outcome.verdict is not Verdict.DECLINED:
         after.append("claimed " + clean(", ".join(claimed).replace("_", " "), 40))
@@ -165,4 +162,4 @@ def errors(a: Analysis) -> Iterator[Part]:
             ),
         )
         caption = "Residuals of every answer."
-        yield explained(Table.of(caption, answers, columns, text_columns=2))
+        yield Table.of(caption, answers, columns, text_columns=2)

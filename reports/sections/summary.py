@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from mortarbench.harness import InputError, Record, Verdict
-from mortarbench.harness.record import SCHEMA, VERIFIED_FACTOR
+from mortarbench.harness.record import PROVEN, SCHEMA, VERIFIED_FACTOR
 from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
@@ -18,10 +18,10 @@ from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
 
 _GROUPS: dict[str, tuple[Verdict, ...]] = {
-    "verified": (Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE),
+    "verified": (Verdict.VERIFIED, *PROVEN),
     "inaccurate": (Verdict.INACCURATE,),
     "wrong": (Verdict.WRONG,),
-    "infeasible claim": (Verdict.INFEASIBLE_CLAIM,),
+    "unproven claim": (Verdict.INFEASIBLE_CLAIM, Verdict.UNBOUNDED_CLAIM),
     "limit": (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT),
     "failed": (Verdict.CRASHED, Verdict.FAILED),
     "declined": (Verdict.DECLINED,),

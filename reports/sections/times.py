@@ -18,7 +18,6 @@ from mortarbench.harness import Record
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
 from mortarbench.harness.suite.suite import NULL_SUFFIX
 from mortarbench.reports.data.cells import (
-    BY_OPTIMUM,
     case_cells,
     grid,
     source,
@@ -38,7 +37,7 @@ from mortarbench.reports.figures.sweeps import accuracy_figure
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
 
-TEXT = Sentences(__name__, LEAST=COVERAGE, BY_OPTIMUM=BY_OPTIMUM)
+TEXT = Sentences(__name__, LEAST=COVERAGE)
 _PARTS = 3  #: number of parts; the canary's drift is measured from first to last
 
 
@@ -60,8 +59,7 @@ def times(a: Analysis) -> Iterator[Part]:
         yield _charged_table(charged, a.evidence.solvers)
     figure = accuracy_figure(a.evidence)
     if figure is not None:
-        marked = any(o.against_residuals for o in a.evidence.flat)
-        caption = TEXT("accuracy", marked)
+        caption = TEXT("accuracy")
         yield Picture(name="accuracy", caption=caption, figure=figure)
 
 

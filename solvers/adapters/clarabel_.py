@@ -21,6 +21,7 @@ from mortarbench.harness import (
     Status,
     needs_matrices,
 )
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     check_positive,
@@ -36,7 +37,7 @@ CLAIMS = {
     "MaxIterations": Status.ITERATION_LIMIT,
     "MaxTime": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "DualInfeasible": Status.INFEASIBLE,
+    "DualInfeasible": Status.UNBOUNDED,
 }  #: all other statuses (AlmostSolved, InsufficientProgress, …) count as FAILED
 
 
@@ -107,7 +108,7 @@ class Clarabel:
         def solve() -> Solution:
             r = solver.solve()
             status = CLAIMS.get(str(r.status), Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 is_primal = str(r.status) == PRIMAL
                 ray = form.multipliers(np.array(r.z)) if is_primal else {}
                 return Solution.without_point(qp, status, str(r.status), **ray)

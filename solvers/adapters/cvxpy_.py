@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import QP, About, Box, Solution, Status, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
@@ -69,7 +70,7 @@ CLAIMS = {
     "optimal": Status.SOLVED,
     "user_limit": Status.ITERATION_LIMIT,
     "infeasible": Status.INFEASIBLE,
-    "unbounded": Status.INFEASIBLE,
+    "unbounded": Status.UNBOUNDED,
     "infeasible_or_unbounded": Status.INFEASIBLE,
 }  #: all other statuses (optimal_inaccurate, …) count as FAILED
 
@@ -147,7 +148,7 @@ class CVXPY:
                 except cvxpy.SolverError as e:
                     return Solution.without_point(qp, Status.FAILED, str(e))
             status = CLAIMS.get(problem.status, Status.FAILED)
-            if status is Status.INFEASIBLE or x.value is None:
+            if status in NO_SOLUTION or x.value is None:
                 return Solution.without_point(qp, status, problem.status)
             if status is Status.SOLVED and np.abs(x.value).max() > DIVERGED:
                 return Solution.without_point(qp, Status.FAILED, "diverged")

@@ -14,6 +14,7 @@ from typing import ClassVar
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     check_positive,
     dense,
@@ -26,7 +27,7 @@ CLAIMS = {
     1: Status.SOLVED,
     2: Status.FAILED,  # solution of a problem with softened constraints
     -1: Status.INFEASIBLE,
-    -3: Status.INFEASIBLE,  # unbounded
+    -3: Status.UNBOUNDED,
     -4: Status.ITERATION_LIMIT,
 }  #: all other exit flags count as FAILED
 MESSAGES = {
@@ -113,7 +114,7 @@ class DAQP:
             x, _, flag, info = model.solve()
             status = CLAIMS.get(flag, Status.FAILED)
             message = MESSAGES.get(flag, f"exit flag {flag}")
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 return Solution.without_point(qp, status, message)
             lam: Vector = np.array(info["lam"]) / scale
             return Solution(

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import block_array, csc_matrix
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     ConicForm,
@@ -27,7 +28,7 @@ from mortarbench.solvers.common.conversion import (
 CLAIMS = {
     0: Status.SOLVED,
     1: Status.INFEASIBLE,
-    2: Status.INFEASIBLE,  # unbounded
+    2: Status.UNBOUNDED,
     -1: Status.ITERATION_LIMIT,
 }  #: claim for each exit flag; all other exit flags count as FAILED
 PRIMAL = 1  #: exit flag with a certificate of infeasibility
@@ -108,7 +109,7 @@ class ECOS:
             info = answer["info"]
             status = CLAIMS.get(info["exitFlag"], Status.FAILED)
             message, iterations = info["infostring"], info["iter"]
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 is_primal = info["exitFlag"] == PRIMAL
                 ray = form.multipliers(v) if is_primal else {}
                 return Solution.without_point(qp, status, message, **ray)

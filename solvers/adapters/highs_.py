@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import csc_matrix, tril, vstack
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     check_choice,
     check_positive,
@@ -29,7 +30,7 @@ CLAIMS = {
     "kIterationLimit": Status.ITERATION_LIMIT,
     "kTimeLimit": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "kUnbounded": Status.INFEASIBLE,
+    "kUnbounded": Status.UNBOUNDED,
     "kUnboundedOrInfeasible": Status.INFEASIBLE,
 }  #: all other statuses count as FAILED
 MIN_TOLERANCE = 1e-10  #: smallest tolerance that HiGHS accepts
@@ -112,7 +113,7 @@ class HiGHS:
             status = CLAIMS.get(name, Status.FAILED)
             point = solver.getSolution()
             m, p = qp.b.size, qp.h.size
-            if status is Status.INFEASIBLE or not point.value_valid:
+            if status in NO_SOLUTION or not point.value_valid:
                 ray: dict[str, Vector] = {}
                 _, has_ray, row = solver.getDualRay()
                 if name == PRIMAL and has_ray and m + p:

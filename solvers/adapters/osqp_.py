@@ -13,6 +13,7 @@ from typing import ClassVar
 from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_positive,
@@ -32,7 +33,7 @@ CLAIMS = {
     "OSQP_SOLVED_INACCURATE": Status.ITERATION_LIMIT,
     "OSQP_TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "OSQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
+    "OSQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
 }  #: all other statuses count as FAILED
 
 
@@ -111,7 +112,7 @@ class OSQP:
             r = solver.solve(raise_error=False)
             name = osqp.SolverStatus(r.info.status_val).name
             status = CLAIMS.get(name, Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 ray = from_two_sided(qp, r.prim_inf_cert) if name == PRIMAL else {}
                 return Solution.without_point(qp, status, r.info.status, **ray)
             return Solution(

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
@@ -30,7 +31,7 @@ CLAIMS = {
     "PIQP_SOLVED": Status.SOLVED,
     "PIQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "PIQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
+    "PIQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
 }  #: all other statuses count as FAILED
 
 
@@ -93,7 +94,7 @@ class PIQP:
             multipliers = dict(
                 y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
             )
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 # the diverging multipliers approach a certificate of infeasibility
                 ray = multipliers if info.status.name == PRIMAL else {}
                 return Solution.without_point(qp, status, info.status.name, **ray)

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,
@@ -33,7 +34,7 @@ CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "PROXQP_DUAL_INFEASIBLE": Status.INFEASIBLE,
+    "PROXQP_DUAL_INFEASIBLE": Status.UNBOUNDED,
     "PROXQP_SOLVED_CLOSEST_PRIMAL_FEASIBLE": Status.INFEASIBLE,
 }  #: all other statuses count as FAILED
 CERTIFICATE = 1e-8  #: tolerance of an infeasibility certificate
@@ -126,7 +127,7 @@ class ProxQP:
                 solver.solve()
             r = solver.results
             status = CLAIMS.get(r.info.status.name, Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 ray: dict[str, Vector] = {}
                 if r.info.status.name == PRIMAL:
                     ray = dict(y=np.array(r.y), **form.multipliers(np.array(r.z)))

@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_positive,
@@ -29,7 +30,7 @@ CLAIMS = {
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
     "TIME_LIMIT_REACHED": Status.TIME_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "DUAL_INFEASIBLE": Status.INFEASIBLE,
+    "DUAL_INFEASIBLE": Status.UNBOUNDED,
 }  #: all other statuses count as FAILED
 INFINITE = 1e20  #: QPALM's value for an absent bound
 
@@ -92,7 +93,7 @@ class QPALM:
             info = solver.info
             name = _name(qpalm, info.status_val)
             status = CLAIMS.get(name, Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 ray: dict[str, Vector] = {}
                 if name == PRIMAL:
                     ray = from_two_sided(qp, np.array(solver.prim_inf_certificate))

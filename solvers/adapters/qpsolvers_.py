@@ -24,6 +24,7 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
@@ -87,7 +88,8 @@ STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
     (r"time", Status.TIME_LIMIT),
     (r"almost|inaccurate", Status.FAILED),
-    (r"infeasible|unbounded", Status.INFEASIBLE),
+    (r"unbounded|dual.?infeasible", Status.UNBOUNDED),
+    (r"infeasible", Status.INFEASIBLE),
 )
 
 
@@ -199,7 +201,7 @@ def _solution(qp: QP, result: Any, scale: float) -> Solution:
     info = info if isinstance(info, Mapping) else _attributes(info)
     message = str(info.get("status", "found" if result.found else "not found"))
     status = Status.SOLVED if result.found else _claim(message)
-    if status is Status.INFEASIBLE:
+    if status in NO_SOLUTION:
         return Solution.without_point(qp, status, message)
     z_box = _vector(result.z_box, qp.q.size, absent=not qp.sizes["bounds"])
     return Solution(

@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     check_choice,
     check_positive,
@@ -26,7 +27,7 @@ CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
     PRIMAL: Status.INFEASIBLE,
-    "unbounded": Status.INFEASIBLE,
+    "unbounded": Status.UNBOUNDED,
 }  #: all other statuses (almost_solved, …) count as FAILED
 LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 
@@ -112,7 +113,7 @@ class QTQP:
             )
             message = r.status.value
             status = CLAIMS.get(message, Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 ray = form.multipliers(np.array(r.y)) if message == PRIMAL else {}
                 return Solution.without_point(qp, status, message, **ray)
             return Solution(

@@ -13,6 +13,7 @@ from typing import ClassVar
 from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     NEGLIGIBLE,
@@ -27,7 +28,7 @@ PRIMAL = -2  #: status with a certificate of infeasibility
 CLAIMS = {
     1: Status.SOLVED,
     2: Status.ITERATION_LIMIT,  # inaccurate solution at the iteration limit
-    -1: Status.INFEASIBLE,  # unbounded
+    -1: Status.UNBOUNDED,
     PRIMAL: Status.INFEASIBLE,
 }  #: all other statuses count as FAILED
 CERTIFICATE = 1e-9  #: tolerance of a certificate of infeasibility
@@ -98,7 +99,7 @@ class SCS:
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
             status = CLAIMS.get(info["status_val"], Status.FAILED)
-            if status is Status.INFEASIBLE:
+            if status in NO_SOLUTION:
                 is_primal = info["status_val"] == PRIMAL
                 ray = form.multipliers(r["y"]) if is_primal else {}
                 return Solution.without_point(qp, status, info["status"], **ray)

@@ -44,7 +44,6 @@ from mortarbench.harness import (
     About,
     Solution,
     Status,
-    Vector,
     kkt_residuals,
     needs_matrices,
 )
@@ -211,8 +210,12 @@ def _proximal(
         if worst <= tol:
             break
         moves = [new - old for new, old in zip(run.at, centre, strict=True)]
-        if run.settled and (message := _no_solution(qp, *moves)):
+        if run.settled and proves_infeasible(qp, moves[1], moves[2]):
+            message = "no point satisfies all constraints"
             return Solution.without_point(qp, Status.INFEASIBLE, message), None
+        if run.settled and proves_unbounded(qp, moves[0]):
+            message = "the objective is unbounded below"
+            return Solution.without_point(qp, Status.UNBOUNDED, message), None
         if not run.settled:
             break
         stalled = 0 if worst < best / 2 else stalled + 1
@@ -225,16 +228,6 @@ def _proximal(
     rounding = "no further progress because of rounding"
     message = rounding if run.settled else "step limit"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
-
-
-def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Return the reason why no solution exists, or None without a certificate.
-
-    (x, y, z) : difference of the last two proximal centres, tested as a certificate
-    """
-    if proves_infeasible(qp, y, z):
-        return "no point satisfies all constraints"
-    return "the objective is unbounded below" if proves_unbounded(qp, x) else None
 
 
 def _point(problem: Problem, run: Run, centre: Point) -> Solution:

@@ -129,7 +129,7 @@ def _step(problem: Problem, memory: int, s: _State) -> _State | Solution:
     alpha = square / curvature if curved else s.alpha
     if not curved and _proves_unbounded(problem.qp, d):
         message = "the objective is unbounded below"
-        return Solution.without_point(problem.qp, Status.INFEASIBLE, message)
+        return Solution.without_point(problem.qp, Status.UNBOUNDED, message)
     problem.counts["shortened"] += t < 1
     return _State(
         problem.project(s.x + t * d),

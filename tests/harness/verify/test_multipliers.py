@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, InputError, kkt_residuals
+from mortarbench.harness import QP, InputError
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify import multipliers
 from mortarbench.harness.verify.multipliers import with_multipliers
 
@@ -162,7 +163,7 @@ def test_a_point_that_holds_nan_gets_no_multipliers():
 
 
 def test_too_many_multipliers_are_refused(monkeypatch):
-    monkeypatch.setattr(multipliers, "MAX_ENTRIES", 10)
+    monkeypatch.setattr(multipliers, "MAX_COLUMNS", 3)
     qp = QP.from_arrays(np.eye(4), -np.ones(4), np.eye(4), np.zeros(4))
     with pytest.raises(
         InputError, match=r"too many to compute; expected y, z and z_box"
