@@ -528,8 +528,8 @@ def verify(
 ) -> Verification:
     """Verify a point by its KKT residuals, as the harness verifies answers of solvers.
 
-    Multipliers that are left out are computed by nonnegative least squares on the
-    active rows and bounds, see `harness.verify.multipliers`. If the residuals are large
+    Multipliers that are left out minimise the residuals in a linear program over the
+    nearly active rows, bounds and sets, see `harness.verify.multipliers`. If the residuals are large
     even with these multipliers, the point is refuted.
 
     Parameters
@@ -537,9 +537,8 @@ def verify(
     qp : a QP, a case of `build`, or its name
     x : (n,) point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
-    tol : relative KKT accuracy; a point is verified if every residual is at most 10·tol
-        or, for a small QP with a proven optimum, if its error relative to the optimum
-        is at most 10·tol (and at most 0.1)
+    tol : relative KKT accuracy; a point is verified if every residual is at most
+        10·tol (and at most 0.1), see docs/verdicts.md
 
     Raises
     ------

@@ -59,8 +59,7 @@ class Reporter(Protocol):
     ) -> list[Path]:
         """Write the report.
 
-        factor : a point is verified if every residual or, with a proven optimum, its
-            error relative to the optimum is at most factor·tol
+        factor : a point is verified if every residual is at most factor·tol
         pool_forms : compare solvers over the cases of all forms together, instead of
             within each form
         """

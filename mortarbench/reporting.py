@@ -76,8 +76,7 @@ def report(
         `folder` to this further folder is written to its subfolder ``report``, instead
         of the report on `folder`
     formats : any of html, md, tex, csv, parquet
-    factor : a point is verified if every residual or, with a proven optimum, its error
-        relative to the optimum is at most factor·tol
+    factor : a point is verified if every residual is at most factor·tol
     fail_on : conditions that `Report.failed_on` lists if they are met: ``worse``, a
         verdict became worse; ``slower``, a solver became slower by the criterion in
         docs/statistics-growth.md

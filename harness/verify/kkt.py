@@ -27,8 +27,6 @@ from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.sets.convex import admissible
 from mortarbench.harness.solution import Solution, Status
 
-#: Number of the rule, stored in records. Records of another rule are not judged again.
-RULE = 2
 #: Size of a row with a right-hand side of 0, as a fraction of ‖x̂‖∞, and scale of forces
 #: that vanish, as a fraction of max P̂ⱼⱼ‖x̂‖∞. Neither has a unit of its own. With
 #: 0.1 = 1/10, an error τ times this scale is tol·‖x̂‖∞, which the solver was asked for.

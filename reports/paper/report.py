@@ -70,8 +70,8 @@ from mortarbench.reports.render.writing import write_figures, write_text
 REPEATED = (
     "Medians of interleaved, randomised repeats in separate worker processes, with "
     "the distribution-free 95 % interval of the median (below six repeats: minimum "
-    "and maximum). Every answer is verified on the original QP, by its residuals or, "
-    "for small QPs, by a proven optimum; only verified answers have times."
+    "and maximum). Every answer is verified on the original QP, by its residuals; "
+    "only verified answers have times."
 )
 
 
