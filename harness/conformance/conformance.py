@@ -44,7 +44,7 @@ from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.solution import NO_SOLUTION, Solution, Status
 from mortarbench.harness.verify.infeasibility import certificate_of
-from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.harness.verify.kkt import diagnosis, kkt_residuals
 from mortarbench.harness.verify.measure import (
     ReasonError,
     failure,
@@ -155,7 +155,8 @@ def _judge(qp: QP, s: Solution, allowed: float) -> None:
     if not residuals.worst <= allowed:
         values = ", ".join(f"{k} {v:.1e}" for k, v in residuals._asdict().items())
         raise ContractError(
-            f"claimed solved, but residuals are {values}; expected at most {allowed:g}"
+            f"claimed solved, but {diagnosis(qp, s, allowed / VERIFIED_FACTOR)} "
+            f"(residuals: {values}; expected at most {allowed:g})"
         )
 
 
