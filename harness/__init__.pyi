@@ -27,6 +27,7 @@ from .record import Verdict as Verdict
 from .sets.box import Box as Box
 from .sets.cones import Cones as Cones
 from .sets.discs import Discs as Discs
+from .solution import NO_SOLUTION as NO_SOLUTION
 from .solution import Solution as Solution
 from .solution import Status as Status
 from .verify.certificate import Certificate as Certificate

@@ -137,7 +137,7 @@ def relative_residual(
     return max(
         relative(np.abs(left).max(initial=0.0), A @ x, b, C @ x, d),
         relative(np.abs(Px + q + forces).max(), Px, q),
-        relative(abs(sum(energies)), *map(np.atleast_1d, energies[:2])),
+        relative(abs(float(sum(energies))), *map(np.atleast_1d, energies[:2])),
     )
 
 

@@ -15,13 +15,13 @@ import numpy as np
 from scipy.sparse import triu
 
 from mortarbench.harness import (
+    NO_SOLUTION,
     QP,
     About,
     Solution,
     Status,
     needs_matrices,
 )
-from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     check_positive,

@@ -15,8 +15,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import QP, About, Box, Solution, Status, needs_matrices
-from mortarbench.harness.solution import NO_SOLUTION
+from mortarbench.harness import (
+    NO_SOLUTION,
+    QP,
+    About,
+    Box,
+    Solution,
+    Status,
+    needs_matrices,
+)
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,

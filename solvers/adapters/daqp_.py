@@ -13,8 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from mortarbench.harness import QP, About, Solution, Status, Vector
-from mortarbench.harness.solution import NO_SOLUTION
+from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import (
     check_positive,
     dense,

@@ -13,8 +13,15 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import block_array, csc_matrix
 
-from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
-from mortarbench.harness.solution import NO_SOLUTION
+from mortarbench.harness import (
+    NO_SOLUTION,
+    QP,
+    About,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+)
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     ConicForm,

@@ -13,8 +13,15 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import csc_matrix, tril, vstack
 
-from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
-from mortarbench.harness.solution import NO_SOLUTION
+from mortarbench.harness import (
+    NO_SOLUTION,
+    QP,
+    About,
+    Solution,
+    Status,
+    Vector,
+    needs_matrices,
+)
 from mortarbench.solvers.common.conversion import (
     check_choice,
     check_positive,

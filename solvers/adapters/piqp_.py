@@ -12,8 +12,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from mortarbench.harness import QP, About, Solution, Status, needs_matrices
-from mortarbench.harness.solution import NO_SOLUTION
+from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     check_choice,

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mortarbench.harness import (
+    NO_SOLUTION,
     QP,
     About,
     Matrix,
@@ -24,7 +25,6 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.harness.solution import NO_SOLUTION
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
