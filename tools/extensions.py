@@ -18,9 +18,6 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-#: folder of scales.h, which compiled modules of solvers include, and of scales.pxd,
-#: which they cimport
-SCALES = ROOT / "harness" / "verify"
 #: folder of sparse.pxd, which compiled modules of problems and solvers cimport
 MAPS = ROOT / "harness" / "distributed"
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: flags of all modules
@@ -73,11 +70,11 @@ def _extension(name: str, flags: list[str]) -> Extension:
         [str(source)],
         depends=[
             str(p)
-            for folder in (source.parent, SCALES, MAPS)
+            for folder in (source.parent, MAPS)
             for p in folder.iterdir()
             if p.suffix in (".h", ".pxi", ".pxd")
         ],
-        include_dirs=[str(source.parent), str(SCALES), np.get_include()],
+        include_dirs=[str(source.parent), np.get_include()],
         extra_compile_args=FLAGS + flags,
     )
 

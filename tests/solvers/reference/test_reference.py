@@ -462,6 +462,7 @@ def test_the_reference_uses_no_other_solver():
     packages, ours = (line.split() for line in run.stdout.splitlines())
     assert not FOREIGN & set(packages)
     assert ours == [
+        "mortarbench.solvers.common", "mortarbench.solvers.common.stopping",
         "mortarbench.solvers.reference", "mortarbench.solvers.reference.equilibrate",
         "mortarbench.solvers.reference.interior",
         "mortarbench.solvers.reference.polish",
