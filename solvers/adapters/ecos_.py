@@ -114,14 +114,17 @@ class ECOS:
                 ray = form.multipliers(v) if is_primal else {}
                 return Solution.without_point(qp, status, message, **ray)
             best = Solution(status=status, x=x, **form.multipliers(v))
-            largest, least = np.abs(x).max(initial=0.0), relative_residual(qp, best)
+            largest, least = (
+                np.abs(x).max(initial=0.0),
+                relative_residual(qp, best, tol),
+            )
             for relative in CORRECTION_SIZES if status is Status.SOLVED else ():
                 if least <= tol or not largest:
                     break
                 again, *refined = correct(x, relative * largest)
                 iterations += again["info"]["iter"]
                 point = replace(best, x=refined[0], **form.multipliers(refined[1]))
-                if (residual := relative_residual(qp, point)) < least:
+                if (residual := relative_residual(qp, point, tol)) < least:
                     best, x, least = point, refined[0], residual
             if status is Status.SOLVED and not least <= CLAIM_FACTOR * tol:
                 status, message = Status.FAILED, "reduced accuracy"

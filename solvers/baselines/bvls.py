@@ -37,9 +37,9 @@ class BVLS:
 
     The free components of the resulting active set are recomputed by a direct solve.
     The tolerance passed to bvls is min(tol, 1e-10). The solver claims a solution if the
-    relative KKT residual is at most tol. Fixed variables are eliminated. The objective is
-    scaled, because the stopping test of bvls is absolute. scipy reports the number of
-    iterations for bvls but not for nnls.
+    relative KKT residual is at most tol. Fixed variables are eliminated. The objective
+    is scaled, because the stopping test of bvls is absolute. scipy reports the number
+    of iterations for bvls but not for nnls.
     """
 
     max_iter: int = 10_000
@@ -135,7 +135,7 @@ def _point(
         iterations=steps,
         message="converged",
     )
-    if relative_residual(qp, point) <= tol:
+    if relative_residual(qp, point, tol) <= tol:
         return point
     message = "step limit, or no further progress in rounding"
     return replace(point, status=Status.ITERATION_LIMIT, message=message)

@@ -239,7 +239,7 @@ def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
         norms[-1] = float(np.linalg.norm(at.w))
         task.counts.setdefault("steps_to_tol", len(norms) - 1)
         point = _point(task, at, norms)
-        worst = relative_residual(qp, point)
+        worst = relative_residual(qp, point, tol)
         if worst <= tol:
             return point
         tighter *= min(0.5, max(0.1, tol / worst))

@@ -208,7 +208,7 @@ def _iterate(
     best, best_worst, stalled = problem.solution(at), np.inf, 0
     for k in range(max_iter + 1):
         solution = replace(problem.solution(at), iterations=k, message="converged")
-        worst = relative_residual(problem.qp, solution)
+        worst = relative_residual(problem.qp, solution, tol)
         if worst <= tol:
             return solution
         stalled = 0 if worst < best_worst / 2 else stalled + 1

@@ -99,7 +99,7 @@ class Problem:
             # recompute g to remove the rounding errors of its updates
             at = restarted(at, x, self.product(x) + qp.q)
             point = self._point(x, v, at.most)
-            worst = relative_residual(qp, point)
+            worst = relative_residual(qp, point, tol)
             if worst <= tol:
                 return point
             tighter *= min(0.5, tol / worst)

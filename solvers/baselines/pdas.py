@@ -204,7 +204,7 @@ def _proximal(
         active, solve = run.active, run.solve
         counts["centres"] += 1
         point = _point(problem, run, centre)
-        worst = relative_residual(qp, point)
+        worst = relative_residual(qp, point, tol)
         if worst <= tol:
             return point, Carry(active, Point(point.x, point.y, point.z))
         moves = [new - old for new, old in zip(run.at, centre, strict=True)]

@@ -2,16 +2,21 @@
 
 The test is of the kind that OSQP (Stellato et al., Math. Program. Comput. 12, 2020) and
 SCS (O'Donoghue, SIAM J. Optim. 31, 2021) use, in the variables √D x with D = diag P.
-With Xⱼ = ‖√D x‖∞/√Dⱼ, the size of variable j, a point solves a QP to `tol` if
+With the scale of forces F = max(‖Px/√D‖∞, ‖q/√D‖∞) and the sizes of the variables
+Xⱼ = max(‖√D x‖∞, tol·F)/√Dⱼ, a point solves a QP to the tolerance `tol` if
 
 * |aᵢx − bᵢ| ≤ tol·(|bᵢ| + Σ|aᵢⱼ|Xⱼ) for each equality row; likewise the violation of
   each inequality row, bound, disc and cone
-* ‖r/√D‖∞ ≤ tol·max(‖Px/√D‖∞, ‖q/√D‖∞), r = Px + q + Aᵀy + Gᵀz + z_box
-* |xᵀPx + qᵀx + bᵀy + hᵀz + σ(z_box)| ≤ tol·max(|xᵀPx|, |qᵀx|), where σ is the support
-  function of the sets, for bounds the product of bounds and multipliers
+* ‖r/√D‖∞ ≤ tol·F with r = Px + q + Aᵀy + Gᵀz + z_box
+* |xᵀPx + qᵀx + bᵀy + hᵀz + σ(z_box)| ≤ tol·max(|xᵀPx|, |qᵀx|, tol·F²), where σ is the
+  support function of the sets, for bounds the product of bounds and multipliers
 
-Multipliers with a wrong sign count as zero. `solvers.smalbe.compiled` contains the same
-test for bounds and equality rows.
+The terms tol·F and tol·F² replace an absolute tolerance: if the solution is x = 0, the
+other scales vanish, and a residual r of size tol·F√D moves x by tol·F/√D. If Px and q
+are rounding errors, F is ‖√D x‖∞. From r and from the gap, their rounding errors are
+subtracted, but at most `tol` times the scale. Multipliers with a wrong sign count as
+zero. `solvers.smalbe.compiled` contains the same test for
+bounds and equality rows.
 """
 
 from __future__ import annotations
@@ -23,9 +28,8 @@ import numpy as np
 from mortarbench.harness import QP, Solution, Vector
 from mortarbench.harness.sets.convex import admissible
 
-#: Rounding error of a sum relative to its terms, in units of the precision of x. Instead
-#: of an absolute tolerance, the rounding errors of r and of the gap are subtracted: if
-#: q = 0 and Px = 0, both scales are zero up to rounding.
+#: rounding errors of Px/√D relative to ‖√D x‖∞, and of xᵀPx relative to xᵀDx, in units
+#: of the precision of x
 ROUNDING = 8
 #: diagonal entries of P below this factor times their mean count as zero
 NO_CURVATURE = 1e-12
@@ -44,14 +48,22 @@ def curvatures(qp: QP) -> Vector:
 
 
 @np.errstate(all="ignore")  # a point of a failed solve may contain NaN, inf, or 1e300
-def relative_residual(qp: QP, s: Solution) -> float:
-    """Return the least `tol` to which a point solves a QP; takes one product with P.
+def relative_residual(qp: QP, s: Solution, tol: float) -> float:
+    """Return the largest error of a point, which solves a QP if the result is ≤ `tol`.
 
-    The result is inf or NaN if the point contains NaN or inf.
+    The call takes one product with P. The result is inf or NaN if the point contains
+    NaN or inf.
+
+    tol : the tolerance, on which the scales depend if x is nearly zero
     """
     x, y, z, z_box = s.x, s.y, np.maximum(s.z, 0), admissible(qp.sets, s.z_box)
-    Px, root, eps = qp.P @ x, np.sqrt(curvatures(qp)), np.finfo(x.dtype).eps
-    X = _sup(root * x) / root
+    Px, root, curved = qp.P @ x, np.sqrt(curvatures(qp)), np.sqrt(_diagonal(qp))
+    force, size = max(_sup(Px / root), _sup(qp.q / root)), _sup(curved * x)
+    eps = ROUNDING * np.finfo(x.dtype).eps
+    if force <= eps * size:
+        force = size
+    least = tol * force if curved.any() else 0.0
+    X = max(_sup(root * x), least) / root
     r, errors = Px + qp.q + z_box, []
     if y.size:
         r = r + qp.A.T @ y
@@ -61,15 +73,15 @@ def relative_residual(qp: QP, s: Solution) -> float:
         errors.append(_ratio(_over(qp.h - qp.G @ x), abs(qp.h) + abs(qp.G) @ X))
     for limit in (limit for one in qp.sets for limit in one.limits(x)):
         errors.append(_ratio(_over(limit.slack), limit.size + limit.sized(X)))
-    supports = [one.support(z_box) for one in qp.sets]
-    energies = np.array([x @ Px, qp.q @ x])
-    gap = energies.sum() + qp.b @ y + qp.h @ z + sum(one.value for one in supports)
-    curved = _diagonal(qp) * abs(x)
-    terms = (curved + abs(qp.q)) @ abs(x) + abs(qp.b) @ abs(y) + abs(qp.h) @ z
-    terms += sum(one.terms for one in supports)
-    force, rounding = max(_sup(Px / root), _sup(qp.q / root)), ROUNDING * eps
-    errors.append(_ratio(_sup(r / root), force, rounding * _sup(curved / root)))
-    errors.append(_ratio(gap, _sup(energies), rounding * terms))
+    energies, work = np.array([x @ Px, qp.q @ x]), qp.b @ y + qp.h @ z
+    gap = energies.sum() + work + sum(one.support(z_box).value for one in qp.sets)
+    energy, terms = max(_sup(energies), least * force), curved * x @ (curved * x)
+    for error, scale, rounding in (
+        (_sup(r / root), force, eps * size),
+        (gap, energy, eps * terms),
+    ):
+        error = np.maximum(abs(error) - np.minimum(rounding, tol * scale), 0)
+        errors.append(_ratio(error, scale))
     return float(np.max(errors))
 
 
@@ -83,10 +95,9 @@ def _over(slack: Vector) -> Vector:
     return np.maximum(-slack, 0)
 
 
-def _ratio(error: Any, size: Any, rounding: Any = 0.0) -> Any:
-    """Return the largest (|error| − rounding)⁺/size, where 0/0 = 0."""
-    error = np.maximum(abs(error) - rounding, 0)
-    return np.where(error == 0, 0, error / size).max(initial=0.0)
+def _ratio(error: Any, size: Any) -> Any:
+    """Return the largest |error|/size, where 0/0 = 0."""
+    return np.where(error == 0, 0, abs(error) / size).max(initial=0.0)
 
 
 def _sup(v: Vector) -> Any:

@@ -182,7 +182,7 @@ def interior_point(qp: QP, delta: float = DELTA) -> Solution:
         at = _start(problem)
         for k in range(MAX_ITERATIONS):
             point = replace(problem.solution(at), iterations=k)
-            worst = relative_residual(qp, point)
+            worst = relative_residual(qp, point, STOP_RESIDUAL)
             stalled = 0 if worst < least / 2 else stalled + 1
             if worst < least:
                 best, least = point, worst

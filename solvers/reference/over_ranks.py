@@ -118,7 +118,7 @@ def _check_residual(qp: QP, task: _Task, point: _Point, faces: int) -> Solution:
         iterations=faces,
         counts={"P_products": task.products},
     )
-    worst = relative_residual(qp, s)
+    worst = relative_residual(qp, s, MAX_REFERENCE_RESIDUAL)
     if not worst <= MAX_REFERENCE_RESIDUAL:
         raise ArithmeticError(
             f"the reference solve over ranks left a KKT residual of {worst:.1e}, more "

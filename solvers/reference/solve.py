@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +58,10 @@ OUTLIER_FACTOR = 1e4
 
 #: function that returns the KKT residual of a point
 Residual = Callable[[QP, Solution], float]
+_relative = partial(relative_residual, tol=MAX_REFERENCE_RESIDUAL)
 
 
-def reference_solution(qp: QP, residual: Residual = relative_residual) -> Solution:
+def reference_solution(qp: QP, residual: Residual = _relative) -> Solution:
     """Return a solution of a convex QP, usually accurate to rounding.
 
     In this case, the remaining residual is caused by the rounding of x to double

@@ -87,7 +87,13 @@ class SMALBE:
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
 
 def relative_residual(
-    qp: QP, s: Solution, Px: Vector, diagonal: Vector, G: Matrix, over: Reduction
+    qp: QP,
+    s: Solution,
+    tol: float,
+    Px: Vector,
+    diagonal: Vector,
+    G: Matrix,
+    over: Reduction,
 ) -> float: ...
 def orthonormal(
     G: Array, e: Vector

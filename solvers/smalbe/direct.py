@@ -105,7 +105,7 @@ class _Task:
     rows: DenseRows
     faces: Faces
 
-    def point(self, *, fitted: bool) -> _Point:
+    def point(self, tol: float, *, fitted: bool) -> _Point:
         """Return the current x with its multipliers and its relative KKT residual.
 
         fitted : True to fit the multipliers a to the gradient on the free components by
@@ -119,7 +119,7 @@ class _Task:
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
         s, serial = self.solution(x, y, z_box), Reduction()
-        worst = relative_residual(qp, s, Px, faces.diagonal, self.rows.G, serial)
+        worst = relative_residual(qp, s, tol, Px, faces.diagonal, self.rows.G, serial)
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
@@ -160,7 +160,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
         except ArithmeticError:
             return _not_convex(qp)
         before, error = error, faces.update()
-        point = task.point(fitted=waited > 0)
+        point = task.point(tol, fitted=waited > 0)
         gains = best is None or point.residual < best.residual / 2 or error < before / 2
         waited = 0 if gains else waited + 1
         if best is None or point.residual <= best.residual:

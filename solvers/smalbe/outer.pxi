@@ -430,7 +430,7 @@ cdef class SMALBE(MPRGP):
                 r[i] = 0.0
             gap += self.x[i] * r[i]
         terms_of_test(self.x, Hx, self.b, r, d, d + n, n, sums, most)
-        return worst_ratio(sums, most, gap)
+        return worst_ratio(sums, most, gap, self.tol)
 
     cdef bint is_accurate(self) except -1:
         """Return True if the rows are satisfied and the energy error is acceptable.

@@ -1,26 +1,33 @@
 # The stopping test of `solvers.common.stopping`, for bounds and equality rows.
 
 
-cdef double excess(double error, double terms, double size) noexcept:
-    """Return (|error| − rounding)⁺/size, where 0/0 = 0."""
-    error = fabs(error) - 8 * 2.0 ** -52 * terms
-    return 0.0 if error <= 0 else error / size
+cdef double ratio(double error, double size, double rounding=0.0) noexcept:
+    """Return (|error| − rounding)⁺/size, where 0/0 = 0; inf if it is not a number."""
+    error = fabs(error) - rounding
+    if error <= 0:
+        return 0.0
+    return error / size if error / size < INFINITY else INFINITY
 
 
-cdef double worst_ratio(const double *sums, const double *most, double gap) noexcept:
-    """Return the larger of the relative dual residual and gap; inf if one is not finite.
+cdef double worst_ratio(
+    const double *sums, double *most, double gap, double tol
+) noexcept:
+    """Return the larger of the relative errors of stationarity and of the gap.
 
-    sums, most : results of `terms_of_test`
+    sums, most : results of `terms_of_test`. On return, most[1] is the scale F of forces
+        and most[3] is the least size of scaled variables.
     """
-    cdef double dual = excess(most[0], most[2], most[1])
-    gap = excess(gap, sums[2], fmax(fabs(sums[0]), fabs(sums[1])))
-    return fmax(dual, gap) if isfinite(dual) and isfinite(gap) else INFINITY
+    cdef double rounding = 8 * 2.0 ** -52, dual, energy
+    if most[1] <= rounding * most[2]:
+        most[1] = most[2]
+    most[3] = fmax(most[3], tol * most[1])
+    energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * most[1] * most[1])
+    dual = ratio(most[0], most[1], fmin(rounding * most[2], tol * most[1]))
+    return fmax(dual, ratio(gap, energy, fmin(rounding * sums[2], tol * energy)))
 
 
-cdef int scales(
-    const double *d, double *w, Py_ssize_t n, Reduction over
-) except -1:
-    """w ← D⁻¹ᐟ² with D from `solvers.common.stopping.curvatures` and P ≠ 0."""
+cdef bint scales(const double *d, double *w, Py_ssize_t n, Reduction over) except -1:
+    """w ← D⁻¹ᐟ² with D from `solvers.common.stopping`; return True unless d = 0."""
     cdef Py_ssize_t i
     cdef double usual
     cdef double[2] total
@@ -32,13 +39,14 @@ cdef int scales(
     usual = total[0] / total[1] if total[1] > 0 else 1.0
     for i in range(n):
         w[i] = 1 / sqrt(d[i] if d[i] > 1e-12 * usual else usual)
-    return 0
+    return total[1] > 0
 
 
-def relative_residual(qp, s, Px, diagonal, G, Reduction over):
-    """Return the least `tol` to which a point within its bounds solves a QP, or inf.
+def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
+    """Return the largest error of a point within its bounds; inf if it is not finite.
 
     s : a `Solution` without multipliers of inequality rows
+    tol : see `solvers.common.stopping.relative_residual`
     diagonal : diagonal of P (n,), empty for an operator without a known diagonal
     G : the equality rows, an array or an operator
     over : processes that share vectors (n,)
@@ -48,7 +56,7 @@ def relative_residual(qp, s, Px, diagonal, G, Reduction over):
     cdef list owners = []
     cdef double[4] sums
     cdef double[4] most
-    cdef double gap, worst
+    cdef double worst
     cdef Room room = Room(3 * n + 2 * m)
     cdef double *d = room.at
     cdef double *w = d + n
@@ -67,7 +75,7 @@ def relative_residual(qp, s, Px, diagonal, G, Reduction over):
     cdef CompressedRows by_components  # Gᵀ
     if len(diagonal):
         memcpy(d, read(diagonal, owners), n * sizeof(double))
-    scales(d, w, n, over)
+    tol = tol if scales(d, w, n, over) else 0.0
     # 1. Gᵀy, Gx and Σ|Gᵢⱼ|wⱼ
     if isinstance(G, np.ndarray):
         row = read(G, owners)
@@ -90,23 +98,20 @@ def relative_residual(qp, s, Px, diagonal, G, Reduction over):
         copy_result(abs(G) @ over.vector(copied(w, n)), m, size, "Σ|Gᵢⱼ|wⱼ")
         copy_result(G.T @ s.y, n, r, "Gᵀy")
     # 2. Stationarity and the gap
-    for i in range(4):
-        sums[i] = most[i] = 0.0
+    sums[:] = [0.0, 0.0, 0.0, 0.0]
+    most[:] = [0.0, 0.0, 0.0, 0.0]
     for i in range(n):
         r[i] += Fx[i] + q[i] + z[i]
-        gap = (ub[i] if z[i] > 0 else lb[i]) * z[i] if z[i] != 0 else 0.0
-        sums[2] += fabs(gap)
-        sums[3] += gap
+        if z[i] != 0:
+            sums[3] += (ub[i] if z[i] > 0 else lb[i]) * z[i]
     terms_of_test(x, Fx, q, r, d, w, n, sums, most)
     over.add(sums, 4)
     for i in range(4):
         most[i] = -over.least(-most[i])
     for i in range(m):
-        sums[2] += fabs(e[i] * y[i])
         sums[3] += e[i] * y[i]
-    worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3])
+    worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)
     # 3. The rows
     for i in range(m):
-        gap = excess(missed[i] - e[i], 0.0, fabs(e[i]) + most[3] * size[i])
-        worst = fmax(worst, gap) if isfinite(gap) else INFINITY
+        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + most[3] * size[i]))
     return worst

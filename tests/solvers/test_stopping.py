@@ -17,6 +17,10 @@ def at(x, y=(), z=(), z_box=None):
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
+def residual(qp, s):
+    return relative_residual(qp, s, 1e-6)
+
+
 def changed(s, **vectors):
     return replace(s, **{k: np.array(v, dtype=float) for k, v in vectors.items()})
 
@@ -35,7 +39,7 @@ def block():
 
 
 def test_a_solution_has_no_residual():
-    assert relative_residual(*block()) == 0
+    assert residual(*block()) == 0
 
 
 @pytest.mark.parametrize(
@@ -51,7 +55,7 @@ def test_a_solution_has_no_residual():
 )
 def test_errors_of_multipliers_are_relative_to_forces_and_energy(vectors, expected):
     qp, s = block()
-    found = relative_residual(qp, changed(s, **vectors))
+    found = residual(qp, changed(s, **vectors))
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
@@ -74,12 +78,12 @@ def free(n, **constraints):
         # the distant limit of one row is not a scale of another
         (free(2, G=np.eye(2), h=[1e20, 1]), [1, 1.01], 0.01 / 2.01),
     ],
-    ids=["equality", "inequality", "slack", "lower", "upper", "disc", "cone", "zero row",
-         "distant row"],
+    ids=["equality", "inequality", "slack", "lower", "upper", "disc", "cone",
+         "zero row", "distant row"],
 )  # fmt: skip
 def test_a_violation_is_relative_to_its_row(qp, x, expected):
     s = at(x, 0 * qp.b, 0 * qp.h)
-    assert relative_residual(qp, s) == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    assert residual(qp, s) == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array])
@@ -96,34 +100,48 @@ def test_units_do_not_matter(store):
         G=f * G * D, h=[-f], lb=-3 / D, ub=3 / D,
     )  # fmt: skip
     same = at(s.x / D, c * s.y / e, c * s.z / f, c * s.z_box * D)
-    assert relative_residual(other, same) == pytest.approx(relative_residual(qp, s))
+    assert residual(other, same) == pytest.approx(residual(qp, s))
 
 
-def test_a_vanishing_objective_has_the_scale_of_rounding():
+def test_forces_that_vanish_are_relative_to_their_rounding_errors():
     """q = 0: the solution 0, and points of the kernel of P, computed with rounding."""
     rng = np.random.default_rng(6)
     B = rng.standard_normal((20, 8))
     x = np.linalg.svd(B.T)[2][-1]
     qp = QP.from_arrays(B @ B.T, np.zeros(20))
-    assert relative_residual(qp, at(0 * x)) == 0
+    assert residual(qp, at(0 * x)) == 0
     assert (qp.P @ x).any()
-    assert relative_residual(qp, at(x)) == 0
-    assert relative_residual(qp, at(x + 1e-9 * B[:, 0])) > 0.1
+    assert residual(qp, at(x)) <= 1e-9
+    assert residual(qp, at(x + 1e-9 * B[:, 0])) > 0.1
+
+
+@pytest.mark.parametrize(("size", "expected"), [(1e-13, 1e-7), (1e-11, 1e-5)])
+def test_a_solution_of_zero_is_reached_up_to_the_error_of_admissible_forces(
+    size, expected
+):
+    """min ½|x|² − x₁ with 2x₁ + x₂ = 0, x ≥ 0: forces of 1 to 1e-6 move x by 1e-6.
+
+    The gap of a point (size, 0) is `size`, relative to 1e-6; its row violates 2·size.
+    """
+    qp = QP.from_arrays(np.eye(2), [-1, 0], A=[[2, 1]], b=[0], lb=0)
+    assert residual(qp, at([0, 0], [0.5], z_box=[0, -0.5])) == 0
+    s = at([size, 0], [0.5], z_box=[0, -0.5])
+    assert residual(qp, s) == pytest.approx(expected, rel=1e-6)
 
 
 def test_rounding_of_a_linear_program_has_no_curvature():
     """min 1e-9 x with x ≥ 1e9: r is 10 % of q, whatever the unit of x."""
     qp = QP.from_arrays([[0]], [1e-9], lb=1e9)
-    assert relative_residual(qp, at([1e9], z_box=[-1e-9])) == 0
-    assert relative_residual(qp, at([1e9], z_box=[-0.9e-9])) == pytest.approx(0.1)
+    assert residual(qp, at([1e9], z_box=[-1e-9])) == 0
+    assert residual(qp, at([1e9], z_box=[-0.9e-9])) == pytest.approx(0.1)
 
 
 def test_an_operator_without_a_diagonal_has_one_unit_for_all_variables():
     P = np.diag([1.0, 100.0])
     qp, s = QP.from_arrays(P, [-1, -100]), at([1, 1 + 1e-4])
     operator = replace(qp, P=aslinearoperator(P))
-    assert relative_residual(operator, s) == pytest.approx(1e-2 / 100.01, rel=1e-6)
-    assert relative_residual(qp, s) == pytest.approx(1e-3 / 10.001, rel=1e-6)
+    assert residual(operator, s) == pytest.approx(1e-2 / 100.01, rel=1e-6)
+    assert residual(qp, s) == pytest.approx(1e-3 / 10.001, rel=1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -132,4 +150,4 @@ def test_a_point_that_is_not_finite_meets_no_tolerance(where, bad):
     qp, s = block()
     vector = getattr(s, where).copy()
     vector[-1] = bad
-    assert not relative_residual(qp, replace(s, **{where: vector})) <= 1e300
+    assert not residual(qp, replace(s, **{where: vector})) <= 1e300
