@@ -172,7 +172,7 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     --------
     >>> import numpy as np
     >>> from mortarbench import QP, Solution, Status
-    >>> from mortarbench.harness import kkt_residuals
+    >>> from mortarbench.harness.verify.kkt import kkt_residuals
     >>> qp = QP.from_arrays(np.eye(2), [-1, -1], lb=0)
     >>> s = Solution(
     ...     status=Status.SOLVED, x=np.array([1.0, 1.0 + 1e-6]), y=np.zeros(0),
@@ -218,8 +218,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
 
     >>> import numpy as np
     >>> from mortarbench import QP, Discs, Solution, Status
-    >>> from mortarbench.harness import kkt_residuals
-    >>> from mortarbench.harness.verify.kkt import normality
+    >>> from mortarbench.harness.verify.kkt import kkt_residuals, normality
     >>> qp = QP.from_arrays(np.eye(2), [-3, -4], sets=[Discs([[0, 1]], [1])])
     >>> c, s = np.cos(1e-4), np.sin(1e-4)
     >>> x = np.array([[c, -s], [s, c]]) @ [0.6, 0.8]

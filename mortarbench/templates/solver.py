@@ -28,9 +28,9 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    kkt_residuals,
     needs_matrices,
 )
+from mortarbench.solvers.common.stopping import relative_residual
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Solver:
         def solve() -> Solution:
             for k, point in enumerate(iterates(P, qp.q, A, qp.b, C, d)):
                 s = answer(Status.SOLVED, *point, k)
-                if kkt_residuals(qp, s).worst <= tol:
+                if relative_residual(qp, s, tol) <= tol:
                     return s
                 if k == self.max_iter:
                     break

@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, kkt_residuals, no_rows
+from mortarbench.harness import QP, no_rows
 from mortarbench.harness.conformance.manufactured import (
     SHAPES,
     infeasible,
@@ -19,6 +19,7 @@ from mortarbench.harness.conformance.manufactured import (
     unbounded,
 )
 from mortarbench.harness.names import completed
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import interior_point

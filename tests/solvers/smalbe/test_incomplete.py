@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse import csr_array, diags_array, kron
 
 import mortarbench as mb
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.smalbe.compiled import IncompleteFactor, sparsity

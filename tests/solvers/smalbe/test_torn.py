@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mortarbench import build
-from mortarbench.harness import Status, kkt_residuals
+from mortarbench.harness import Status
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import rows as rows_module
