@@ -32,9 +32,10 @@ from numpy.typing import NDArray
 
 import mortarbench as mb
 from mortarbench.case import Case
-from mortarbench.harness import QP, Verdict, kkt_residuals, verdict
+from mortarbench.harness import QP, Verdict, verdict
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import Solver
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.baselines import apgd, projected_gradient
 from mortarbench.solvers.baselines.apgd import AcceleratedGradient

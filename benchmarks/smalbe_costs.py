@@ -34,10 +34,11 @@ import numpy as np
 from scipy.linalg.blas import dsymv
 
 import mortarbench as mb
-from mortarbench.harness import QP, InputError, Solution, kkt_residuals
+from mortarbench.harness import QP, InputError, Solution
 from mortarbench.harness.errors import unknown
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

@@ -5,7 +5,7 @@ from time import process_time
 import numpy as np
 import pytest
 
-from mortarbench.harness import kkt_residuals
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

@@ -10,7 +10,8 @@ from scipy.linalg.blas import dsymv
 
 import mortarbench as mb
 from benchmarks.smalbe_costs import INCOMPLETE, SUBDOMAINS, in_turn, sparse_qp, timed
-from mortarbench.harness import Status, kkt_residuals
+from mortarbench.harness import Status
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

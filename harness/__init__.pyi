@@ -34,5 +34,4 @@ from .verify.certificate import Certificate as Certificate
 from .verify.certificate import UncertifiableError as UncertifiableError
 from .verify.certificate import certify as certify
 from .verify.kkt import Residuals as Residuals
-from .verify.kkt import kkt_residuals as kkt_residuals
 from .verify.kkt import verdict as verdict

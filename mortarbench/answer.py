@@ -529,8 +529,8 @@ def verify(
     """Verify a point by its KKT residuals, as the harness verifies answers of solvers.
 
     Multipliers that are left out minimise the residuals in a linear program over the
-    nearly active rows, bounds and sets, see `harness.verify.multipliers`. If the residuals are large
-    even with these multipliers, the point is refuted.
+    nearly active rows, bounds and sets, see `harness.verify.multipliers`. If the
+    residuals are large even with these multipliers, the point is refuted.
 
     Parameters
     ----------

@@ -18,9 +18,6 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-#: folder of scales.h, which compiled modules of solvers include, and of scales.pxd,
-#: which they cimport
-SCALES = ROOT / "harness" / "verify"
 #: folder of sparse.pxd, which compiled modules of problems and solvers cimport
 MAPS = ROOT / "harness" / "distributed"
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: flags of all modules
@@ -28,8 +25,6 @@ FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]  #: flags of all
 #: same digits on every machine.
 MODULES = {
     "mortarbench.harness.verify.products": [],
-    # residuals must have the same digits on every machine
-    "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
     # stiffness matrices and elimination orders must also be equal on every machine
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
@@ -73,11 +68,11 @@ def _extension(name: str, flags: list[str]) -> Extension:
         [str(source)],
         depends=[
             str(p)
-            for folder in (source.parent, SCALES, MAPS)
+            for folder in (source.parent, MAPS)
             for p in folder.iterdir()
             if p.suffix in (".h", ".pxi", ".pxd")
         ],
-        include_dirs=[str(source.parent), str(SCALES), np.get_include()],
+        include_dirs=[str(source.parent), np.get_include()],
         extra_compile_args=FLAGS + flags,
     )
 

@@ -21,8 +21,9 @@ from functools import cache
 from pathlib import Path
 
 from mortarbench.case import build
-from mortarbench.harness import Case, Solution, kkt_residuals
+from mortarbench.harness import Case, Solution
 from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 
 PAGE = Path(__file__).parents[1] / "docs" / "smalbe-products.md"

@@ -68,8 +68,9 @@ class Box:
             ("lower bound", self.lower, 1),
             ("upper bound", self.upper, -1),
         ):
-            finite = np.flatnonzero(np.isfinite(bound))
-            if finite.size:
+            is_finite = np.isfinite(bound)
+            if is_finite.any():  # on any rank, if the bounds are distributed
+                finite = np.flatnonzero(np.asarray(is_finite))
                 at = bound[finite]
                 slack = sign * (x[finite] - at)
                 limits.append(Limits(name, slack, np.abs(at), size[finite], finite))

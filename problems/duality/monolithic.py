@@ -14,7 +14,8 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
+from mortarbench.harness import QP, Friction, Reference, Solution, Vector
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.balance import check_friction
 from mortarbench.problems.contact.bodies import (
     Bodies,

@@ -67,9 +67,9 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    kkt_residuals,
 )
 from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD

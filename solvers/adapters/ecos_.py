@@ -13,15 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import block_array, csc_matrix
 
-from mortarbench.harness import (
-    NO_SOLUTION,
-    QP,
-    About,
-    Solution,
-    Status,
-    Vector,
-    kkt_residuals,
-)
+from mortarbench.harness import NO_SOLUTION, QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import (
     CONIC_SETS,
     ConicForm,
@@ -31,6 +23,7 @@ from mortarbench.solvers.common.conversion import (
     needs_dense,
     to_cone,
 )
+from mortarbench.solvers.common.stopping import relative_residual
 
 CLAIMS = {
     0: Status.SOLVED,
@@ -121,14 +114,17 @@ class ECOS:
                 ray = form.multipliers(v) if is_primal else {}
                 return Solution.without_point(qp, status, message, **ray)
             best = Solution(status=status, x=x, **form.multipliers(v))
-            largest, least = np.abs(x).max(initial=0.0), kkt_residuals(qp, best).worst
+            largest, least = (
+                np.abs(x).max(initial=0.0),
+                relative_residual(qp, best, tol),
+            )
             for relative in CORRECTION_SIZES if status is Status.SOLVED else ():
                 if least <= tol or not largest:
                     break
                 again, *refined = correct(x, relative * largest)
                 iterations += again["info"]["iter"]
                 point = replace(best, x=refined[0], **form.multipliers(refined[1]))
-                if (residual := kkt_residuals(qp, point).worst) < least:
+                if (residual := relative_residual(qp, point, tol)) < least:
                     best, x, least = point, refined[0], residual
             if status is Status.SOLVED and not least <= CLAIM_FACTOR * tol:
                 status, message = Status.FAILED, "reduced accuracy"

@@ -13,6 +13,7 @@ from scipy.sparse import diags_array
 from mortarbench.harness import QP, Matrix, Vector
 from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
+from mortarbench.solvers.common.stopping import curvatures
 
 #: δᵢ/Dᵢ: weight δᵢ of the proximal term of xᵢ, relative to the curvature Dᵢ = Pᵢᵢ; a
 #: typical curvature replaces a negligible Pᵢᵢ, see `penalise`
@@ -102,16 +103,6 @@ def penalise(
         counts["factorisations"] += 1
     faces = factorise(M, G, sigma, unbounded)
     return Problem(qp, A, G, D, rho, sigma, factorise, faces, counts)
-
-
-def curvatures(qp: QP) -> Vector:
-    """Return diag P (n,), with a typical curvature in place of negligible entries.
-
-    The typical curvature is the mean of the positive entries, else ‖q‖∞, else 1.
-    """
-    D = np.array(qp.P.diagonal())
-    usual = D[D > 0].mean() if (D > 0).any() else np.abs(qp.q).max(initial=0.0) or 1.0
-    return np.where(D > 1e-12 * usual, D, usual)
 
 
 def row_norms(M: Matrix, D: Vector) -> Vector:

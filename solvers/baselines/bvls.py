@@ -23,14 +23,12 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    kkt_residuals,
     needs_matrices,
 )
 from mortarbench.solvers.common.conversion import check_positive, dense
+from mortarbench.solvers.common.stopping import relative_residual
 
 MAX_COMPONENTS = 5_000  #: largest accepted n, because P is converted to a dense matrix
-#: largest KKT residual of a point that is claimed as a solution, relative to tol
-CLAIM_FACTOR = 5.0
 
 
 @dataclass(frozen=True)
@@ -38,10 +36,10 @@ class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") for other bounds.
 
     The free components of the resulting active set are recomputed by a direct solve.
-    The tolerance passed to bvls is min(tol, 1e-10). The solver claims a solution if all
-    KKT residuals are at most 5·tol. Fixed variables are eliminated. The objective is
-    scaled, because the stopping test of bvls is absolute. scipy reports the number of
-    iterations for bvls but not for nnls.
+    The tolerance passed to bvls is min(tol, 1e-10). The solver claims a solution if the
+    relative KKT residual is at most tol. Fixed variables are eliminated. The objective
+    is scaled, because the stopping test of bvls is absolute. scipy reports the number
+    of iterations for bvls but not for nnls.
     """
 
     max_iter: int = 10_000
@@ -137,7 +135,7 @@ def _point(
         iterations=steps,
         message="converged",
     )
-    if kkt_residuals(qp, point).worst <= CLAIM_FACTOR * tol:
+    if relative_residual(qp, point, tol) <= tol:
         return point
     message = "step limit, or no further progress in rounding"
     return replace(point, status=Status.ITERATION_LIMIT, message=message)

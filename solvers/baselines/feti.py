@@ -35,7 +35,6 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    kkt_residuals,
     too_large,
 )
 from mortarbench.harness.operators import Preconditioned, Product, SerialisableOperator
@@ -44,12 +43,11 @@ from mortarbench.solvers.common.conversion import (
     check_positive,
     has_bound,
 )
+from mortarbench.solvers.common.stopping import relative_residual
 
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
-#: largest KKT residual of a point that is claimed as a solution, relative to tol
-CLAIM_FACTOR = 5.0
 #: the solve fails if its reduced tolerance falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
 #: the solve fails after this number of consecutive steps if none of them halved the
@@ -69,10 +67,10 @@ class FETI:
     """In-house FETI: projected preconditioned CG that stores all directions.
 
     The iteration stops when the gradient Px + q, projected onto the kernel of the
-    equality rows, is at most tol times its initial value. If a KKT residual exceeds
-    5·tol at this point, the iteration continues with a smaller bound. The solver claims
-    a solution only if all KKT residuals are at most 5·tol. It reports the number of CG
-    steps as iterations, and counts all products with the Hessian P.
+    equality rows, is at most tol times its initial value. If the relative KKT residual
+    exceeds tol at this point, the iteration continues with a smaller bound. The solver
+    claims a solution only if the relative KKT residual is at most tol. It reports the
+    number of CG steps as iterations, and counts all products with the Hessian P.
     """
 
     #: preconditioner M; "auto" selects "dirichlet" if P provides it, otherwise "none"
@@ -230,7 +228,7 @@ class _Directions:
 
 
 def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
-    """Reduce the bound on ‖w‖ until all KKT residuals are at most 5·tol."""
+    """Reduce the bound on ‖w‖ until the relative KKT residual is at most tol."""
     qp, tighter = task.qp, 1.0
     at = _state(task, task.coarse.feasible(qp.b))
     directions = _Directions(np.empty((16, qp.q.size)), np.empty((16, qp.q.size)))
@@ -241,10 +239,10 @@ def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
         norms[-1] = float(np.linalg.norm(at.w))
         task.counts.setdefault("steps_to_tol", len(norms) - 1)
         point = _point(task, at, norms)
-        worst = kkt_residuals(qp, point).worst
-        if worst <= CLAIM_FACTOR * tol:
+        worst = relative_residual(qp, point, tol)
+        if worst <= tol:
             return point
-        tighter *= min(0.5, max(0.1, CLAIM_FACTOR * tol / worst))
+        tighter *= min(0.5, max(0.1, tol / worst))
         if reason or tighter < MIN_TOL_FACTOR or not np.isfinite(worst):
             return replace(
                 point, status=Status.ITERATION_LIMIT, message=reason or STAGNATED
@@ -307,7 +305,7 @@ def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
 
 def _point(task: _Task, at: _State, norms: list[float]) -> Solution:
     n, m = task.qp.q.size, len(norms)
-    # the evaluation of KKT residuals by the caller takes one product
+    # the evaluation of the KKT residual by the caller takes one product
     task.counts["P_products"] += 1
     return Solution(
         status=Status.SOLVED,

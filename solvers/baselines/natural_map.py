@@ -15,10 +15,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
+from mortarbench.harness import QP, Solution, Status, Vector
+from mortarbench.solvers.common.stopping import relative_residual
 
-#: largest KKT residual of a point that is claimed as a solution, relative to tol
-CLAIM_FACTOR = 5.0
 #: the solve fails if its reduced tolerance falls below this factor times tol
 MIN_TOL_FACTOR = 1e-4
 
@@ -73,12 +72,12 @@ class Problem:
         tol: float,
         max_iter: int,
     ) -> Solution:
-        """Take steps until all KKT residuals are at most 5·tol; return the solution.
+        """Take steps until the relative KKT residual is at most tol.
 
-        The residuals are evaluated when the norm of the natural map is at most tol·‖q‖;
-        if q = 0, ‖q‖ is replaced by the initial ‖g‖. If the residuals are too large,
-        the loop continues with a smaller bound. The status is SOLVED only if all
-        residuals are at most 5·tol.
+        The residual is evaluated when the norm of the natural map is at most tol·‖q‖;
+        if q = 0, ‖q‖ is replaced by the initial ‖g‖. If the residual is too large, the
+        loop continues with a smaller bound. The status is SOLVED only if the residual
+        is at most tol.
 
         step : iterate ↦ the next iterate, or a solution that ends the loop
         restarted : iterate, x and the gradient at x ↦ an iterate at x
@@ -100,16 +99,16 @@ class Problem:
             # recompute g to remove the rounding errors of its updates
             at = restarted(at, x, self.product(x) + qp.q)
             point = self._point(x, v, at.most)
-            worst = kkt_residuals(qp, point).worst
-            if worst <= CLAIM_FACTOR * tol:
+            worst = relative_residual(qp, point, tol)
+            if worst <= tol:
                 return point
-            tighter *= min(0.5, CLAIM_FACTOR * tol / worst)
+            tighter *= min(0.5, tol / worst)
             if tighter < MIN_TOL_FACTOR:
                 return _unsolved(point, "no further progress because of rounding")
 
     def _point(self, x: Vector, v: Vector, most: float) -> Solution:
         """Return x with the multipliers L(v − Π(v)), where L = `most`."""
-        # the evaluation of KKT residuals by the caller takes one product
+        # the evaluation of the KKT residual by the caller takes one product
         self.counts["P_products"] += 1
         return Solution(
             status=Status.SOLVED,

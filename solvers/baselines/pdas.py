@@ -44,7 +44,6 @@ from mortarbench.harness import (
     About,
     Solution,
     Status,
-    kkt_residuals,
     needs_matrices,
 )
 from mortarbench.solvers.baselines.active_set import (
@@ -63,6 +62,7 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
     proves_unbounded,
 )
 from mortarbench.solvers.common.conversion import check_positive
+from mortarbench.solvers.common.stopping import relative_residual
 
 #: Factor by which ρ increases after every two consecutive changes of the centre,
 #: neither of which halved the smallest residual so far. With these increases, all of
@@ -73,8 +73,6 @@ MAX_KAPPA = 1e10  #: ρ is increased only while ρ·aD⁻¹aᵀ is below this va
 #: which halved the smallest residual so far
 PATIENCE = 10
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
-#: largest KKT residual of a point that is claimed as a solution, relative to tol
-CLAIM_FACTOR = 5.0
 
 
 class Carry(NamedTuple):
@@ -88,9 +86,8 @@ class Carry(NamedTuple):
 class PDAS:
     """In-house primal-dual active set method with Cholesky factors of the faces.
 
-    The iteration stops when the KKT residuals of the QP are at most tol. If rounding
-    prevents further progress, the solver also claims a point with residuals of at most
-    5·tol. The solver reports the number of linear solves as iterations. It counts
+    The iteration stops when the relative KKT residual of the QP is at most tol. The
+    solver reports the number of linear solves as iterations. It counts
     factorisations (one per face, plus one if the block of variables without bounds is
     eliminated in advance), constraints that entered or left the active set, steps that
     exchanged a single constraint, proximal centres, and products with P.
@@ -197,7 +194,7 @@ def _start(qp: QP, carry: Carry | None) -> Carry:
 def _proximal(
     problem: Problem, tol: float, start: Carry, max_iter: int
 ) -> tuple[Solution, Carry | None]:
-    """Update the proximal centre until the KKT residuals are small."""
+    """Update the proximal centre until the relative KKT residual is at most tol."""
     qp, counts = problem.qp, problem.counts
     active, centre, solve = start.active, start.centre, None
     slack, best, stalled, kappa = 0.01 * tol, np.inf, 0, KAPPA
@@ -206,9 +203,9 @@ def _proximal(
         active, solve = run.active, run.solve
         counts["centres"] += 1
         point = _point(problem, run, centre)
-        worst = kkt_residuals(qp, point).worst
+        worst = relative_residual(qp, point, tol)
         if worst <= tol:
-            break
+            return point, Carry(active, Point(point.x, point.y, point.z))
         moves = [new - old for new, old in zip(run.at, centre, strict=True)]
         if run.settled and proves_infeasible(qp, moves[1], moves[2]):
             message = "no point satisfies all constraints"
@@ -223,8 +220,6 @@ def _proximal(
             kappa, solve = RHO_GROWTH * kappa, None
             problem = penalise(qp, counts, problem.factorise, kappa)
         centre, best, slack = run.at, min(best, worst), slack / 10
-    if worst <= CLAIM_FACTOR * tol:
-        return point, Carry(active, Point(point.x, point.y, point.z))
     rounding = "no further progress because of rounding"
     message = rounding if run.settled else "step limit"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
@@ -239,7 +234,7 @@ def _point(problem: Problem, run: Run, centre: Point) -> Solution:
     z_box = np.where(run.active.side > 0, np.maximum(force, 0), z_box)
     fixed = problem.qp.lb == problem.qp.ub
     z_box = np.where(fixed, force, z_box)
-    counts["P_products"] += 1  # for the evaluation of KKT residuals by the caller
+    counts["P_products"] += 1  # for the evaluation of the KKT residual by the caller
     other_counts = {k: v for k, v in counts.items() if k != "solves"}
     return Solution(
         status=Status.SOLVED,

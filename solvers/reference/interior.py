@@ -41,10 +41,10 @@ from mortarbench.harness import (
     Solution,
     Status,
     Vector,
-    kkt_residuals,
 )
 from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.sets.convex import hull
+from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: δ, chosen for a QP whose largest entries are about one
@@ -182,7 +182,7 @@ def interior_point(qp: QP, delta: float = DELTA) -> Solution:
         at = _start(problem)
         for k in range(MAX_ITERATIONS):
             point = replace(problem.solution(at), iterations=k)
-            worst = kkt_residuals(qp, point).worst
+            worst = relative_residual(qp, point, STOP_RESIDUAL)
             stalled = 0 if worst < least / 2 else stalled + 1
             if worst < least:
                 best, least = point, worst

@@ -9,7 +9,8 @@ solve with one step of iterative refinement.
 Every other QP is scaled (`equilibrate`) and solved by an interior-point method until
 the active constraints can be identified (`interior`). The equations of the active set
 are then solved with refinement in extended precision (`polish`). The result is the
-point for which the harness measures the smallest KKT residual of the original QP.
+point with the smallest KKT residual of the original QP. The residual is an argument,
+so that the harness can choose among the points by its own rule.
 
 If the sets are bounds and discs, a method that uses projections (`projection`) refines
 the point of the interior-point method. QPs with other sets are solved by the projection
@@ -18,26 +19,19 @@ method alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from mortarbench.harness import QP, Discs, Solution, Status, kkt_residuals
+from mortarbench.harness import QP, Discs, Solution, Status
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.sets.blocks import Blocks
-
-MAX_RESIDUAL = 1e-14
-
-
-def is_small(qp: QP) -> bool:
-    """Return True if the assembly of an operator P is cheap."""
-    return bool(qp.q.size + qp.b.size + qp.h.size <= 400)
-
-
+from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import DELTA, interior_point
 from mortarbench.solvers.reference.polish import polish
@@ -48,6 +42,8 @@ from mortarbench.solvers.reference.projection import projection_iterates, refine
 #: refinement of a QP with many solutions ended at a solution of size 1e10, whose
 #: rounding errors hid errors of the optimal value.
 MAX_START_RESIDUAL = 1e-3
+#: KKT residual of a point, apart from rounding, that needs no further refinement
+MAX_RESIDUAL = 1e-14
 #: largest number of further rounds of `projection` that do not reduce a residual
 #: between MAX_RESIDUAL and MAX_REFERENCE_RESIDUAL; the residual is then accepted
 MAX_IDLE_ROUNDS = 1
@@ -55,11 +51,17 @@ MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 #: δ of the interior-point method if there are discs and P is singular; with a smaller
 #: δ, steps along the kernel of P leave the discs so far that the linearisation fails
 SINGULAR_DELTA = 1e-7
+#: largest number of variables and rows of a QP whose operator P is assembled
+MAX_ASSEMBLED = 800
 #: data of a scaled QP count as outliers above this factor times their median
 OUTLIER_FACTOR = 1e4
 
+#: function that returns the KKT residual of a point
+Residual = Callable[[QP, Solution], float]
+_relative = partial(relative_residual, tol=MAX_REFERENCE_RESIDUAL)
 
-def reference_solution(qp: QP) -> Solution:
+
+def reference_solution(qp: QP, residual: Residual = _relative) -> Solution:
     """Return a solution of a convex QP, usually accurate to rounding.
 
     In this case, the remaining residual is caused by the rounding of x to double
@@ -67,6 +69,9 @@ def reference_solution(qp: QP) -> Solution:
     the displacements of stiff bodies. The field `iterations` contains the number of
     interior-point steps, if that method ran. The function does not check that P is
     positive semidefinite.
+
+    residual : KKT residual by which the best point is chosen; it is called with vectors
+        in extended precision
 
     Raises
     ------
@@ -85,7 +90,7 @@ def reference_solution(qp: QP) -> Solution:
     [1.0, 0.0]
 
     """
-    if not qp.is_explicit and is_small(qp):
+    if not qp.is_explicit and qp.q.size + qp.b.size + qp.h.size <= MAX_ASSEMBLED:
         qp = replace(qp, P=assembled(qp.P))
     if not qp.is_explicit:
         raise ValueError("the reference solve needs P as a matrix; got an operator")
@@ -93,7 +98,7 @@ def reference_solution(qp: QP) -> Solution:
         raise ValueError("the reference solve needs finite matrices; got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
     attempts: tuple[Iterator[Solution], ...] = (
-        _candidates(qp),
+        _candidates(qp, residual),
         _candidates_without_outliers(qp),
         _less_regularised_candidates(qp),
     )
@@ -102,18 +107,16 @@ def reference_solution(qp: QP) -> Solution:
         shifts = (DELTA, SINGULAR_DELTA) if smooth else ()
         attempts = (
             *(_smooth_candidates(qp, delta) for delta in shifts),
-            _projection_candidates(qp),
+            _projection_candidates(qp, residual),
         )
     for candidates in attempts:
         residuals = list[float]()
         for point in candidates:
-            residuals.append(worst := _residual(qp, point))
+            residuals.append(worst := _extended(residual, qp, point))
             if worst <= least:
                 best, least = point, worst
         is_near = residuals[0] <= MAX_START_RESIDUAL
-        if is_near and least <= (
-            MAX_RESIDUAL if is_small(qp) else MAX_REFERENCE_RESIDUAL
-        ):
+        if is_near and least <= MAX_REFERENCE_RESIDUAL:
             return best
     if least <= MAX_REFERENCE_RESIDUAL:
         return best
@@ -123,19 +126,19 @@ def reference_solution(qp: QP) -> Solution:
     )
 
 
-def _residual(qp: QP, s: Solution) -> float:
-    """Return the largest KKT residual, evaluated in extended precision."""
+def _extended(residual: Residual, qp: QP, s: Solution) -> float:
+    """Return the KKT residual, evaluated in extended precision."""
     vectors = {k: getattr(s, k).astype(np.longdouble) for k in ("x", "y", "z", "z_box")}
-    return kkt_residuals(qp, replace(s, **vectors)).worst
+    return residual(qp, replace(s, **vectors))
 
 
-def _candidates(qp: QP) -> Iterator[Solution]:
+def _candidates(qp: QP, residual: Residual) -> Iterator[Solution]:
     """Yield points with usually decreasing errors."""
     if _is_nonnegative(qp):
         # LinAlgError if P is singular; RuntimeError if nnls reached its step limit
         with suppress(np.linalg.LinAlgError, RuntimeError):
             yield (point := _nonnegative(qp))
-            if _residual(qp, point) <= MAX_RESIDUAL:
+            if _extended(residual, qp, point) <= MAX_RESIDUAL:
                 return
     scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
@@ -151,7 +154,7 @@ def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
     yield scaled.recover(refine(scaled.qp, start))
 
 
-def _projection_candidates(qp: QP) -> Iterator[Solution]:
+def _projection_candidates(qp: QP, residual: Residual) -> Iterator[Solution]:
     """Yield points of a QP over arbitrary sets until the residual is small.
 
     The QP is scaled if its sets consist of blocks: with a single penalty for all
@@ -163,7 +166,7 @@ def _projection_candidates(qp: QP) -> Iterator[Solution]:
     residuals = list[float]()
     for iterate in projection_iterates(scaled.qp if scaled else qp):
         yield (point := scaled.recover(iterate) if scaled else iterate)
-        residuals.append(_residual(qp, point))
+        residuals.append(_extended(residual, qp, point))
         best = int(np.argmin(residuals))
         is_settled = best < len(residuals) - MAX_IDLE_ROUNDS
         if residuals[best] <= (MAX_REFERENCE_RESIDUAL if is_settled else MAX_RESIDUAL):

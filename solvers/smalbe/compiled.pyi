@@ -49,16 +49,6 @@ class IncompleteFactor:
     ) -> None: ...
     def solve(self, free: NDArray[np.bool_], v: Vector) -> Vector: ...
 
-class Judge:
-    def __init__(
-        self,
-        qp: QP,
-        scaled: QP,
-        root: Vector | None,
-        diagonal: Vector,
-        norm: float,
-    ) -> None: ...
-
 class SMALBE:
     def __init__(
         self,
@@ -96,8 +86,14 @@ class SMALBE:
         self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
 
-def residual_bound(
-    qp: QP, s: Solution, Px: Vector, diagonal: Vector, G: Matrix, over: Reduction
+def relative_residual(
+    qp: QP,
+    s: Solution,
+    tol: float,
+    Px: Vector,
+    diagonal: Vector,
+    G: Matrix,
+    over: Reduction,
 ) -> float: ...
 def orthonormal(
     G: Array, e: Vector

@@ -13,11 +13,10 @@ ranks share, and all other operators and preconditioners call Python functions.
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free block of a sparse P
-* judge.pxi: an upper bound on the KKT residuals for QPs with bounds only
+* stopping.pxi: the relative KKT residuals of the stopping test
 * mprgp.pxi: the inner loop
 * release.pxi: proportioning in the inner loop with an incomplete factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
-* residuals.pxi: an upper bound on the KKT residuals of any QP that SMALBE solves
 
 tests/support/textbook contains the same algorithm in NumPy. Tests check that both
 versions take equal numbers of steps and reach the same points up to rounding.
@@ -47,7 +46,6 @@ from scipy.linalg.cython_lapack cimport (
 from mortarbench.harness.distributed.sparse cimport (
     BorderedFactor, CompressedRows, LinearMap,
 )
-from mortarbench.harness.verify cimport scales
 
 from sys import getrefcount
 
@@ -153,20 +151,9 @@ cdef extern from "vectors.h" nogil:
     void bound_multipliers(const double *nu, const double *lower, const double *upper,
                  const double *g, double *z, Py_ssize_t n)
     void masked(const double *free, const double *a, double *t, Py_ssize_t n)
-    double terms_of_energy(const double *q, const double *diagonal, const double *x,
-                           const double *z, const double *Fx, const double *lb,
-                           const double *ub, const double *forces, double *size,
-                           Py_ssize_t n, double *sums, double *most)
-    double worst_of_forces(double energy, double largest, const double *q,
-                           const double *diagonal, const double *x, const double *Fx,
-                           const double *lb, const double *ub, const double *size,
-                           double *forces, Py_ssize_t n, double worst)
-    void sizes_of_variables(double energy, const double *q, const double *diagonal,
-                            const double *x, const double *Fx, double *size,
-                            double *own, Py_ssize_t n)
-    void terms_of_rows(const double *rows, const double *e, const double *x,
-                       const double *own_size, const double *size, Py_ssize_t m,
-                       Py_ssize_t n, double *missed, double *own, double *known)
+    void terms_of_test(const double *x, const double *Px, const double *q,
+                       const double *r, const double *d, const double *w,
+                       Py_ssize_t n, double *sums, double *most)
 
 cdef extern from "incomplete.h" nogil:
     int RUN
@@ -235,8 +222,7 @@ include "preparation.pxi"
 include "feasible_set.pxi"
 include "model.pxi"
 include "incomplete.pxi"
-include "judge.pxi"
+include "stopping.pxi"
 include "mprgp.pxi"
 include "release.pxi"
 include "outer.pxi"
-include "residuals.pxi"

@@ -17,11 +17,11 @@ cdef double ENERGY_BUDGET = 1.25
 # to τ = 0, so that no step is possible (`test_earlier_failures_do_not_recur`).
 cdef double MIN_TAIL = 1e-4
 # Values of ‖g^P‖ in units of tol‖b‖. The KKT residual is first evaluated below
-# FIRST_JUDGED. Below MOST_JUDGED, the inner run ends even if the KKT residual exceeds
+# FIRST_TESTED. Below LEAST_TESTED, the inner run ends even if the KKT residual exceeds
 # the tolerance. At a KKT residual of 1e-6, ‖g^P‖/‖b‖ is 1e-4 for strings and 1e-5 for
 # journal bearings.
-cdef double FIRST_JUDGED = 1e3
-cdef double MOST_JUDGED = 1e-2
+cdef double FIRST_TESTED = 1e3
+cdef double LEAST_TESTED = 1e-2
 # Number of pairs of projections in `onto_rows`. At the tolerance 1e-8, the contact
 # force of a sphere on a plane differs from the load by 3e-9 without projections and by
 # 2e-10 with four pairs. Each pair takes two products with C.
@@ -57,8 +57,9 @@ cdef class SMALBE(MPRGP):
     cdef Model cached_model
     cdef double cached_rho
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
-    cdef Judge judge  # stopping test by KKT residuals; None for the test of ‖g^P‖
-    cdef double next_judged  # ‖g^P‖ at or below which `judge` is evaluated next
+    # (4n,) workspace of the test of KKT residuals; None for the test of ‖g^P‖
+    cdef Room tested
+    cdef double next_tested  # ‖g^P‖ at or below which KKT residuals are evaluated next
     # number of products up to which the energy error is reduced
     cdef long most_products
 
@@ -95,7 +96,12 @@ cdef class SMALBE(MPRGP):
         self.plain = self.expansion != MODEL
         self.spectral_length = 0.0
         self.preconditioned = preconditioned
-        self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
+        self.factor, self.tail = problem.factor, 1.0
+        if problem.tests_residuals:
+            self.tested = Room(4 * self.n)
+            memcpy(self.tested.at, self.diagonal, self.n * sizeof(double))
+            scale(self.inverse_norm, self.tested.at, self.n)
+            scales(self.tested.at, self.tested.at + self.n, self.n, self.over)
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
         if problem.discs and M is None:  # CG then takes few steps on a face
             kept = 0
@@ -311,7 +317,7 @@ cdef class SMALBE(MPRGP):
             self.b_size = sqrt(self.over.total(dot(self.g, self.g, n)))
         self.small_gradient = tol * self.b_size
         self.coarse_gradient = options.eta * self.b_size
-        self.next_judged = FIRST_JUDGED * self.small_gradient
+        self.next_tested = FIRST_TESTED * self.small_gradient
         done, errors = [], [o.infeasibility for o in at.outer[-2:]]
         for o in at.outer:
             left -= len(o.trace) + 1
@@ -328,7 +334,7 @@ cdef class SMALBE(MPRGP):
             stopped = self.minimise(max(left, 0), trace, note)
             left -= len(trace) + 1
             solved = sqrt(self.parts.phi_square + self.parts.beta_square) <= self.small_gradient
-            solved = stopped if self.judge is not None else solved and self.is_accurate()
+            solved = stopped if self.tested is not None else solved and self.is_accurate()
             # 2. The Lagrangian, and the precision of the inner problems.
             self.rows.times(self.x, self.Cv)
             error = self.rows.size(self.Cv)
@@ -377,31 +383,54 @@ cdef class SMALBE(MPRGP):
     cdef bint stops(self) except -1:
         """Return True if the inner run may end."""
         cdef double size = sqrt(self.parts.phi_square + self.parts.beta_square)
-        if self.judge is not None:
-            return self.is_judged_solved(size)
+        if self.tested is not None:
+            return self.is_tested_solved(size)
         if self.rows.exist and size < self.coarse_gradient:
             if size < self.M_now * self.violation():
                 return True
         return size <= self.small_gradient and self.is_accurate()
 
-    cdef bint is_judged_solved(self, double size) except -1:
-        """Return True if the KKT residual of the original problem is within tol.
+    cdef bint is_tested_solved(self, double size) except -1:
+        """Return True if the relative KKT residual is within tol.
 
         The evaluation costs as much as several steps. It is therefore repeated only
         when ‖g^P‖ (the argument `size`) has decreased enough, on the assumption that
-        the residual is proportional to ‖g^P‖. If the residual has no scale (at x = 0),
-        ‖g^P‖ is tested instead.
+        the residual is proportional to ‖g^P‖.
         """
         cdef double residual
-        if size > self.next_judged:
+        if size > self.next_tested:
             return False
-        residual = self.judge.residual(self.x, self.g)
-        if residual <= self.tol or size <= MOST_JUDGED * self.small_gradient:
+        residual = self.residual()
+        if residual <= self.tol or size <= LEAST_TESTED * self.small_gradient:
             return self.is_accurate()
-        if isinf(residual):
-            return size <= self.small_gradient and self.is_accurate()
-        self.next_judged = size * fmin(fmax(2 * self.tol / residual, 0.03), 0.9)
+        self.next_tested = size * fmin(fmax(2 * self.tol / residual, 0.03), 0.9)
         return False
+
+    cdef double residual(self) noexcept:
+        """Return the relative KKT residual of a problem with bounds only (stopping.pxi).
+
+        Since multipliers of bounds remove the other components of the gradient, r = g^P
+        and the gap is xᵀg^P.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef double *d = self.tested.at
+        cdef double *r = d + 2 * n
+        cdef double *Hx = r + n
+        cdef double[3] sums
+        cdef double[4] most
+        cdef double gap = 0.0
+        sums[:] = [0.0, 0.0, 0.0]
+        most[:] = [0.0, 0.0, 0.0, 0.0]
+        for i in range(n):
+            Hx[i] = self.g[i] + self.b[i]
+            r[i] = self.g[i]
+            if self.x[i] <= self.set.lower[i] and r[i] > 0:
+                r[i] = 0.0
+            if self.x[i] >= self.set.upper[i] and r[i] < 0:
+                r[i] = 0.0
+            gap += self.x[i] * r[i]
+        terms_of_test(self.x, Hx, self.b, r, d, d + n, n, sums, most)
+        return worst_ratio(sums, most, gap, self.tol)
 
     cdef bint is_accurate(self) except -1:
         """Return True if the rows are satisfied and the energy error is acceptable.

@@ -9,8 +9,6 @@
 #include <math.h>
 #include <string.h>
 
-#include "scales.h"
-
 #if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__) && __GNUC__ >= 12
 #define TWICE __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
@@ -990,13 +988,6 @@ TWICE static int negate(out s, Py_ssize_t n)
 
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 #define SMALLER(a, b) ((a) < (b) ? (a) : (b))
-#define MOST(a, b) CHOSEN((a) > (b), a, b) /* b if a is NaN */
-
-INLINE double largest_of(four t)
-{
-    double a = LARGER(t[0], t[1]), b = LARGER(t[2], t[3]);
-    return LARGER(a, b);
-}
 
 /* x = shift + ν, clipped to [lb, ub]. If a component of ν is at its bound, x is set
    to lb or ub, because the sum may differ from the bound in the last bit. `free` is
@@ -1045,122 +1036,27 @@ TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, d
     return total;
 }
 
-/* Compute terms of the energy of a point, with forces = Gᵀy + z: sums = xᵀFx, qᵀx,
-   work of the bounds; most = largest |z (x - bound)|, largest component of size;
-   size (n,) = max(|Fx|, |q|, |forces|) by components. Return the smallest positive
-   diagonal entry, or inf without a positive entry, or -1 if x violates a bound. */
-TWICE static double
-terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, out size,
-                Py_ssize_t n, out sums, out most)
-{
-    four zero = EACH(0), xFx4 = zero, qx4 = zero, work4 = zero, slack4 = zero;
-    four largest4 = zero, least4 = EACH(INFINITY);
-    mask beyond = (mask) zero;
-    Py_ssize_t whole = n & ~(Py_ssize_t) 3, outside;
-    for (Py_ssize_t i = 0; i < whole; i += 4) {
-        four at = FOUR(x + i), push = FOUR(z + i), low = FOUR(lb + i), up = FOUR(ub + i);
-        four product = FOUR(Fx + i), cost = FOUR(q + i), d = FOUR(diagonal + i);
-        four step = (four) ((mask) CHOSEN(push > zero, up, low) & (push != zero));
-        four gap = ABSOLUTE(push * (at - step)), most_here = ABSOLUTE(product);
-        beyond |= ~(low <= at) | ~(at <= up);
-        xFx4 += at * product;
-        qx4 += cost * at;
-        work4 += step * push;
-        slack4 = MOST(gap, slack4);
-        least4 = CHOSEN((d > zero) & (d < least4), d, least4);
-        most_here = MOST(ABSOLUTE(cost), most_here);
-        most_here = MOST(ABSOLUTE(FOUR(forces + i)), most_here);
-        largest4 = MOST(most_here, largest4);
-        *(four *) (size + i) = most_here;
-    }
-    double xFx = total(xFx4), qx = total(qx4), work = total(work4);
-    double slack = largest_of(slack4), largest = largest_of(largest4);
-    double least = -largest_of(-least4);
-    outside = (beyond[0] | beyond[1] | beyond[2] | beyond[3]) != 0;
-    for (Py_ssize_t i = whole; i < n; i++) {
-        double step = z[i] > 0 ? ub[i] : lb[i], size_of_all;
-        step = z[i] != 0 ? step : 0;
-        outside |= !(lb[i] <= x[i]) | !(x[i] <= ub[i]);
-        xFx += x[i] * Fx[i];
-        qx += q[i] * x[i];
-        work += step * z[i];
-        slack = LARGER(slack, fabs(z[i] * (x[i] - step)));
-        least = diagonal[i] > 0 && diagonal[i] < least ? diagonal[i] : least;
-        size_of_all = LARGER(fabs(Fx[i]), fabs(q[i]));
-        size_of_all = LARGER(size_of_all, fabs(forces[i]));
-        largest = LARGER(largest, size_of_all);
-        size[i] = size_of_all;
-    }
-    sums[0] = xFx;
-    sums[1] = qx;
-    sums[2] = work;
-    most[0] = slack;
-    most[1] = largest;
-    return outside ? -1 : least;
-}
-
-/* Return the largest error of stationarity or `worst`, whichever is larger, or inf
-   if a residual is not finite; forces receive the residual Fx + q + forces. */
-TWICE static double
-worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, in lb,
-                in ub, in size, out forces, Py_ssize_t n, double worst)
-{
-    four sum = EACH(0), most = EACH(0);
-    Py_ssize_t whole = n & ~(Py_ssize_t) 3;
-    for (Py_ssize_t i = 0; i < whole; i += 4) {
-        four r = FOUR(forces + i) + (FOUR(Fx + i) + FOUR(q + i));
-        *(four *) (forces + i) = r;
-        sum += ABSOLUTE(r);
-        most = MOST(ABSOLUTE(r), most);
-    }
-    double all = total(sum), at_most = largest_of(most);
-    for (Py_ssize_t i = whole; i < n; i++) {
-        double r = fabs(forces[i] += Fx[i] + q[i]);
-        all += r;
-        at_most = LARGER(r, at_most);
-    }
-    /* the largest error is at least at_most / largest, so few components must be
-       examined */
-    worst = LARGER(at_most / largest, worst);
-    for (Py_ssize_t i = 0; i < n; i++) {
-        double r = fabs(forces[i]), step, room;
-        if (!(r > worst * size[i]))
-            continue;
-        step = diagonal[i] > 0 ? r / diagonal[i] : INFINITY;
-        room = forces[i] > 0 ? x[i] - lb[i] : ub[i] - x[i];
-        r = balance_error(r, size[i], step, x[i], room, energy);
-        worst = LARGER(worst, r);
-    }
-    return isfinite(all) ? worst : INFINITY;
-}
-
-/* size = scale of each variable from the energy, or 0 if the energy defines no
-   scale; own = scale without the energy. */
-TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in Fx, out size,
-                                     out own, Py_ssize_t n)
-{
-    for (Py_ssize_t j = 0; j < n; j++) {
-        double known = variable_size(energy, q[j], diagonal[j], x[j]);
-        size[j] = known < INFINITY ? known : 0;
-        own[j] = own_size(Fx[j], diagonal[j], x[j]);
-    }
-}
-
-/* missed = Gx - e, own = |G| own_size, known = |G| size, for rows G (m, n). */
+/* Add terms of the stopping test (`solvers/common/stopping.py`) at a point with the
+   residual r, where d is the diagonal of P and w = D⁻¹ᐟ²: xᵀPx, qᵀx and Σ d xᵢ² to
+   `sums`; `most` becomes at least as large as the components of w|r|, w max(|Px|, |q|),
+   dw|x| and |x|/w. */
 TWICE static void
-terms_of_rows(in rows, in e, in x, in own_size, in size, Py_ssize_t m, Py_ssize_t n,
-              out missed, out own, out known)
+terms_of_test(in x, in Px, in q, in r, in d, in w, Py_ssize_t n, out sums, out most)
 {
-    for (Py_ssize_t i = 0; i < m; i++) {
-        in row = rows + i * n;
-        double error = -e[i], own_terms = 0, terms = 0;
-        for (Py_ssize_t j = 0; j < n; j++) {
-            error += row[j] * x[j];
-            own_terms += fabs(row[j]) * own_size[j];
-            terms += fabs(row[j]) * size[j];
-        }
-        missed[i] = error;
-        own[i] = own_terms;
-        known[i] = terms;
+    double xPx = 0, qx = 0, terms = 0;
+    double error = most[0], force = most[1], curved = most[2], size = most[3];
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double residual = w[i] * fabs(r[i]), length = fabs(x[i]);
+        double larger = w[i] * LARGER(fabs(Px[i]), fabs(q[i]));
+        double change = d[i] * w[i] * length, scaled = length / w[i];
+        xPx += x[i] * Px[i];
+        qx += q[i] * x[i];
+        terms += d[i] * length * length;
+        error = LARGER(residual, error);
+        force = LARGER(larger, force);
+        curved = LARGER(change, curved);
+        size = LARGER(scaled, size);
     }
+    sums[0] += xPx, sums[1] += qx, sums[2] += terms;
+    most[0] = error, most[1] = force, most[2] = curved, most[3] = size;
 }

@@ -16,13 +16,13 @@ from mortarbench.harness import (
     InputError,
     Residuals,
     Status,
-    kkt_residuals,
     verdict,
 )
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.verify import measure
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.listing import about
 from mortarbench.problems import elastic
 from mortarbench.problems.families.beam_ring import BeamRing

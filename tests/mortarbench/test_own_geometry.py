@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 import mortarbench as mb
-from mortarbench.harness import kkt_residuals
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.reports.export.vtu import write_vtu
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT

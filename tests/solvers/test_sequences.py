@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import Status, kkt_residuals
+from mortarbench.harness import Status
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

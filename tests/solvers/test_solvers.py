@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
-from mortarbench.harness import QP, Status, kkt_residuals
+from mortarbench.harness import QP, Status
 from mortarbench.harness.conformance.manufactured import (
     infeasible,
     one_of_each,
@@ -18,6 +18,7 @@ from mortarbench.harness.conformance.manufactured import (
 )
 from mortarbench.harness.environment.environment import PACKAGES as OWN
 from mortarbench.harness.registry import options_of
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.adapters.cvxpy_ import DECLINED_BACKENDS

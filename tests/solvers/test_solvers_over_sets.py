@@ -5,12 +5,13 @@ import gc
 import numpy as np
 import pytest
 
-from mortarbench.harness import Box, Cones, Discs, Status, Verdict, kkt_residuals
+from mortarbench.harness import Box, Cones, Discs, Status, Verdict
 from mortarbench.harness import verdict as judged
 from mortarbench.harness.conformance.manufactured import (
     SET_SHAPES,
     manufactured_over_sets,
 )
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import measure
 from mortarbench.solvers import SOLVERS
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import kkt_residuals
 from mortarbench.harness.conformance import conformance
 from mortarbench.harness.conformance.conformance import (
     CHECKS,
@@ -32,6 +31,7 @@ from mortarbench.harness.conformance.manufactured import (
     strings,
 )
 from mortarbench.harness.conformance.weaknesses import line_of
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from tests.support import FAULTY_SOLVERS, ROOT
 from tests.support.faulty_solvers import (

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from mortarbench.harness import Box, Cones, Discs, kkt_residuals, needs_matrices
+from mortarbench.harness import Box, Cones, Discs, needs_matrices
 from mortarbench.harness.conformance import manufactured
 from mortarbench.harness.conformance.conformance import (
     CHECKS,
@@ -21,7 +21,7 @@ from mortarbench.harness.conformance.manufactured import (
     manufactured_over_sets,
 )
 from mortarbench.harness.conformance.weaknesses import weaknesses_page
-from mortarbench.harness.verify.kkt import normality
+from mortarbench.harness.verify.kkt import kkt_residuals, normality
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, Solution, Status, kkt_residuals, verdict
+from mortarbench.harness import QP, Solution, Status, verdict
 from mortarbench.harness.conformance.equivalence import CHANGES, changes_of
 from mortarbench.harness.conformance.manufactured import FORMS, SHAPES, strings
 from mortarbench.harness.conformance.metamorphic import (
@@ -18,6 +18,7 @@ from mortarbench.harness.conformance.metamorphic import (
     scale_rows,
     shift_unknowns,
 )
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.adapters.piqp_ import PIQP
 
 

@@ -13,7 +13,6 @@ from mortarbench.harness import (
     Solution,
     Status,
     Verdict,
-    kkt_residuals,
     no_rows,
     verdict,
 )
@@ -23,6 +22,7 @@ from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.verify.kkt import (
     NEGLIGIBLE,
     energy_at,
+    kkt_residuals,
     largest_eigenvalue,
     own_sizes,
     scales_at,

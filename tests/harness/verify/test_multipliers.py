@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import QP, InputError
-from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify import multipliers
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.multipliers import with_multipliers
 
 TOL = 1e-8

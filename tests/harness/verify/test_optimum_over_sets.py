@@ -10,8 +10,8 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, Solution, Status, kkt_residuals
-from mortarbench.harness.verify.kkt import own_sizes
+from mortarbench.harness import QP, Solution, Status
+from mortarbench.harness.verify.kkt import kkt_residuals, own_sizes
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.harness.verify.optimum import proven_optimum
 from mortarbench.harness.verify.rational import rational

@@ -12,12 +12,17 @@ from mortarbench.harness import (
     Solution,
     Status,
     Verdict,
-    kkt_residuals,
     no_rows,
     verdict,
 )
 from mortarbench.harness.record import Record
-from mortarbench.harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
+from mortarbench.harness.verify.kkt import (
+    ROUNDING,
+    Residuals,
+    kkt_residuals,
+    rejudged,
+    tightened,
+)
 from mortarbench.harness.verify.optimum import (
     coupled,
     decided,

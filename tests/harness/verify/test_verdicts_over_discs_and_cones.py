@@ -13,14 +13,14 @@ import pytest
 
 import mortarbench as mb
 from mortarbench.cli.main import main
-from mortarbench.harness import QP, Cones, Discs, Solution, Status, kkt_residuals
+from mortarbench.harness import QP, Cones, Discs, Solution, Status
 from mortarbench.harness.conformance.metamorphic import (
     change_units,
     mirror,
     permute_unknowns,
     shift_unknowns,
 )
-from mortarbench.harness.verify.kkt import ROUNDING, normality, own_sizes
+from mortarbench.harness.verify.kkt import ROUNDING, kkt_residuals, normality, own_sizes
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.registries import Registries
 from mortarbench.solvers.reference.solve import reference_solution

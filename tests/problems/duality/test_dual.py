@@ -7,7 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csc_array, csr_array
 
-from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Solution, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import kkt_residuals
 from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.contact.bodies import factorise_floating
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.linearise import linearisation

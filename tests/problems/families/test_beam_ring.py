@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
 from mortarbench.harness.suite.suite import load_suite
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mortarbench import problems
-from mortarbench.harness import InputError, certify, kkt_residuals
+from mortarbench.harness import InputError, certify
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.sparse import vstack
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.balance import check_balance
 from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise_clamped

@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.greco import Greco
 from mortarbench.problems.models.greco import PUBLISHED

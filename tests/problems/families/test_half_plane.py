@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.half_plane import HalfPlane
 from mortarbench.problems.models.half_plane import (

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mortarbench.harness import InputError, Solution, Status, kkt_residuals
+from mortarbench.harness import InputError, Solution, Status
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.names import parse
 from mortarbench.harness.operators import assembled
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import OPERATORS, PROBLEMS
 from mortarbench.problems.families.half_space import HalfSpace
 from mortarbench.problems.models.half_space.influence import (

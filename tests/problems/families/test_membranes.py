@@ -7,8 +7,9 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import issparse
 
-from mortarbench.harness import InputError, Solution, Status, kkt_residuals
+from mortarbench.harness import InputError, Solution, Status
 from mortarbench.harness.files.matfile import read_mat, save_mat
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.models.membranes import hat_integrals

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.obstacle import Obstacle
 from mortarbench.problems.models.obstacle import (
     CONTACT_RADIUS,

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import as_vectors
 from mortarbench.problems.models.patch import model

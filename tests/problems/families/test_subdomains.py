@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, Status, kkt_residuals
+from mortarbench.harness import InputError, Status
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import certified
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.duality import problem

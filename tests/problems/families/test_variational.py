@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems.families.variational import JournalBearing, String, Torsion
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution

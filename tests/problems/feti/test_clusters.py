@@ -10,8 +10,9 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
 import mortarbench as mb
-from mortarbench.harness import InputError, Status, kkt_residuals, no_rows
+from mortarbench.harness import InputError, Status, no_rows
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.verdicts import certified
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.duality.decomposed import decompose

@@ -19,10 +19,11 @@ from scipy.sparse import (
 )
 
 from mortarbench.cli.main import main
-from mortarbench.harness import QP, InputError, kkt_residuals
+from mortarbench.harness import QP, InputError
 from mortarbench.harness.files.qpfile import explicit_matrices, load_qp, save_qp
 from mortarbench.harness.names import assemble, parse
 from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.files.qps import parse_qps, save_qps
 from mortarbench.problems.files.readers import read

@@ -7,8 +7,9 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.baselines.infeasibility_certificate import (
     proves_infeasible,

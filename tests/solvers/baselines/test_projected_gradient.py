@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
 
 

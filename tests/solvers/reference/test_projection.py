@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, Cones, kkt_residuals
+from mortarbench.harness import QP, Cones
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.box_stack import box_stack
 

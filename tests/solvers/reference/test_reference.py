@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from mortarbench.harness import QP, kkt_residuals, no_rows
+from mortarbench.harness import QP, no_rows
 from mortarbench.harness.conformance.manufactured import (
     SHAPES,
     infeasible,
@@ -19,6 +19,7 @@ from mortarbench.harness.conformance.manufactured import (
     unbounded,
 )
 from mortarbench.harness.names import completed
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import interior_point
@@ -462,6 +463,7 @@ def test_the_reference_uses_no_other_solver():
     packages, ours = (line.split() for line in run.stdout.splitlines())
     assert not FOREIGN & set(packages)
     assert ours == [
+        "mortarbench.solvers.common", "mortarbench.solvers.common.stopping",
         "mortarbench.solvers.reference", "mortarbench.solvers.reference.equilibrate",
         "mortarbench.solvers.reference.interior",
         "mortarbench.solvers.reference.polish",

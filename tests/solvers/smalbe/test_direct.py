@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.smalbe.direct import MAX_UNKNOWNS
 from mortarbench.solvers.smalbe.faces import Faces

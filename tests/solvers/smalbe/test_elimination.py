@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.sparse import bsr_array, coo_array, csr_array, dia_array
 
-from mortarbench.harness import QP, Box, Discs, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Box, Discs, Status, no_rows
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.elimination import eliminate_free

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
 from mortarbench.harness.registry import options_of
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 

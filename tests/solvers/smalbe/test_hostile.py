@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
 
 TOLERANCES = (1e-6, 1e-9, 1e-12)

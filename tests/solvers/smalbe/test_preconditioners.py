@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Status, Structure, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, Structure, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.driver import outer_loop

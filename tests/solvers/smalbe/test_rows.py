@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, random_array
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers.smalbe import rows as module
 from mortarbench.solvers.smalbe.compiled import Reduction, Rows
 from mortarbench.solvers.smalbe.driver import outer_loop

@@ -1,5 +1,6 @@
 """SMALBE: steps, invariants and difficult problems."""
 
+import re
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -7,9 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.stopping import relative_residual
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
@@ -338,9 +341,10 @@ def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
 
     assert s.status is Status.ITERATION_LIMIT
     assert s.counts["P_products"] <= 10_000
-    worst = kkt_residuals(qp, s).worst
+    worst = relative_residual(qp, s, 1e-300)
     assert 0 < worst <= 10.0 ** (orders - 16)
-    assert f"stagnated at residual {worst:.1e}" in s.message
+    reported = float(re.match(r"stagnated at residual ([\d.e-]+):", s.message)[1])
+    assert reported == pytest.approx(worst, rel=0.3)  # the rest is rounding of Px
 
 
 @pytest.mark.parametrize("seed", [271828, 314159])
@@ -546,15 +550,15 @@ def test_few_products_suffice_with_bounds_only():
     [range(2000, 2020), pytest.param(range(2020, 2060), marks=pytest.mark.slow)],
     ids=["20", "40 more"],
 )
-def test_a_claim_uses_at_most_half_of_the_allowed_residual(dual, tol, seeds):
-    """The residuals of the original QP decide, not those of the projected problem."""
+def test_the_residual_of_the_original_problem_decides(dual, tol, seeds):
+    """The residual of the projected problem may be smaller."""
     for seed in seeds:
         qp = dual(seed)
-        for name in ("smalbe", "smalbe-permon"):
+        for name, most in (("smalbe", tol), ("smalbe-permon", 5 * tol)):
             s = SOLVERS[name].prepare(qp, tol)()
 
             assert s.status is Status.SOLVED
-            assert kkt_residuals(qp, s).worst <= 5 * tol
+            assert relative_residual(qp, s, tol) <= most * (1 + 1e-9)
 
 
 def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
@@ -611,7 +615,7 @@ def test_earlier_failures_do_not_recur(qp, name):
     s = SOLVERS[name].prepare(qp, 1e-6)()
 
     assert s.status is Status.SOLVED
-    assert kkt_residuals(qp, s).worst <= 1e-5
+    assert relative_residual(qp, s, 1e-6) <= 5e-6
     assert s.counts["P_products"] <= 100
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mortarbench import build
-from mortarbench.harness import Status, kkt_residuals
+from mortarbench.harness import Status
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import rows as rows_module
@@ -150,11 +151,11 @@ def test_a_solve_stalled_by_rounding_ends(jump, tol):
 @pytest.mark.parametrize("tol", [1e-8, 1e-10])
 def test_rounding_along_previous_directions_is_removed(jump, tol):
     """Without this correction, the solve took at least 209 products: as many as
-    directions are stored, and then further ones.
+    directions are stored, and then further ones. A second outer iteration takes 30.
     """
     plate = PROBLEMS["plate"]
     given = plate.complete({"pattern": "checkerboard", "jump": jump})
     qp = plate.build("dual", given, reference_solution).qp
     s = SMALBE().prepare(qp, tol)()
     assert s.status is Status.SOLVED
-    assert s.counts["P_products"] <= 60
+    assert s.counts["P_products"] <= 90

@@ -1,0 +1,117 @@
+# The stopping test of `solvers.common.stopping`, for bounds and equality rows.
+
+
+cdef double ratio(double error, double size, double rounding=0.0) noexcept:
+    """Return (|error| − rounding)⁺/size, where 0/0 = 0; inf if it is not a number."""
+    error = fabs(error) - rounding
+    if error <= 0:
+        return 0.0
+    return error / size if error / size < INFINITY else INFINITY
+
+
+cdef double worst_ratio(
+    const double *sums, double *most, double gap, double tol
+) noexcept:
+    """Return the larger of the relative errors of stationarity and of the gap.
+
+    sums, most : results of `terms_of_test`. On return, most[1] is the scale F of forces
+        and most[3] is the least size of scaled variables.
+    """
+    cdef double rounding = 8 * 2.0 ** -52, dual, energy
+    if most[1] <= rounding * most[2]:
+        most[1] = most[2]
+    most[3] = fmax(most[3], tol * most[1])
+    energy = fmax(fmax(fabs(sums[0]), fabs(sums[1])), tol * most[1] * most[1])
+    dual = ratio(most[0], most[1], fmin(rounding * most[2], tol * most[1]))
+    return fmax(dual, ratio(gap, energy, fmin(rounding * sums[2], tol * energy)))
+
+
+cdef bint scales(const double *d, double *w, Py_ssize_t n, Reduction over) except -1:
+    """w ← D⁻¹ᐟ² with D from `solvers.common.stopping`; return True unless d = 0."""
+    cdef Py_ssize_t i
+    cdef double usual
+    cdef double[2] total
+    total[0] = total[1] = 0.0
+    for i in range(n):
+        total[0] += d[i] if d[i] > 0 else 0.0
+        total[1] += d[i] > 0
+    over.add(total, 2)
+    usual = total[0] / total[1] if total[1] > 0 else 1.0
+    for i in range(n):
+        w[i] = 1 / sqrt(d[i] if d[i] > 1e-12 * usual else usual)
+    return total[1] > 0
+
+
+def relative_residual(qp, s, double tol, Px, diagonal, G, Reduction over):
+    """Return the largest error of a point within its bounds; inf if it is not finite.
+
+    s : a `Solution` without multipliers of inequality rows
+    tol : see `solvers.common.stopping.relative_residual`
+    diagonal : diagonal of P (n,), empty for an operator without a known diagonal
+    G : the equality rows, an array or an operator
+    over : processes that share vectors (n,)
+    """
+    cdef Py_ssize_t i, j, n = len(qp.q), m = len(s.y)
+    cdef int k
+    cdef list owners = []
+    cdef double[4] sums
+    cdef double[4] most
+    cdef double worst
+    cdef Room room = Room(3 * n + 2 * m)
+    cdef double *d = room.at
+    cdef double *w = d + n
+    cdef double *r = w + n
+    cdef double *missed = r + n
+    cdef double *size = missed + m
+    cdef const double *x = read(s.x, owners)
+    cdef const double *y = read(s.y, owners)
+    cdef const double *z = read(s.z_box, owners)
+    cdef const double *q = read(qp.q, owners)
+    cdef const double *e = read(qp.b, owners)
+    cdef const double *Fx = read(Px, owners)
+    cdef const double *lb = read(qp.sets[0].lower, owners)
+    cdef const double *ub = read(qp.sets[0].upper, owners)
+    cdef const double *row
+    cdef CompressedRows by_components  # Gᵀ
+    if len(diagonal):
+        memcpy(d, read(diagonal, owners), n * sizeof(double))
+    tol = tol if scales(d, w, n, over) else 0.0
+    # 1. Gᵀy, Gx and Σ|Gᵢⱼ|wⱼ
+    if isinstance(G, np.ndarray):
+        row = read(G, owners)
+        for i in range(m):
+            missed[i] = dot(row, x, n)
+            for j in range(n):
+                size[i] += fabs(row[j]) * w[j]
+            add(y[i], row, r, n)
+            row += n
+    elif issparse(G):
+        by_components = transposed_rows(G)
+        for i in range(n):
+            for j in range(by_components.indptr[i], by_components.indptr[i + 1]):
+                k = by_components.indices[j]
+                missed[k] += by_components.data[j] * x[i]
+                size[k] += fabs(by_components.data[j]) * w[i]
+                r[i] += by_components.data[j] * y[k]
+    elif m:
+        copy_result(G @ s.x, m, missed, "Gx")
+        copy_result(abs(G) @ over.vector(copied(w, n)), m, size, "Σ|Gᵢⱼ|wⱼ")
+        copy_result(G.T @ s.y, n, r, "Gᵀy")
+    # 2. Stationarity and the gap
+    sums[:] = [0.0, 0.0, 0.0, 0.0]
+    most[:] = [0.0, 0.0, 0.0, 0.0]
+    for i in range(n):
+        r[i] += Fx[i] + q[i] + z[i]
+        if z[i] != 0:
+            sums[3] += (ub[i] if z[i] > 0 else lb[i]) * z[i]
+    terms_of_test(x, Fx, q, r, d, w, n, sums, most)
+    over.add(sums, 4)
+    for i in range(4):
+        most[i] = -over.least(-most[i])
+    for i in range(m):
+        sums[3] += e[i] * y[i]
+    worst = worst_ratio(sums, most, sums[0] + sums[1] + sums[3], tol)
+    # 3. The rows
+    for i in range(m):
+        worst = fmax(worst, ratio(missed[i] - e[i], fabs(e[i]) + most[3] * size[i]))
+    return worst
