@@ -49,10 +49,19 @@ class Box:
         for name, bound in (("lb", self.lower), ("ub", self.upper)):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
-        if not (self.lower < np.inf).all() or not (self.upper > -np.inf).all():
-            raise ValueError("QP bounds contain NaN, lb = +inf or ub = -inf")
+        for name, bound, sign in (("lb", self.lower, 1), ("ub", self.upper, -1)):
+            if not (sign * bound < np.inf).all():
+                i = int((sign * np.asarray(bound) < np.inf).argmin())
+                raise ValueError(
+                    f"{name}[{i}] is {np.asarray(bound)[i]:g}; expected a number "
+                    f"{'below inf' if sign > 0 else 'above -inf'}"
+                )
         if (self.lower > self.upper).any():
-            raise ValueError("QP bounds cross: lb > ub in some component")
+            lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+            i = int((lower > upper).argmax())
+            raise ValueError(
+                f"bounds cross at {i}: {lower[i]:g} > {upper[i]:g}; expected lb ≤ ub"
+            )
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
         """Return the bounds of the box, which is its own hull."""
