@@ -13,6 +13,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mortarbench import progress
@@ -182,8 +183,22 @@ def test_a_picture_is_drawn_only_if_there_is_a_point(cli, tmp_path):
     assert drawn[::2] == (0, "")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert lost[0] == 1
-    assert "no picture: lost returned no point" in lost[2]
+    assert "no file is written: lost returned no point" in lost[2]
     assert not (tmp_path / "b.png").exists()
+
+
+def test_the_answer_is_written_unless_there_is_no_point(cli, tmp_path):
+    written = cli("solve", "well/primal", "--solver", "exact", "--out", "a.npz")
+    lost = cli("solve", "well/primal", "--solver", "lost", "--out", "b.npz")
+    wrong = cli("solve", "well/primal", "--solver", "exact", "--out", "a.csv")
+
+    assert written[::2] == (0, "")
+    with np.load(tmp_path / "a.npz") as stored:
+        assert {"x", "y", "z", "z_box"} <= set(stored)
+    assert "no file is written: lost returned no point" in lost[2]
+    assert not (tmp_path / "b.npz").exists()
+    assert wrong[0] == 2
+    assert "a.csv: unknown format '.csv'; expected .npz" in wrong[2]
 
 
 def test_an_exported_qp_is_the_emitted_qp_with_the_name_of_its_case(cli, tmp_path):
