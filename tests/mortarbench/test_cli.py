@@ -381,6 +381,50 @@ def test_output_of_a_plugin_is_not_mixed_with_results(cli, pit):
     assert "a family says hello" in err
 
 
+@pytest.mark.slow
+def test_every_command_prints_only_json_even_if_a_library_in_c_prints(pit, tmp_path):
+    """A library may print on the file descriptor 1 of the process of the command."""
+    noise = "\nimport os\nos.write(1, b'from C\\n')\n"
+    with (tmp_path / "plug.py").open("a") as file:
+        file.write(noise)
+    plugin = ("--plugin", "plug.py")
+    commands = {
+        "list": ("list", "solvers", *plugin),
+        "run": pit,
+        "solve": ("solve", "pit/primal", "--solver", "times", *plugin),
+        "test-solver": ("test-solver", "times", *plugin),
+        "validate": ("validate", "out/pit", *plugin),
+        "report": ("report", "out/pit", "--format", "csv"),
+        "replay": ("replay", "out/pit", "RUN_ID", *plugin),
+        "doctor": ("doctor",),
+    }
+    for arguments in commands.values():
+        if "RUN_ID" in arguments:
+            (journal,) = (tmp_path / "out/pit/journal").iterdir()
+            run_id = json.loads(journal.read_text().splitlines()[0])["run_id"]
+            arguments = [run_id if a == "RUN_ID" else a for a in arguments]
+        done = subprocess.run(
+            [sys.executable, "-m", "mortarbench", *arguments, "--json"],
+            capture_output=True, text=True, check=False, cwd=tmp_path,
+        )  # fmt: skip
+
+        assert json.loads(done.stdout), (arguments, done.stderr)
+        assert ("from C" in done.stderr) == ("plug.py" in arguments)
+    assert set(commands) == {
+        name
+        for name, command in main_module._COMMANDS.items()
+        if main_module._JSON in (*command.options, *command.excluding)
+    }
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-", "<&-"])
+def test_closed_streams_do_not_matter(closed):
+    command = f"{sys.executable} -m mortarbench list solvers {closed}"
+    done = subprocess.run(command, shell=True, capture_output=True, check=False)
+
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 def test_missing_numbers_and_inapplicable_units_are_not_shown(cli):
     lost = cli("solve", "well/primal", "--solver", "lost")[1]
     dual = cli("solve", "well/dual", "--solver", "exact")[1]

@@ -126,6 +126,15 @@ def test_a_weak_certificate_causes_a_remark(sound, bound, told):
     assert [text.startswith(told) for text in found] == [True] * (told is not None)
 
 
+def test_a_master_without_free_nodes_leaves_standard_output_to_results(tmp_path, capfd):
+    """An empty matrix would make LAPACK print an error on standard output."""
+    toml = BLOCKS + '[[supports]]\nboundary = "table"\nfix = ["x", "y"]\n'
+    case = f"bodies:{stacked_blocks(tmp_path, toml=toml)}/dual"
+    main(Registries(), ["solve", case, "--solver", "smalbe", "--json"])
+
+    assert json.loads(capfd.readouterr().out)["status"] == "verified"
+
+
 def test_an_unverified_answer_has_no_remarks(sound):
     record = replace(sound.record, verdict=Verdict.INACCURATE, energy_bound=np.inf)
 
