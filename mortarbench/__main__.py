@@ -8,10 +8,12 @@ import sys
 
 def _reserve_standard_output() -> None:
     """Reserve standard output for results; libraries in C print on standard error."""
-    is_closed = sys.stdout is None or sys.stderr is None
-    if is_closed or sys.stdout is not sys.__stdout__:  # captured within this process
+    if sys.stdout is None or sys.stderr is None:  # closed when the process started
         return
-    results = os.fdopen(os.dup(1), "w", encoding=sys.stdout.encoding, errors="replace")
+    encoding = sys.stdout.encoding
+    if sys.stdout is not sys.__stdout__:  # captured within this process
+        return
+    results = os.fdopen(os.dup(1), "w", encoding=encoding, errors="replace")
     os.dup2(2, 1)
     sys.stdout = results
 

@@ -37,7 +37,7 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.datafile import check_size, opened
+from mortarbench.harness.files.datafile import check_size, max_bytes, opened, parsing
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.sets.cones import Cones
 from mortarbench.problems.contact.friction_cones import FrictionalContact
@@ -73,24 +73,24 @@ def read_datasets(path: Path) -> Datasets:
     """
     import h5py  # imported here, because workers of solvers do not need HDF5
 
-    arrays: dict[str, NDArray[Any]] = {}
+    datasets: dict[str, h5py.Dataset] = {}
 
-    def read(name: str, node: Any) -> None:
+    def find(name: Any, node: Any) -> None:
+        if not isinstance(name, str):
+            raise ValueError("a name is not UTF-8")
         if isinstance(node, h5py.Dataset):
-            check_size(f"{path}: {name}", node.size * node.dtype.itemsize)
-            arrays[name] = np.asarray(node[()])
+            datasets[name] = node
 
-    with opened(path, _EXPECTED) as stream:
-        try:
-            with h5py.File(stream, "r") as file:
-                file.visititems(read)
-        except InputError:
-            raise
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError):
-            raise InputError(
-                f"{path}: damaged, or not HDF5; expected {_EXPECTED}"
-            ) from None
-    return arrays
+    wrong = f"damaged, or not HDF5; expected {_EXPECTED}"
+    with (
+        opened(path, _EXPECTED) as stream,
+        parsing(path, wrong, 2 * max_bytes()),
+        h5py.File(stream, "r") as file,
+    ):
+        file.visititems(find)
+        size = sum(node.size * node.dtype.itemsize for node in datasets.values())
+        check_size(f"{path}: its content", size)
+        return {name: np.asarray(node[()]) for name, node in datasets.items()}
 
 
 def write_datasets(path: Path, arrays: Datasets) -> None:

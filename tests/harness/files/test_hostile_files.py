@@ -595,17 +595,22 @@ def test_the_undamaged_mesh_is_read(tmp_path):
 
 # random damage
 
-KINDS = ("npz", "mat", "qps", "msh", "inp", "med", "parquet")
+#: numbers of damaged files in the slow test: 3600 QPs, 500 of FCLIB, 3000 meshes
+COUNTS = {
+    **dict.fromkeys(("npz", "mat", "parquet", "qps", "qplib", "json"), 600),
+    "hdf5": 500,
+    **dict.fromkeys(("msh", "inp", "med"), 1000),
+}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COUNTS)
 def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
     fuzz(kind, 2 if kind == "parquet" else 30, 11, tmp_path, seconds=120)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_none_of_a_thousand_damaged_files_causes_a_crash_or_hang(tmp_path, kind):
-    survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
+@pytest.mark.parametrize(("kind", "count"), COUNTS.items())
+def test_no_damaged_file_causes_a_crash_or_hang_or_runs_code(tmp_path, kind, count):
+    survived = fuzz(kind, count, 12, tmp_path, seconds=120)
 
-    assert 0 < survived < 500  # some files survive the damage, others do not
+    assert 0 < survived < count / 2  # some files survive the damage, others do not

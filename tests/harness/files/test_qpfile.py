@@ -1,7 +1,6 @@
 import json
 import pickle
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness import QP, InputError, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
+from tests.support.damaged_files import Touch, object_array
 
 P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
 
@@ -169,22 +169,11 @@ def test_a_file_of_qpsolvers_may_contain_none(tmp_path, protocol):
     assert qp.G.shape == qp.A.shape == (0, 2)
 
 
-class _Touch:
-    """Object that creates a file when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return Path.touch, (self.path,)
-
-
 @pytest.mark.parametrize("value", [[1.0], [None], False])
 def test_no_other_object_counts_as_none_and_none_is_unpickled(tmp_path, value):
     sentinel = tmp_path / "SENTINEL"
-    held = np.empty((), dtype=object)
-    for held[()] in (value, _Touch(sentinel)):
-        np.savez(tmp_path / "a.npz", **plain(G=held))
+    for held in (value, Touch(sentinel)):
+        np.savez(tmp_path / "a.npz", **plain(G=object_array(held)))
         with pytest.raises(InputError, match="G is a pickled Python object"):
             load_qp(tmp_path / "a.npz")
     assert not sentinel.exists()
