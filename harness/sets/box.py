@@ -49,12 +49,15 @@ class Box:
         for name, bound in (("lb", self.lower), ("ub", self.upper)):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
-        for name, bound, sign in (("lb", self.lower, 1), ("ub", self.upper, -1)):
-            if not (sign * bound < np.inf).all():
-                i = int((sign * np.asarray(bound) < np.inf).argmin())
+        for name, bound, is_valid, expected in (
+            ("lb", self.lower, self.lower < np.inf, "below inf"),
+            ("ub", self.upper, self.upper > -np.inf, "above -inf"),
+        ):
+            if not is_valid.all():
+                i = int(np.asarray(is_valid).argmin())
+                value = np.asarray(bound)[i]
                 raise ValueError(
-                    f"{name}[{i}] is {np.asarray(bound)[i]:g}; expected a number "
-                    f"{'below inf' if sign > 0 else 'above -inf'}"
+                    f"{name}[{i}] is {value:g}; expected a number {expected}"
                 )
         if (self.lower > self.upper).any():
             lower, upper = np.asarray(self.lower), np.asarray(self.upper)

@@ -37,7 +37,7 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.datafile import check_size, max_bytes, opened, parsing
+from mortarbench.harness.files.datafile import check_size, opened, parsing
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.sets.cones import Cones
 from mortarbench.problems.contact.friction_cones import FrictionalContact
@@ -68,7 +68,8 @@ def read_datasets(path: Path) -> Datasets:
     Raises
     ------
     InputError
-        If the file cannot be read, is not HDF5, or is too large.
+        If the file cannot be read, is not HDF5, is too large, or refers to data in
+        other files.
 
     """
     import h5py  # imported here, because workers of solvers do not need HDF5
@@ -82,15 +83,19 @@ def read_datasets(path: Path) -> Datasets:
             datasets[name] = node
 
     wrong = f"damaged, or not HDF5; expected {_EXPECTED}"
-    with (
-        opened(path, _EXPECTED) as stream,
-        parsing(path, wrong, 2 * max_bytes()),
-        h5py.File(stream, "r") as file,
-    ):
-        file.visititems(find)
-        size = sum(node.size * node.dtype.itemsize for node in datasets.values())
+    with opened(path, _EXPECTED) as stream:
+        with parsing(path, wrong, 0):
+            file = h5py.File(stream, "r")
+            file.visititems(find)
+            size = sum(node.size * node.dtype.itemsize for node in datasets.values())
+            if any(node.external or node.is_virtual for node in datasets.values()):
+                raise InputError(
+                    f"{path}: arrays in other files, which are not opened; expected "
+                    "all data in this file"
+                )
         check_size(f"{path}: its content", size)
-        return {name: np.asarray(node[()]) for name, node in datasets.items()}
+        with parsing(path, wrong, 2 * size), file:
+            return {name: np.asarray(node[()]) for name, node in datasets.items()}
 
 
 def write_datasets(path: Path, arrays: Datasets) -> None:
