@@ -218,7 +218,10 @@ def _own_qp(
     if "maker" in meta:
         n, maker = vectors["q"].size, str(meta["maker"])
         matrices["P"] = SerialisableOperator(n, maker, _ingredients(arrays), operators)
-    structure = _structure(arrays) if "fixed" in arrays else None
+    structure = None
+    if "fixed" in arrays:
+        K, B = (_matrix(arrays, name) for name in _STRUCTURE)
+        structure = Structure(K=K, B=B, fixed=arrays["fixed"])
     return QP(**vectors, **matrices, structure=structure, sets=further_sets(arrays))
 
 
@@ -281,22 +284,6 @@ def check_dense(name: str, M: Matrix) -> None:
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
-
-
-def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
-    parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
-    if missing := [name for name in parts if name not in arrays]:
-        raise ValueError(f"{', '.join(missing)} missing, but fixed is present")
-    if arrays["fixed"].dtype.kind not in "iu":
-        raise ValueError("fixed must contain integers")
-    fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
-    K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
-    N = K.shape[0]
-    if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
-        raise ValueError("the shapes of K, B, fixed and q are inconsistent")
-    if ((fixed < 0) | (fixed >= N)).any():
-        raise ValueError(f"fixed contains indices out of range; expected 0 … {N - 1}")
-    return Structure(K=K, B=B, fixed=fixed)
 
 
 def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -72,7 +72,7 @@ def _text(path: Path, expected: str, parse: Callable[[str], TwoSidedQP]) -> Load
     """
     data = content(path, expected, copies=_COPIES)
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8; expected {expected}") from None
     with located(str(path)):
