@@ -288,9 +288,9 @@ class QP:
         try:  # cvxpy depends on OSQP, so this form of the data is always available
             data, _, _ = problem.get_problem_data("OSQP")
         except Exception as e:  # the errors of cvxpy have no common base class
-            why = shortened(" ".join(str(e).split()))
+            why = shortened(" ".join(str(e).split())).rstrip(".")
             raise InputError(
-                f"cvxpy cannot compile the problem to a QP: {why} Expected a convex "
+                f"cvxpy cannot compile the problem to a QP: {why}; expected a convex "
                 "quadratic objective and linear constraints of continuous variables"
             ) from None
         G, h = data["F"], data["G"]

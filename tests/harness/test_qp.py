@@ -176,7 +176,7 @@ def test_a_problem_of_cvxpy_that_is_no_qp_is_refused_in_one_line(reason):
     rows = [x >= level] if reason == "no value" else []
     function = objective.get(reason, cvxpy.sum_squares(x))
 
-    message = r"cvxpy cannot compile .* Expected a convex|parameter .* has no value"
+    message = r"cvxpy cannot compile .*; expected a convex|parameter .* has no value"
     with pytest.raises(InputError, match=message) as e:
         QP.from_cvxpy(cvxpy.Problem(cvxpy.Minimize(function), rows))
     assert "\n" not in str(e.value)
