@@ -8,7 +8,8 @@ A family that reads problems from files has the key ``path``, and its attribute
 ``path_suffix`` is the suffix of these files. The name of such a case is
 ``FAMILY:PATH/key=value/…/FORM``. PATH may contain slashes, and ends at the first
 component with the suffix. If ``path_suffix`` is empty, PATH is the rest of the name,
-``FAMILY:PATH``, and the family has a single form.
+``FAMILY:PATH``, and the family has a single form. ``PATH#ROW`` is one problem of a file
+that contains several, counted from 1.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _FILE = re.compile(
     r"[^=:]*\.[A-Za-z]\w*(/|$)"
 )  #: pattern of a text that begins with the path of a file with a suffix
+_ROW = re.compile(r"(.+)#([1-9][0-9]{0,8})", re.DOTALL)
 _INTEGER_LIMIT = 2**63  #: smallest positive integer that does not fit in 64 bits
 _TYPE_NAMES = {
     int: "an integer, such as 4",
@@ -261,6 +263,17 @@ def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]
     if len(family.forms) == 1 and (not parts or "=" in parts[-1]):
         parts.append(family.forms[0])
     return path, parts
+
+
+def split_row(path: str) -> tuple[str, int | None]:
+    """Split PATH#ROW into the path of a file and a row, or None if there is no row.
+
+    >>> from mortarbench.harness.names import split_row
+    >>> split_row("sets/two.parquet#2"), split_row("a#b.npz")
+    (('sets/two.parquet', 2), ('a#b.npz', None))
+    """
+    match = _ROW.fullmatch(path)
+    return (match[1], int(match[2])) if match else (path, None)
 
 
 def _number(text: str, kind: type) -> object:

@@ -351,6 +351,10 @@ class Family(ABC):
         """
         return None
 
+    def problems_in(self, path: str) -> list[str]:
+        """Return the paths of the problems in an input file, such as PATH#1, PATH#2."""
+        return [path]
+
     def with_copies(self, folder: Path) -> Family:
         """Return a family that also reads the copies of files in a result folder.
 

@@ -11,18 +11,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
-from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.errors import InputError, shortened, shown
 from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.sets.convex import ConvexSet, hull
 from mortarbench.harness.sets.convex import Vector as Vector
 from mortarbench.harness.sets.discs import Discs
 
+#: parts of a QP that are passed to `QP.from_arrays`, except sets
+_PARTS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: Largest absolute entry of P − Pᵀ that counts as rounding, relative to the largest
 #: absolute entry of P.
 SYMMETRY_TOLERANCE = 1e-12
+#: Limits of at least this magnitude in arrays and files are infinite. Many programs
+#: write 1e20 for infinity, some after rounding or scaling.
+MIN_INFINITE = 1e20 * (1 - 1e-6)
 #: Largest number of rows of P for which convexity is checked by a Cholesky
 #: factorisation. For a P of this size, the factorisation takes less than a second.
 _MAX_FACTORED_ROWS = 2000
@@ -132,10 +137,7 @@ class QP:
             if array.shape != shape:
                 raise ValueError(f"QP.{name} has shape {array.shape}, expected {shape}")
         for name in ("q", "b", "h"):
-            if not np.isfinite(arrays[name]).all():
-                raise ValueError(
-                    f"QP.{name} contains NaN or inf, expected finite numbers"
-                )
+            _check_finite(f"QP.{name}", arrays[name])
         every = _without_intervals((box, *further[has_box:]), n)
         values = {**arrays, "sets": every, "structure": structure}
         for name, value in values.items():
@@ -179,13 +181,14 @@ class QP:
         Matrices may be dense or sparse; sparse matrices are stored by columns. A vector
         may also be a matrix with one row or column. A single row of G or A may be a
         vector, with a scalar right-hand side. If all lower or all upper bounds are
-        equal, a scalar suffices. Absent constraints and bounds are None.
+        equal, a scalar suffices. Absent constraints and bounds are None. Limits of at
+        least 1e20·(1 − 1e-6) are infinite; rows of G with an infinite h are dropped.
 
         Parameters
         ----------
         P : (n, n) symmetric positive semidefinite, with both triangles
         q : (n,)
-        G, h : (p, n) and (p,), the rows G x ≤ h
+        G, h : (p, n) and (p,), the rows G x ≤ h; h is inf where a row has no limit
         A, b : (m, n) and (m,), the rows A x = b
         lb, ub : (n,) bounds, -inf and inf where absent
         sets : convex sets of blocks of variables without bounds
@@ -194,9 +197,9 @@ class QP:
         ------
         InputError
             If an argument is missing, is not numeric, has the wrong shape or contains
-            NaN (or inf, except in bounds), if `sets` is not a tuple or list of valid
-            convex sets other than `Box`, if bounds cross, or if P is not symmetric or
-            not positive semidefinite (see `check_convex`).
+            NaN (or inf, except in bounds and h), if `sets` is not a tuple or list of
+            valid convex sets other than `Box`, if bounds cross, or if P is not
+            symmetric or not positive semidefinite (see `check_convex`).
 
         Examples
         --------
@@ -225,11 +228,21 @@ class QP:
         if not (n := vector.size):
             raise InputError("q is empty; expected at least one variable")
         try:
+            hessian = _matrix("P", P, n, n)
+            rows, limits = _rows("G", G, "h", h, n)
+            limits = with_infinities(limits)
+            kept = limits != np.inf
+            equalities, sides = _rows("A", A, "b", b, n)
+            _check_finite("q", vector)
+            _check_finite("b", sides)
+            _check_finite("h", np.where(kept, limits, 0.0))
             qp = cls(
-                P=_matrix("P", P, n, n),
+                P=hessian,
                 q=vector,
-                **_rows("A", A, "b", b, n),
-                **_rows("G", G, "h", h, n),
+                A=equalities,
+                b=sides,
+                G=rows if kept.all() else rows[kept],
+                h=limits[kept],
                 lb=_bound("lb", lb, -np.inf, n),
                 ub=_bound("ub", ub, np.inf, n),
                 sets=sets,
@@ -239,6 +252,49 @@ class QP:
             raise InputError(str(e)) from None
         check_convex(qp.P)
         return qp
+
+    @classmethod
+    def from_qpsolvers(cls, problem: Any) -> QP:
+        """Create a QP from a ``qpsolvers.Problem``, whose conventions are the same.
+
+        Raises
+        ------
+        InputError
+            For the same reasons as in `from_arrays`.
+
+        """
+        return cls.from_arrays(**{name: getattr(problem, name) for name in _PARTS})
+
+    @classmethod
+    def from_cvxpy(cls, problem: Any) -> QP:
+        """Create the QP to which cvxpy compiles a ``cvxpy.Problem``.
+
+        Its variables are those of the compiled problem, including auxiliary ones.
+        Constants of the objective are dropped, and a maximised objective is negated.
+
+        Raises
+        ------
+        InputError
+            If cvxpy cannot compile the problem to a QP, for instance because of
+            integer variables, second-order cones or parameters without values.
+
+        """
+        for parameter in problem.parameters():
+            if parameter.value is None:
+                raise InputError(
+                    f"the parameter {parameter.name()} of cvxpy has no value; expected "
+                    "values of all parameters"
+                )
+        try:  # cvxpy depends on OSQP, so this form of the data is always available
+            data, _, _ = problem.get_problem_data("OSQP")
+        except Exception as e:  # the errors of cvxpy have no common base class
+            why = shortened(" ".join(str(e).split())).rstrip(".")
+            raise InputError(
+                f"cvxpy cannot compile the problem to a QP: {why}; expected a convex "
+                "quadratic objective and linear constraints of continuous variables"
+            ) from None
+        G, h = data["F"], data["G"]
+        return cls.from_arrays(data["P"], data["q"], G, h, data["A"], data["b"])
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{count} {name}" for name, count in self.sizes.items())
@@ -294,6 +350,26 @@ class QP:
     def objective(self, x: Vector) -> float:
         """Evaluate ½ xᵀP x + qᵀx."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x)
+
+
+def with_infinities(limits: Vector) -> Vector:
+    """Replace limits of at least `MIN_INFINITE` by ±inf.
+
+    >>> import numpy as np
+    >>> from mortarbench.harness.qp import with_infinities
+    >>> with_infinities(np.array([1e19, -9.99999999e19]))
+    array([1.e+19,   -inf])
+    """
+    is_finite = ~(np.abs(limits) >= MIN_INFINITE)
+    return np.where(is_finite, limits, np.copysign(np.inf, limits))
+
+
+def _check_finite(name: str, v: Vector) -> None:
+    """Raise ValueError if a vector contains NaN or inf."""
+    if not np.isfinite(v).all():
+        values = np.asarray(v)
+        i = int(np.isfinite(values).argmin())
+        raise ValueError(f"{name}[{i}] is {values[i]:g}; expected a finite number")
 
 
 def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
@@ -512,8 +588,8 @@ def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
     """
     value = absent if value is None else value
     if np.ndim(value) == 0 and not issparse(value):
-        return np.full(n, _numbers(name, value))
-    return numeric_vector(name, value, n)
+        return with_infinities(np.full(n, _numbers(name, value)))
+    return with_infinities(numeric_vector(name, value, n))
 
 
 def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
@@ -538,7 +614,12 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
         M = entries = _numbers(name, value)
         M = np.atleast_2d(M) if rows is None else M
     if not np.isfinite(entries).all():
-        raise InputError(f"{name} contains NaN or inf; expected finite numbers")
+        where = coo_array(M)
+        k = int(np.isfinite(where.data).argmin())
+        place = ", ".join(str(int(index[k])) for index in where.coords)
+        raise InputError(
+            f"{name}[{place}] is {where.data[k]:g}; expected a finite number"
+        )
     if M.ndim != 2 or M.shape != (M.shape[0] if rows is None else rows, n):
         expected = f"({'rows' if rows is None else rows}, {n})"
         raise InputError(f"{name} has shape {M.shape}; expected {expected}")
@@ -547,14 +628,14 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
 
 def _rows(
     name: str, M: Any, side: str, rhs: ArrayLike | None, n: int
-) -> dict[str, Matrix]:
-    """Return the matrix and the right-hand side of constraints as keyword arguments.
+) -> tuple[Matrix, Vector]:
+    """Return the matrix and the right-hand side of constraints.
 
     name, side : names of the matrix and the right-hand side, such as "G" and "h"
     M : matrix with n columns; None for zero rows
     """
     if M is None:
-        return {name: no_rows(n), side: np.zeros(0)}
+        return no_rows(n), np.zeros(0)
     matrix = _matrix(name, M, None, n)
     p = matrix.shape[0]
     scalar = rhs is not None and np.ndim(rhs) == 0 and not issparse(rhs)
@@ -563,7 +644,7 @@ def _rows(
         raise InputError(
             f"{side} has {vector.size} entries; expected {p}, one per row of {name}"
         )
-    return {name: matrix, side: vector}
+    return matrix, vector
 
 
 def _freeze(M: Matrix) -> None:

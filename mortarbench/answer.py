@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mortarbench.arguments import (
+    ARCHIVES,
     GRIDS,
     PICTURES,
     check_output_file,
@@ -28,6 +29,8 @@ from mortarbench.harness import QP, Fields, Record, Residuals, Solution, Solver,
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.npz import write_mappable
+from mortarbench.harness.files.store import POINT
 from mortarbench.harness.names import assemble, is_shared
 from mortarbench.harness.processes.measurement import (
     measure_once,
@@ -79,7 +82,9 @@ class Answer:
     spec: SolverSpec  #: name and options of the solver
     solver: str | Solver  #: name or object, as passed to `solve`
     defaults: Mapping[str, Any]  #: default options of the solver
-    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, one line each
+    #: possible mistakes in the input, and reasons to doubt a verified answer, one line
+    #: each
+    remarks: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -213,6 +218,31 @@ class Answer:
             return draw(figure)
         return save(figure, check_output_file(path, PICTURES))
 
+    def save(self, path: str | Path) -> Path:
+        """Write x, y, z and z_box and, for bodies, displacements to an npz file.
+
+        The displacements (N, dim) of the nodes at the reference positions `points`
+        (N, dim) are in m.
+
+        Raises
+        ------
+        InputError
+            If the answer has no point, or the file cannot be written.
+
+        """
+        path = check_output_file(path, ARCHIVES)
+        if self.solution is None or not self.has_point:
+            raise InputError(f"{path}: {self.record.solver} returned no point")
+        arrays = {name: getattr(self.solution, name) for name in POINT}
+        if self.case.family_case.fields is not None:
+            fields = self.fields()
+            arrays |= {"points": fields.points, "displacements": fields.displacement}
+        try:
+            write_mappable(path, arrays)
+        except OSError as e:
+            raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+        return path
+
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
 
@@ -309,6 +339,11 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     return tuple(reasons)
 
 
+def _of_input(case: Case) -> tuple[str, ...]:
+    """Return the remarks on the input; () if only MPI ranks have built the case."""
+    return case.remarks if "family_case" in vars(case) else ()
+
+
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:
     """Return True if contact forces sum to at most `MAX_OPEN_FORCE` times the loads."""
     if not record.quantities.get("contact_rows"):
@@ -353,7 +388,7 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
 @TURN
 @ended_by_signals()
 def solve(
-    case: Case | QP | str,
+    case: Case | QP | str | object,
     solver: str | Solver,
     tol: float = 1e-8,
     *,
@@ -370,7 +405,7 @@ def solve(
 
     Parameters
     ----------
-    case : a case of `build`, its name, or a QP
+    case : a case of `build`, its name, a QP, or a problem of qpsolvers or cvxpy
     solver : a name listed by `solvers`, or an object with the methods `declines` and
         `prepare`
     tol : requested relative KKT accuracy
@@ -475,7 +510,7 @@ def solver_session(
             spec=spec,
             solver=solver,
             defaults=defaults,
-            remarks=remarks(case, record, solution),
+            remarks=(*_of_input(case), *remarks(case, record, solution)),
         )
 
     work = None
@@ -519,7 +554,7 @@ class Verification:
 
 
 def verify(
-    qp: QP | Case | str,
+    qp: QP | Case | str | object,
     x: ArrayLike,
     y: ArrayLike | None = None,
     z: ArrayLike | None = None,
@@ -534,7 +569,7 @@ def verify(
 
     Parameters
     ----------
-    qp : a QP, a case of `build`, or its name
+    qp : a QP, a case of `build`, its name, or a problem of qpsolvers or cvxpy
     x : (n,) point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
     tol : relative KKT accuracy; a point is verified if every residual is at most

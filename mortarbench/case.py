@@ -227,8 +227,8 @@ class BareQP(plugin.Family):
         return plugin.Case(qp=self.qp, recover=lambda s: s.x, quantities=lambda _: {})
 
 
-def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
-    """Return the unbuilt case for a name or a QP.
+def as_case(problem: Case | QP | str | object, plugins: Plugins = ()) -> Case:
+    """Return the unbuilt case for a name, a QP, or a problem of qpsolvers or cvxpy.
 
     If `problem` is a case, the same case is returned, unless `plugins` contains files
     that its registries have not loaded.
@@ -261,14 +261,21 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
         case str():
             registries = load_registries(plugins)
             return Case(id=parse(problem, registries.families), registries=registries)
+    # attributes are tested, since an import of qpsolvers takes a second
+    if hasattr(problem, "get_problem_data"):
+        return as_case(QP.from_cvxpy(problem), plugins)
+    if all(hasattr(problem, name) for name in ("P", "q", "G", "h", "A", "b")):
+        return as_case(QP.from_qpsolvers(problem), plugins)
     hint = f"; write 'file:{problem}' for a file" if isinstance(problem, Path) else ""
     raise InputError(
         f"case = {shown(problem)}; expected the name of a case, the result of "
-        f"build(), or a QP{hint}"
+        f"build(), a QP, or a problem of qpsolvers or cvxpy{hint}"
     )
 
 
-def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
+def export(
+    case: Case | QP | str | object, path: str | Path, *, plugins: Plugins = ()
+) -> Path:
     """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
 
     FCLIB files contain problems over friction cones (`Cones`). For a case
@@ -277,7 +284,7 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
 
     Parameters
     ----------
-    case : a name, a case of `build`, or a QP
+    case : a name, a case of `build`, a QP, or a problem of qpsolvers or cvxpy
     path : file to write; its suffix determines the format
     plugins : Python files with more families
 

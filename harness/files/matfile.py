@@ -30,7 +30,7 @@ from mortarbench.harness.files.qpfile import (
     explicit_matrices,
     listed_dense,
 )
-from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetric
+from mortarbench.harness.qp import QP, Matrix, Vector, canonical
 from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
@@ -220,24 +220,19 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         valid QP.
 
     """
-    vectors: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
-    matrices = {name: matrix(arrays, name) for name in _MATRICES}
+    parts: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
+    parts |= {name: matrix(arrays, name) for name in _MATRICES}
     try:
         text = np.asarray(arrays.get("meta", "{}"))
         if text.dtype.kind != "U" or text.size != 1:
             raise ValueError("meta is not a string")
         meta = json_object(str(text.item()))
-        for name in _MATRICES:
-            if not np.isfinite(matrices[name].data).all():
-                raise ValueError(f"{name} contains inf; expected finite numbers")
         for name in listed_dense(meta):
-            check_dense(name, matrices[name])
-            matrices[name] = matrices[name].toarray()
-        qp = QP(**vectors, **matrices, sets=further_sets(arrays))
-        check_symmetric(qp.P)
+            check_dense(name, parts[name])
+            parts[name] = parts[name].toarray()
+        return QP.from_arrays(**parts, sets=further_sets(arrays)), meta
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(shortened(" ".join(str(e).split()))) from None
-    return qp, meta
 
 
 def vector(arrays: Mapping[str, Any], name: str) -> Vector:

@@ -9,6 +9,8 @@ share.
 from __future__ import annotations
 
 import mmap
+import pickle
+import pickletools
 import zipfile
 from collections.abc import Mapping
 from io import BytesIO
@@ -34,11 +36,39 @@ _ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 #: kinds of dtypes that are read; records and objects, which are pickled, are refused
 _KINDS = "biufcSU"
+_MAX_NONE_BYTES = 512  #: number of bytes that suffice for a pickled None
 _PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
 
 class _PickledError(ValueError):
-    """Error for an array of Python objects, such as a SciPy matrix saved by NumPy."""
+    """Error for an array of Python objects, such as a SciPy matrix saved by NumPy.
+
+    The argument is the beginning of the pickled data.
+    """
+
+
+def is_pickled_none(data: bytes) -> bool:
+    """Return True if `data` are the pickled ``np.array(None)``; nothing is unpickled.
+
+    The opcodes are compared with those that NumPy writes, in protocol 4 or, before
+    NumPy 2, in protocol 3.
+    """
+    known = [_opcodes(pickle.dumps(np.array(None), protocol=i)) for i in (3, 4)]
+    try:
+        return _opcodes(data) in known
+    except Exception:  # pickletools raises many types of exceptions for damaged data
+        return False
+
+
+def _opcodes(data: bytes) -> list[tuple[str, str]]:
+    """Return the opcodes and arguments of a pickle that determine its value."""
+    ignored = ("PROTO", "FRAME", "MEMOIZE", "BINPUT")
+    opcodes = []
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name not in ignored:
+            text = str(argument).replace("numpy._core", "numpy.core")
+            opcodes.append((opcode.name, text))
+    return opcodes
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -81,7 +111,7 @@ def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
 
 
 def read(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of a file without unpickling.
+    """Read all arrays of a file without unpickling; an array that is None is left out.
 
     Raises
     ------
@@ -99,7 +129,9 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
         for name, member in members.items():
             try:
                 arrays[name] = _read_array(archive, member)
-            except _PickledError:
+            except _PickledError as e:
+                if is_pickled_none(e.args[0]):
+                    continue
                 raise InputError(
                     f"{path}: {shortened(name)} is a pickled Python object, which is "
                     "never read; expected an array of numbers (for a sparse matrix, "
@@ -172,7 +204,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
         raise ValueError(f"the npy header has version {version}; expected 1.0 or 2.0")
     shape, fortran, dtype = readers[version](file)
     if dtype.hasobject:
-        raise _PickledError
+        raise _PickledError(file.read(_MAX_NONE_BYTES))
     if dtype.kind not in _KINDS or not dtype.itemsize:
         raise ValueError("not a plain array of numbers or text")
     return shape, fortran, dtype

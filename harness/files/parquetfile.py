@@ -1,4 +1,4 @@
-"""One QP in one Parquet file, in the format of qpbenchmark's test sets.
+"""QPs in Parquet files, in the format of qpbenchmark's test sets.
 
 Each row of the table is a problem. The columns are ``P, q, G, h, A, b, lb, ub`` (lists
 of doubles) and ``name``. All matrices are dense and stored row by row; their number of
@@ -38,7 +38,7 @@ from mortarbench.harness.files.datafile import (
 )
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.files.qpfile import explicit_matrices, listed_dense
-from mortarbench.harness.qp import QP, Matrix, Vector, check_symmetric, no_rows
+from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
 
 _MATRICES = ("P", "G", "A")
@@ -94,38 +94,44 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
 
 
-def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
+def load_parquet(path: Path, row: int | None = None) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data; matrices that were sparse are in CSC format.
+
+    row : row of the problem, counted from 1; None for the only row of a file
 
     Raises
     ------
     InputError
-        If the file is not Parquet, does not contain exactly one problem, lacks a
-        column, or its columns do not define a valid QP.
+        If the file is not Parquet, does not have the row, lacks a column, or its
+        columns do not define a valid QP.
 
     """
-    flat, text = _columns(path)
+    head, flat = _read_row(path, row or 1)
+    rows = head["rows"]
+    if row is None and rows != 1:
+        choice = f"{path}#1 or another row up to #{rows}" if rows else "one row"
+        raise InputError(f"{path}: has {rows} problems; expected {choice}")
+    if row is not None and row > rows:
+        raise InputError(f"{path}#{row}: expected a row from 1 to {rows}")
+    if missing := head["missing"]:
+        raise InputError(
+            f"{path}: no column {', '.join(missing)}; expected the columns of a QP"
+        )
+    check_size(f"{path}: its content", head["bytes"])
     try:
-        meta = json_object(text)
+        meta = json_object(head["meta"])
         dense = listed_dense(meta) if "dense" in meta else set(_MATRICES)
-        P, q = flat["P"], flat["q"]
-        if P is None or q is None:
+        if odd := [name for name, count in head["columns"].items() if count == -1]:
+            raise ValueError(f"{odd[0]} is not a list of numbers")
+        if flat["P"] is None or flat["q"] is None:
             raise ValueError("P or q is null; expected lists of numbers")
-        n = q.size
-        parts: dict[str, Any] = {"q": q}
+        parts: dict[str, Any] = {name: flat[name] for name in _COLUMNS}
         for name in _MATRICES:
-            M = flat[name]
-            parts[name] = (
-                no_rows(n) if M is None else _matrix(name, M, n, name in dense)
-            )
-        for name in _RIGHT_HAND_SIDE.values():
-            parts[name] = np.zeros(0) if (rhs := flat[name]) is None else rhs
-        for name, absent in (("lb", -np.inf), ("ub", np.inf)):
-            bound = flat[name]
-            parts[name] = np.full(n, absent) if bound is None else bound
+            if parts[name] is not None:
+                M = _matrix(name, parts[name], flat["q"].size)
+                parts[name] = M if name in dense else csc_array(M)
         sets = {name: part for name, part in flat.items() if SET_ARRAY.fullmatch(name)}
-        qp = QP(**parts, sets=further_sets(sets))
-        check_symmetric(qp.P)
+        qp = QP.from_arrays(**parts, sets=further_sets(sets))
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
     except InputError as e:
@@ -133,56 +139,54 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
     return qp, meta
 
 
-def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
-    """Read the columns and the text of the meta data in a separate process.
-
-    A damaged file may crash Arrow; the separate process protects this process.
+def count_problems(path: Path) -> int:
+    """Return the number of rows of a Parquet file.
 
     Raises
     ------
     InputError
-        If the file is not Parquet, does not have exactly one row, is too large, or
-        lacks a column.
+        If the file is not Parquet.
+
+    """
+    return int(_read_row(path, 0)[0]["rows"])
+
+
+def _read_row(path: Path, row: int) -> tuple[dict[str, Any], dict[str, Vector | None]]:
+    """Read the head of a file, and the columns of a row, in a separate process.
+
+    A damaged file may crash Arrow; the separate process protects this process. If the
+    file does not have the row, lacks a column or is too large, there are no columns.
+
+    Raises
+    ------
+    InputError
+        If the file is not Parquet.
 
     """
     reader = [sys.executable, "-I", str(_READER)]
-    command = [*reader, str(max_bytes()), _KEY, SET_ARRAY.pattern]
+    command = [*reader, str(max_bytes()), _KEY, SET_ARRAY.pattern, str(row), *_COLUMNS]
     with opened(path, "a Parquet file") as file:
-        done = subprocess.run(
-            [*command, *_COLUMNS], stdin=file, capture_output=True, check=False
-        )
+        done = subprocess.run(command, stdin=file, capture_output=True, check=False)
     line, _, numbers = done.stdout.partition(b"\n")
     if done.returncode or not line:
         raise InputError(f"{path}: malformed; expected a Parquet file")
     head = json.loads(line)
-    if head["rows"] != 1:
-        raise InputError(f"{path}: contains {head['rows']} problems; expected one row")
-    if missing := head["missing"]:
-        raise InputError(
-            f"{path}: no column {', '.join(missing)}; expected the columns of a QP"
-        )
-    check_size(f"{path}: its content", head["bytes"])
     flat: dict[str, Vector | None] = {}
     begin = 0
-    for name, count in head["columns"].items():
-        if count == -1:
-            raise InputError(f"{path}: {name} is not a list of numbers")
-        end = begin + 8 * (count or 0)
+    for name, count in head.get("columns", {}).items():
+        end = begin + 8 * max(count or 0, 0)
         flat[name] = None if count is None else np.frombuffer(numbers[begin:end])
         begin = end
-    return flat, head["meta"]
+    return head, flat
 
 
-def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
+def _matrix(name: str, flat: Vector, n: int) -> Matrix:
     """Check and return the matrix with n columns whose rows `flat` concatenates."""
     if n == 0 or flat.size % n:
         raise ValueError(
             f"{name} has {flat.size} entries; expected rows of {n} entries"
         )
-    if not np.isfinite(flat).all():
-        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
-    M = flat.reshape(-1, n)
-    return M if dense else csc_array(M)
+    return flat.reshape(-1, n)
 
 
 def _flat(M: Matrix) -> Vector:

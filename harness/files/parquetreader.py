@@ -2,19 +2,20 @@
 
 ::
 
-    python parquetreader.py MAX_BYTES KEY PATTERN COLUMN... < FILE
+    python parquetreader.py MAX_BYTES KEY PATTERN ROW COLUMN... < FILE
 
 The process prints a line of JSON with the entries
 
 * ``rows``, the number of rows,
 * ``missing``, the names among COLUMN... that the file lacks,
-* ``bytes``, the size that the file declares, and
+* ``bytes``, the size that the file declares for the row group that contains the row ROW
+  (counted from 1), and
 * ``meta``, the text under KEY in the metadata of the schema.
 
-If the file has exactly one row, declares at most MAX_BYTES and lacks no column, the
-line also has the entry ``columns``. For each COLUMN, and for each column whose name
-matches PATTERN, this entry contains the length of the list in the row, null for a null,
-or -1 for any other type. The numbers of these lists follow the line as float64. To
+If the file has the row, lacks no column, and declares at most MAX_BYTES, the line also
+has the entry ``columns``. For each COLUMN, and for each column whose name matches
+PATTERN, this entry contains the length of the list in the row, null for a null, or -1
+for any other type. The numbers of these lists follow the line as float64. To
 start quickly, the process imports no other module of this package.
 """
 
@@ -38,16 +39,19 @@ SECONDS = 600
 ROOM = 2**29
 
 
-def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
-    """Read the Parquet file on standard input, and print its columns."""
+def main(max_bytes: int, key: str, pattern: str, row: int, wanted: list[str]) -> None:
+    """Read a row of the Parquet file on standard input, and print its columns."""
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     metadata = file.metadata
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    ends = np.cumsum([0] + [group.num_rows for group in groups])
+    number = int(np.searchsorted(ends, row)) - 1  # of the group that contains the row
+    group = groups[number] if 0 <= number < len(groups) else None
     # The number of values is also used, since a page can encode a billion equal values
     # in a few bytes.
-    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-    chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
+    chunks = [] if group is None else map(group.column, range(group.num_columns))
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
     names = file.schema_arrow.names
     optional = [name for name in names if re.fullmatch(pattern, name)]
@@ -58,14 +62,15 @@ def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
         "bytes": size,
         "meta": meta.decode(errors="replace"),
     }
-    if metadata.num_rows != 1 or head["missing"] or size > max_bytes:
+    if group is None or head["missing"] or size > max_bytes:
         print(json.dumps(head))
         return
     _bound(4 * size + ROOM)
     wanted = [*wanted, *optional]
-    table = file.read(columns=wanted, use_threads=False)
+    table = file.read_row_group(number, columns=wanted, use_threads=False)
     table.validate(full=True)
-    arrays = {name: _numbers(table.column(name)[0]) for name in wanted}
+    i = row - 1 - int(ends[number])
+    arrays = {name: _numbers(table.column(name)[i]) for name in wanted}
     head["columns"] = {k: v if v is None else v.size for k, v in arrays.items()}
     head["columns"] |= {
         k: -1 for k, v in arrays.items() if v is not None and v.ndim != 1
@@ -99,7 +104,8 @@ def _numbers(scalar: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4:])
+    limit, key, pattern, row, *columns = sys.argv[1:]
+    main(int(limit), key, pattern, int(row), columns)
     sys.stdout.flush()
     # Do not wait for Arrow's threads, which may never end or may abort Python.
     os._exit(0)

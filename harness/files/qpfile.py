@@ -17,9 +17,9 @@ Absent constraints have zero rows, and absent bounds are ±inf. The optional str
 a dual QP (`harness.qp.Structure`) is stored as the matrices ``K, B`` and the vector
 ``fixed``.
 
-Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` are also accepted. In these
-files, matrices are dense arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets
-are optional.
+Files written by ``np.savez(path, P=P, q=q, G=G, h=h)`` and by ``Problem.save`` of
+qpsolvers are also accepted. In these files, matrices are dense arrays or CSC parts, and
+``G, h``, ``A, b``, bounds and sets are optional or None.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, issparse
 
 from mortarbench.harness.errors import InputError, shortened, unknown
 from mortarbench.harness.files.datafile import check_size, json_object
@@ -47,7 +47,6 @@ from mortarbench.harness.qp import (
     Structure,
     Vector,
     canonical,
-    check_symmetric,
 )
 from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
 
@@ -168,8 +167,8 @@ def load_qp(
 
     operators : makers of operators by name (`harness.operators`), for a file that the
         case worker of the same run has written. Such a file may contain an operator and
-        may have any size. None for a file of unknown origin. Such a file is refused if
-        P is an operator or asymmetric, or if the file exceeds the size limit of
+        may have any size. None for a file of unknown origin, whose arrays are checked
+        like arguments of `QP.from_arrays`, and whose size is limited by
         `harness.files.datafile`
 
     Raises
@@ -179,86 +178,85 @@ def load_qp(
         valid QP.
 
     """
-    parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
-    is_trusted = operators is not None
-    arrays = mapped_arrays(path, limited=not is_trusted)
-    lacking = [name for name in (*_VECTORS, *parts, "meta") if name not in arrays]
-    if lacking and not is_trusted and "meta" not in arrays:
-        return _plain_qp(path, arrays), {}
-    if lacking:
-        raise InputError(f"{path}: {', '.join(lacking)} missing")
+    arrays = mapped_arrays(path, limited=operators is None)
     try:
-        array = arrays["meta"]
-        if array.dtype.kind != "U" or array.size != 1:
-            raise ValueError("meta is not a string")
-        meta = json_object(str(array.item()))
-        vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
-        matrices = {name: _matrix(arrays, name) for name in _MATRICES}
-        dense = listed_dense(meta)
-        if not is_trusted:
-            _check_foreign(matrices, dense, meta)
-        structure = _structure(arrays) if "fixed" in arrays else None
-        for name in dense:
-            # if all entries are stored, use a view of the values, which may be mapped
-            M = matrices[name]
-            rows, columns = M.shape
-            full = M.nnz == rows * columns and M.has_canonical_format
-            matrices[name] = M.data.reshape(columns, rows).T if full else M.toarray()
-        if operators is not None and "maker" in meta:
-            n, maker = vectors["q"].size, str(meta["maker"])
-            matrices["P"] = SerialisableOperator(
-                n, maker, _ingredients(arrays), operators
-            )
-        qp = QP(**vectors, **matrices, structure=structure, sets=further_sets(arrays))
-        if not is_trusted:
-            check_symmetric(qp.P)
+        meta = _meta(arrays)
+        if operators is None:
+            return _foreign_qp(arrays, meta), meta
+        return _own_qp(arrays, meta, operators), meta
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
     except InputError as e:
         raise InputError(f"{path}: {e}") from None
-    return qp, meta
 
 
-def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
-    """Return the QP that is defined by arrays saved with `np.savez`."""
-    try:
-        for name in arrays:
-            if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
-                raise unknown("array", name, (*_VECTORS, *_MATRICES))
-        matrices = {name: _plain_matrix(arrays, name) for name in _MATRICES}
-        vectors = {name: _plain_vector(arrays, name) for name in _VECTORS}
-        arguments: dict[str, Any] = {**matrices, **vectors}
-        arguments["sets"] = further_sets(arrays)
-        qp = QP.from_arrays(**arguments)
-    except (ValueError, TypeError, OverflowError) as e:
-        raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
-    except InputError as e:
-        raise InputError(f"{path}: {e}") from None
-    return qp
+def _meta(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Return the meta data of a file; they are empty if the file has none."""
+    array = arrays.get("meta", np.array("{}"))
+    if array.dtype.kind != "U" or array.size != 1:
+        raise ValueError("meta is not a string")
+    return json_object(str(array.item()))
 
 
-def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | None:
-    if name not in arrays:
-        parts = [f"{name}_{part}" for part in _PARTS]
-        there = [part for part in parts if part in arrays]
-        if there and len(there) < len(parts):
-            lacking = ", ".join(part for part in parts if part not in arrays)
-            raise ValueError(f"{lacking} missing, but {there[0]} is present")
-        return _matrix(arrays, name) if there else None
-    M = _vector(arrays, name)
-    if M.ndim != 2:
-        raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
-    if not np.isfinite(M).all():
-        raise ValueError(f"{name} contains NaN or inf; expected finite numbers")
-    return M
+def _own_qp(
+    arrays: Mapping[str, NDArray[Any]],
+    meta: Mapping[str, Any],
+    operators: Mapping[str, Maker],
+) -> QP:
+    """Return the QP of a file that `save_qp` has written; arrays are not copied."""
+    parts = [f"{name}_{part}" for name in _MATRICES for part in _PARTS]
+    if lacking := [name for name in (*_VECTORS, *parts) if name not in arrays]:
+        raise ValueError(f"{', '.join(lacking)} missing")
+    vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
+    matrices = {name: _matrix(arrays, name) for name in _MATRICES}
+    for name in listed_dense(meta):
+        # if all entries are stored, use a view of the values, which may be mapped
+        M = matrices[name]
+        rows, columns = M.shape
+        full = M.nnz == rows * columns and M.has_canonical_format
+        matrices[name] = M.data.reshape(columns, rows).T if full else M.toarray()
+    if "maker" in meta:
+        n, maker = vectors["q"].size, str(meta["maker"])
+        matrices["P"] = SerialisableOperator(n, maker, _ingredients(arrays), operators)
+    structure = None
+    if "fixed" in arrays:
+        K, B = (_matrix(arrays, name) for name in _STRUCTURE)
+        structure = Structure(K=K, B=B, fixed=arrays["fixed"])
+    return QP(**vectors, **matrices, structure=structure, sets=further_sets(arrays))
 
 
-def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | None:
-    """Return a vector, possibly stored as a row or column; None if it is missing."""
-    if name not in arrays:
-        return None
-    v = _vector(arrays, name)
-    return v.ravel() if v.ndim == 2 and 1 in v.shape else v
+def _foreign_qp(arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any]) -> QP:
+    """Check the arrays of a file of unknown origin, and return their QP."""
+    if "maker" in meta:
+        raise ValueError(
+            "contains P as an operator, which is read only from files of the same run; "
+            "expected P as a matrix, as in files of export"
+        )
+    for name in arrays if "meta" not in arrays else ():
+        if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
+            raise unknown("array", name, (*_VECTORS, *_MATRICES))
+    parts: dict[str, Any] = {name: _foreign_matrix(arrays, name) for name in _MATRICES}
+    parts |= {name: _vector(arrays, name) for name in _VECTORS if name in arrays}
+    for name in listed_dense(meta):
+        if issparse(parts[name]):
+            check_dense(name, parts[name])
+            parts[name] = parts[name].toarray()
+    return QP.from_arrays(**{"q": None, **parts}, sets=further_sets(arrays))
+
+
+def _foreign_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | None:
+    """Return a matrix stored as an array or as CSC parts; None if it is missing."""
+    if name in arrays:
+        M = _vector(arrays, name)
+        if M.ndim != 2:
+            raise ValueError(f"{name} has shape {M.shape}; expected two dimensions")
+        return M
+    parts = [f"{name}_{part}" for part in _PARTS]
+    there = [part for part in parts if part in arrays]
+    if there and len(there) < len(parts):
+        lacking = ", ".join(part for part in parts if part not in arrays)
+        raise ValueError(f"{lacking} missing, but {there[0]} is present")
+    return _matrix(arrays, name) if there else None
 
 
 def listed_dense(meta: Mapping[str, Any]) -> set[str]:
@@ -288,35 +286,6 @@ def check_dense(name: str, M: Matrix) -> None:
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
 
 
-def _check_foreign(
-    matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
-) -> None:
-    """Check that P is not an operator, and that dense matrices are within the limit."""
-    if "maker" in meta:
-        raise ValueError(
-            "contains P as an operator, which is read only from files of the same run; "
-            "expected P as a matrix, as in files of export"
-        )
-    for name in dense:
-        check_dense(name, matrices[name])
-
-
-def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
-    parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
-    if missing := [name for name in parts if name not in arrays]:
-        raise ValueError(f"{', '.join(missing)} missing, but fixed is present")
-    if arrays["fixed"].dtype.kind not in "iu":
-        raise ValueError("fixed must contain integers")
-    fixed = arrays["fixed"].astype(np.int64, casting="same_kind")
-    K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
-    N = K.shape[0]
-    if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
-        raise ValueError("the shapes of K, B, fixed and q are inconsistent")
-    if ((fixed < 0) | (fixed >= N)).any():
-        raise ValueError(f"fixed contains indices out of range; expected 0 … {N - 1}")
-    return Structure(K=K, B=B, fixed=fixed)
-
-
 def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     return {
         name.removeprefix(_INGREDIENT): array
@@ -336,8 +305,6 @@ def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
 def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     """Check the CSC parts of a stored matrix, and return the matrix."""
     data = _vector(arrays, f"{name}_data")
-    if not np.isfinite(data).all():
-        raise ValueError(f"{name}_data contains NaN or inf; expected finite numbers")
     indices, indptr, shape = (arrays[f"{name}_{part}"] for part in _PARTS[1:])
     if {indices.dtype.kind, indptr.dtype.kind, shape.dtype.kind} - set("iu"):
         raise ValueError(f"{name}_indices, _indptr and _shape must contain integers")

@@ -25,7 +25,7 @@ from mortarbench.harness.solution import History, Solution, Status, checked_hist
 Arrays = Mapping[str, NDArray[Any]]
 
 _DIGEST = re.compile("[0-9a-f]{16}")
-_POINT = ("x", "y", "z", "z_box")
+POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
@@ -123,8 +123,8 @@ def write_arrays(path: Path, arrays: Arrays) -> None:
 
 def read_point(path: Path, status: Status) -> Solution:
     """Read a file written by `write_point` as a `Solution` that claims `status`."""
-    arrays = read_arrays(path, _POINT)
-    x, y, z, z_box = (arrays[name] for name in _POINT)
+    arrays = read_arrays(path, POINT)
+    x, y, z, z_box = (arrays[name] for name in POINT)
     history = _history(path, arrays)
     return Solution(status=status, x=x, y=y, z=z, z_box=z_box, history=history)
 
@@ -190,7 +190,7 @@ def _expected(
 
 def point_arrays(solution: Solution) -> Arrays:
     """Return the vectors of a point and the columns of its history by name."""
-    point = {name: getattr(solution, name) for name in _POINT}
+    point = {name: getattr(solution, name) for name in POINT}
     return point | {_HISTORY + name: v for name, v in solution.history.items()}
 
 

@@ -48,10 +48,22 @@ class Box:
         for name, bound in (("lb", self.lower), ("ub", self.upper)):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")
-        if not (self.lower < np.inf).all() or not (self.upper > -np.inf).all():
-            raise ValueError("QP bounds contain NaN, lb = +inf or ub = -inf")
+        for name, bound, is_valid, expected in (
+            ("lb", self.lower, self.lower < np.inf, "below inf"),
+            ("ub", self.upper, self.upper > -np.inf, "above -inf"),
+        ):
+            if not is_valid.all():
+                i = int(np.asarray(is_valid).argmin())
+                value = np.asarray(bound)[i]
+                raise ValueError(
+                    f"{name}[{i}] is {value:g}; expected a number {expected}"
+                )
         if (self.lower > self.upper).any():
-            raise ValueError("QP bounds cross: lb > ub in some component")
+            lower, upper = np.asarray(self.lower), np.asarray(self.upper)
+            i = int((lower > upper).argmax())
+            raise ValueError(
+                f"bounds cross at {i}: {lower[i]:g} > {upper[i]:g}; expected lb ≤ ub"
+            )
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
         """Return the bounds of the box, which is its own hull."""

@@ -13,7 +13,7 @@ from typing import Any
 
 from mortarbench.harness import checked
 from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
-from mortarbench.harness.names import CaseId, assemble
+from mortarbench.harness.names import CaseId, assemble, split_row
 from mortarbench.harness.plugin import Family
 
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence", "growing")
@@ -124,11 +124,7 @@ def _blocks(
                     f"the grid spans {count} cases; expected at most {most} in all; "
                     f"take fewer values, or set max_cases = {count} in the suite"
                 )
-            given = [
-                _located(point, folder, family)
-                for point in _points(axes)
-                for _ in forms
-            ]
+            given = [point for point in _points(axes) for _ in forms]
             cases = [
                 assemble(family, point, checked.text("forms", form))
                 for point, form in zip(given, cycle(forms), strict=False)
@@ -137,17 +133,19 @@ def _blocks(
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:
-    """Replace each shell pattern among paths by the matching files, sorted by name."""
-    entries = paths if isinstance(paths, list) else [paths]
-    if not any(_is_pattern(path, folder, family) for path in entries):
-        return paths
+    """Replace shell patterns among paths by the matching files, sorted by name.
+
+    A file with several problems is replaced by the paths of its problems.
+    """
     expanded: list[object] = []
-    for path in entries:
+    for path in paths if isinstance(paths, list) else [paths]:
         if _is_pattern(path, folder, family):
-            expanded += _matching(str(path), folder, family)
+            files: Sequence[object] = _matching(str(path), folder, family)
         else:
-            expanded.append(path)
-    return expanded
+            files = [_located({"path": path}, folder, family)["path"]]
+        for file in files:
+            expanded += family.problems_in(file) if isinstance(file, str) else [file]
+    return expanded if len(expanded) != 1 or isinstance(paths, list) else expanded[0]
 
 
 def _is_pattern(path: object, folder: Path, family: Family) -> bool:
@@ -195,12 +193,16 @@ def _located(
     path is returned.
     """
     match point:
-        case {"path": str(text)} if text and not Path(text).is_file():
-            if (beside := folder / text).is_file():
-                return {**point, "path": os.path.relpath(beside)}
-            copied = _copied(escape(text), family)
-            if text not in copied and len(copied) == 1:
-                return {**point, "path": copied[0]}
+        case {"path": str(text)} if text:
+            file, _ = split_row(text)
+            row = text.removeprefix(file)
+            if Path(file).is_file():
+                return point
+            if (beside := folder / file).is_file():
+                return {**point, "path": f"{os.path.relpath(beside)}{row}"}
+            copied = _copied(escape(file), family)
+            if file not in copied and len(copied) == 1:
+                return {**point, "path": f"{copied[0]}{row}"}
     return point
 
 

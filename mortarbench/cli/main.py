@@ -370,6 +370,13 @@ _COMMANDS = {
                 "contact; FILE.pvd: write all load steps up to this one",
             ),
             _Option(
+                "--out",
+                "FILE.npz",
+                "write x, the multipliers y, z and z_box and, for bodies, the "
+                "displacements of the nodes",
+                {"type": Path},
+            ),
+            _Option(
                 "--mesh-error",
                 "",
                 "also estimate the discretisation error by solves on finer meshes (at "

@@ -10,6 +10,7 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from mortarbench.arguments import (
+    ARCHIVES,
     GRIDS,
     PICTURES,
     check_output_file,
@@ -43,6 +44,8 @@ def run(registries: Registries, options: Namespace) -> int:
         )
     if options.vtu is not None:
         check_output_file(options.vtu, GRIDS)
+    if options.out is not None:
+        check_output_file(options.out, ARCHIVES)
     ranks_asked(options.mpi, "--mpi")
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
@@ -66,8 +69,8 @@ def run(registries: Registries, options: Namespace) -> int:
             _build(case, pictures)
         answer = solve(case, options.tol)
     _print(answer, options)
-    if pictures:
-        _draw(answer, options)
+    if pictures or options.out is not None:
+        _write(answer, options)
     return 0 if answer.verdict.is_verified else 1
 
 
@@ -95,7 +98,7 @@ def _print(answer: Answer, options: Namespace) -> None:
 
 
 def _build(case: Case, pictures: Sequence[str]) -> None:
-    """Build the case and print its remarks.
+    """Build the case.
 
     pictures : options for pictures on the command line
 
@@ -105,9 +108,8 @@ def _build(case: Case, pictures: Sequence[str]) -> None:
         If pictures are requested and the case has no bodies.
 
     """
-    for remark in case.remarks:
-        say(remark)
-    if pictures and case.family_case.fields is None:
+    fields = case.family_case.fields
+    if pictures and fields is None:
         names = ", ".join(f"--{o}" for o in pictures)
         raise InputError(f"{case.name} has no bodies to draw; leave out {names}")
 
@@ -158,11 +160,13 @@ def _imports_from_working_directory() -> bool:
     return first in ("", os.getcwd()) and first not in others
 
 
-def _draw(answer: Answer, options: Namespace) -> None:
-    """Write the requested pictures, unless the answer has no point."""
+def _write(answer: Answer, options: Namespace) -> None:
+    """Write the requested files, unless the answer has no point."""
     if not answer.has_point:
-        say(f"no picture: {answer.record.solver} returned no point")
+        say(f"no file is written: {answer.record.solver} returned no point")
         return
+    if options.out is not None:
+        answer.save(options.out)
     if options.plot is not None:
         answer.plot(options.plot, scale=options.scale)
     if options.vtu is not None:

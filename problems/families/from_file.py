@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mortarbench.harness import Family, InputError
 from mortarbench.harness.files.copies import Copies, content_digest
+from mortarbench.harness.names import split_row
 from mortarbench.harness.plugin import SourceFile
 from mortarbench.problems.files.file_digest import check_digest, format_of
 
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
 
 
 class FromFile(Family):
-    """QPs from files: npz, mat (of `export` or Maros-Mészáros), QPS text or Parquet.
+    """QPs from files: npz, mat, QPS, Parquet, QPLIB, or JSON of Clarabel.
 
-    Text and mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file
-    is a parameter of the case. The digest identifies the measured QP in records, and a
+    ``file:PATH.parquet#ROW`` is one problem of a Parquet file, counted from 1. Text and
+    mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file is a
+    parameter of the case. The digest identifies the measured QP in records, and a
     changed file defines a different case.
 
     copies : copies of files in a result folder; None to read files from their original
@@ -39,7 +41,7 @@ class FromFile(Family):
         """Return all keys, including the digest of the file."""
         params = {**self.defaults, **given}
         if params["path"] and "sha256" not in given:
-            path = str(params["path"])
+            path, _ = split_row(str(params["path"]))
             if self.copies is None:
                 params["sha256"] = content_digest(Path(path))
             else:
@@ -57,11 +59,27 @@ class FromFile(Family):
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
         """Return the path of the file, the digest of its content, and its suffix."""
-        path, sha256 = str(params["path"]), str(params["sha256"])
-        suffix = format_of(Path(path))
+        path, _ = split_row(str(params["path"]))
+        sha256, suffix = str(params["sha256"]), format_of(Path(path))
         if path.lower().endswith(".gz"):
             suffix += ".gz"
         return SourceFile(path=path, sha256=sha256, suffix=suffix)
+
+    def problems_in(self, path: str) -> list[str]:
+        """Return the paths of all problems in a file; Parquet files may have several.
+
+        Raises
+        ------
+        InputError
+            If the path is that of a Parquet file that cannot be read.
+
+        """
+        if not path.lower().endswith(".parquet"):
+            return [path]
+        from mortarbench.harness.files.parquetfile import count_problems
+
+        count = count_problems(self._located(self.complete({"path": path})))
+        return [path] if count == 1 else [f"{path}#{i + 1}" for i in range(count)]
 
     def with_copies(self, folder: Path) -> FromFile:
         """Return the family that reads the copies of a result folder."""
@@ -87,7 +105,8 @@ class FromFile(Family):
         from mortarbench.harness import Case
         from mortarbench.problems.files.readers import read
 
-        qp, scale, constant = read(self._located(params))
+        _, row = split_row(str(params["path"]))
+        qp, scale, constant, remarks = read(self._located(params), row)
 
         def quantities(s: Solution) -> dict[str, float]:
             return {"value": scale * qp.objective(s.x) + constant}
@@ -98,4 +117,5 @@ class FromFile(Family):
             quantities=quantities,
             scale=scale,
             constant=constant,
+            remarks=remarks,
         )

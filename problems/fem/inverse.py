@@ -228,6 +228,8 @@ def _inverse(
     number[c] = np.arange(c.size, dtype=np.int32)
     compliance = np.zeros((c.size, c.size))
     for components, U in factor.trailing() if c.size else ():
+        if not components.size:
+            continue  # LAPACK reports an empty matrix as an error, on standard output
         # (UᵀU)⁻¹ on the components eliminated last; skip components outside c
         lower, _ = lapack.dpotri(U.T, lower=1)
         scatter_symmetric(lower.T, number[components], compliance)

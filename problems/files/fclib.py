@@ -37,7 +37,7 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.checked import located
-from mortarbench.harness.files.datafile import check_size, opened
+from mortarbench.harness.files.datafile import check_size, opened, parsing
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.sets.cones import Cones
 from mortarbench.problems.contact.friction_cones import FrictionalContact
@@ -68,29 +68,34 @@ def read_datasets(path: Path) -> Datasets:
     Raises
     ------
     InputError
-        If the file cannot be read, is not HDF5, or is too large.
+        If the file cannot be read, is not HDF5, is too large, or refers to data in
+        other files.
 
     """
     import h5py  # imported here, because workers of solvers do not need HDF5
 
-    arrays: dict[str, NDArray[Any]] = {}
+    datasets: dict[str, h5py.Dataset] = {}
 
-    def read(name: str, node: Any) -> None:
+    def find(name: Any, node: Any) -> None:
+        if not isinstance(name, str):
+            raise ValueError("a name is not UTF-8")
         if isinstance(node, h5py.Dataset):
-            check_size(f"{path}: {name}", node.size * node.dtype.itemsize)
-            arrays[name] = np.asarray(node[()])
+            datasets[name] = node
 
+    wrong = f"damaged, or not HDF5; expected {_EXPECTED}"
     with opened(path, _EXPECTED) as stream:
-        try:
-            with h5py.File(stream, "r") as file:
-                file.visititems(read)
-        except InputError:
-            raise
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError):
-            raise InputError(
-                f"{path}: damaged, or not HDF5; expected {_EXPECTED}"
-            ) from None
-    return arrays
+        with parsing(path, wrong, 0):
+            file = h5py.File(stream, "r")
+            file.visititems(find)
+            size = sum(node.size * node.dtype.itemsize for node in datasets.values())
+            if any(node.external or node.is_virtual for node in datasets.values()):
+                raise InputError(
+                    f"{path}: arrays in other files, which are not opened; expected "
+                    "all data in this file"
+                )
+        check_size(f"{path}: its content", size)
+        with parsing(path, wrong, 2 * size), file:
+            return {name: np.asarray(node[()]) for name, node in datasets.items()}
 
 
 def write_datasets(path: Path, arrays: Datasets) -> None:

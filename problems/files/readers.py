@@ -1,4 +1,4 @@
-"""QPs from files, ``file:PATH``: exports, Maros-Mészáros .mat files, QPS, Parquet."""
+"""QPs from files, ``file:PATH``, in the format that the suffix indicates."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from mortarbench.harness.files.datafile import content
 from mortarbench.harness.files.matfile import matrix, read_mat, to_qp, vector
 from mortarbench.harness.files.parquetfile import load_parquet
 from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.qp import check_convex
+from mortarbench.harness.files.reading import read_json
+from mortarbench.problems.files.clarabel_json import clarabel_qp
 from mortarbench.problems.files.file_digest import format_of
+from mortarbench.problems.files.qplib import parse_qplib
 from mortarbench.problems.files.qps import parse_qps
-from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
+from mortarbench.problems.files.two_sided import LoadedQP, TwoSidedQP, loaded
 
-#: QP, scale and constant: the objective of the file is scale·(objective of the QP) +
-#: constant
-Loaded = tuple[QP, float, float]
-
-#: bound on the memory of the Python objects of a QPS file, relative to the file size
+#: bound on the memory of the Python objects of a text file, relative to its size
 _COPIES = 16
 
 
-def read(path: Path) -> Loaded:
+def read(path: Path, row: int | None = None) -> LoadedQP:
     """Read a QP in the format indicated by the suffix of its path, ignoring .gz.
+
+    row : row of a Parquet file, counted from 1; None for the only row
 
     Raises
     ------
@@ -39,97 +39,102 @@ def read(path: Path) -> Loaded:
         If the suffix is unknown, the file is damaged, or its QP is not convex.
 
     """
-    qp, scale, constant = _READERS[format_of(path)](path)
-    with located(str(path)):
-        check_convex(qp.P)
-    return qp, scale, constant
+    suffix = format_of(path)
+    if suffix == ".parquet":
+        return _with_units(path, load_parquet(path, row))
+    if row is not None:
+        raise InputError(
+            f"{path}#{row}: only Parquet files contain several problems; expected "
+            f"{path}"
+        )
+    return _READERS[suffix](path)
 
 
-def _npz(path: Path) -> Loaded:
-    qp, meta = load_qp(path)
-    with located(str(path)):
-        return _with_units(qp, meta)
+def _npz(path: Path) -> LoadedQP:
+    return _with_units(path, load_qp(path))
 
 
-def _mat(path: Path) -> Loaded:
+def _mat(path: Path) -> LoadedQP:
     """Read a .mat file: an export (it contains G or h) or a Maros-Mészáros problem."""
     arrays = read_mat(path)
     with located(str(path)):
-        if {"G", "h"} & arrays.keys():
-            return _with_units(*to_qp(arrays))
-        two_sided = maros_meszaros(arrays)
-        return one_sided(two_sided), 1.0, two_sided.r
+        if not {"G", "h"} & arrays.keys():
+            return loaded(maros_meszaros(arrays))
+        exported = to_qp(arrays)
+    return _with_units(path, exported)
 
 
-def _parquet(path: Path) -> Loaded:
-    qp, meta = load_parquet(path)
-    with located(str(path)):
-        return _with_units(qp, meta)
+def _text(path: Path, expected: str, parse: Callable[[str], TwoSidedQP]) -> LoadedQP:
+    """Read a text file.
 
-
-def _qps(path: Path) -> Loaded:
-    data = content(path, "a QPS file", copies=_COPIES)
+    expected : description of the file, for messages
+    parse : function that parses the text
+    """
+    data = content(path, expected, copies=_COPIES)
     try:
-        text = data.decode("utf-8")
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8; expected a QPS file") from None
+        raise InputError(f"{path}: not UTF-8; expected {expected}") from None
     with located(str(path)):
-        two_sided, sign = parse_qps(text)
-        return one_sided(two_sided), sign, sign * two_sided.r
+        return loaded(parse(text))
 
 
-_READERS: dict[str, Callable[[Path], Loaded]] = {
+def _json(path: Path) -> LoadedQP:
+    data = read_json(path, "a problem of Clarabel")
+    with located(str(path)):
+        return LoadedQP(clarabel_qp(data))
+
+
+_qps = partial(_text, expected="a QPS file", parse=parse_qps)
+_READERS: dict[str, Callable[[Path], LoadedQP]] = {
     ".npz": _npz,
     ".mat": _mat,
-    ".parquet": _parquet,
     ".qps": _qps,
     ".mps": _qps,
     ".sif": _qps,
+    ".qplib": partial(_text, expected="a QPLIB file", parse=parse_qplib),
+    ".json": _json,
 }
 
 
 def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     """Return the problem  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  from arrays of a .mat file.
 
-    P and q may be named Q and c, and r may be missing. In the files of the collection,
+    P and q may be named Q and c, l and u may be named rl and ru, and r may be missing.
+    Bounds lb and ub of the variables may be missing. In the files of the collection,
     the last n rows of A are the identity; they are converted to bounds of variables.
 
     Raises
     ------
     InputError
-        If a variable is missing, its shape is inconsistent with that of another one, or
-        P, A, q or r contains a number that is not finite.
+        If a variable is missing, or its shape is inconsistent with that of another one.
 
     """
     read = partial(_first_named, arrays)
     P, q = read(matrix, "P", "Q"), read(vector, "q", "c")
-    A, l, u = read(matrix, "A"), read(vector, "l"), read(vector, "u")
+    A, l, u = read(matrix, "A"), read(vector, "l", "rl"), read(vector, "u", "ru")
     r = float(vector(arrays, "r").sum()) if "r" in arrays else 0.0
-    if not all(np.isfinite(values).all() for values in (P.data, A.data, q, r)):
-        raise InputError("P, A, q or r contains inf; expected finite numbers")
     n, m = q.size, l.size
+    lb = vector(arrays, "lb") if "lb" in arrays else np.full(n, -np.inf)
+    ub = vector(arrays, "ub") if "ub" in arrays else np.full(n, np.inf)
     for name, got, right in (
         ("P", P.shape, (n, n)),
         ("A", A.shape, (m, n)),
         ("u", u.shape, (m,)),
+        ("lb", lb.shape, (n,)),
+        ("ub", ub.shape, (n,)),
     ):
         if got != right:
             raise InputError(f"{name} has shape {got}, expected {right}")
     for name, size in (("n", n), ("m", m)):
         if name in arrays and vector(arrays, name).tolist() != [size]:
             raise InputError(f"{name} contradicts the other variables; expected {size}")
-    bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
-    rows = m - n if bounded else m
-    return TwoSidedQP(
-        P=P,
-        q=q,
-        r=r,
-        A=A[:rows],
-        l=l[:rows],
-        u=u[:rows],
-        lb=l[rows:] if bounded else np.full(n, -np.inf),
-        ub=u[rows:] if bounded else np.full(n, np.inf),
-    )
+    if not np.isfinite(r):
+        raise InputError("r contains inf; expected a finite number")
+    if m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0:
+        lb, ub = np.maximum(lb, l[m - n :]), np.minimum(ub, u[m - n :])
+        A, l, u = A[: m - n], l[: m - n], u[: m - n]
+    return TwoSidedQP(P=P, q=q, r=r, A=A, l=l, u=u, lb=lb, ub=ub)
 
 
 def _first_named(
@@ -139,10 +144,12 @@ def _first_named(
     return read(arrays, next((name for name in names if name in arrays), names[0]))
 
 
-def _with_units(qp: QP, meta: Mapping[str, Any]) -> Loaded:
+def _with_units(path: Path, exported: tuple[QP, Mapping[str, Any]]) -> LoadedQP:
+    """Return the QP of an export with the scale and the constant in its meta data."""
+    qp, meta = exported
     scale, constant = meta.get("scale", 1.0), meta.get("constant", 0.0)
     if not all(
         is_number(v) and abs(v) <= sys.float_info.max for v in (scale, constant)
     ):
-        raise InputError("meta: scale or constant is not a finite number")
-    return qp, float(scale), float(constant)
+        raise InputError(f"{path}: meta: scale or constant is not a finite number")
+    return LoadedQP(qp, float(scale), float(constant))

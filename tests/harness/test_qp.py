@@ -3,8 +3,10 @@
 import doctest
 from importlib import import_module
 
+import cvxpy
 import numpy as np
 import pytest
+import qpsolvers
 from scipy.sparse import coo_array, csc_matrix, csr_array, eye_array
 from scipy.sparse.linalg import aslinearoperator
 
@@ -85,8 +87,8 @@ WHOLE = r"expected both triangles, P \+ P.T - diag\(diag\(P\)\)"
         ({"P": [[1, 2], [2, 1]]}, "it has a negative eigenvalue; expected a convex QP"),
         ({"P": None}, "P is missing; expected an array of numbers"),
         ({"P": np.eye(3)}, r"P has shape \(3, 3\); expected \(2, 2\)"),
-        ({"P": np.nan * I2}, "P contains NaN or inf; expected finite numbers"),
-        ({"P": csc_matrix(np.inf * np.ones((2, 2)))}, "P contains NaN or inf"),
+        ({"P": np.nan * I2}, r"P\[0, 0\] is nan; expected a finite number"),
+        ({"P": csc_matrix(np.diag([1, np.inf]))}, r"P\[1, 1\] is inf; expected a fin"),
         ({"P": 1j * I2}, "P is of type complex128; expected an array of numbers"),
         ({"P": csc_matrix(1j * I2)}, "P is of type complex128; expected an array"),
         ({"P": [[1, 2], [3]]}, "P is ragged; expected an array of numbers"),
@@ -95,7 +97,7 @@ WHOLE = r"expected both triangles, P \+ P.T - diag\(diag\(P\)\)"
         ({"q": None}, "q is missing"),
         ({"q": []}, "q is empty; expected at least one variable"),
         ({"q": 1.0}, r"q has shape \(\); expected one dimension"),
-        ({"q": [1, np.nan]}, "q contains NaN or inf"),
+        ({"q": [1, np.nan]}, r"q\[1\] is nan; expected a finite number"),
         ({"q": {1: 2}}, "q is of type dict"),
         ({"G": I2}, "h is missing, but G is present"),
         ({"h": ZERO}, "G is missing, but h is present"),
@@ -106,10 +108,14 @@ WHOLE = r"expected both triangles, P \+ P.T - diag\(diag\(P\)\)"
             r"G has shape \(2, 3\); expected \(rows, 2",
         ),
         ({"A": [1, 1], "b": ZERO}, "b has 2 entries; expected 1, one per row of A"),
-        ({"G": [1, 1], "h": np.inf}, "h contains NaN or inf"),
+        ({"G": I2, "h": [np.inf, np.nan]}, r"h\[1\] is nan; expected a finite"),
+        ({"G": I2, "h": [1, -1e20]}, r"h\[1\] is -inf; expected a finite number"),
+        ({"A": I2, "b": [1, np.inf]}, r"b\[1\] is inf; expected a finite number"),
         ({"lb": [0, 0, 0]}, r"lb has shape \(3,\); expected \(2,\)"),
-        ({"lb": np.nan}, "bounds contain NaN"),
-        ({"lb": 1, "ub": 0}, "bounds cross: lb > ub"),
+        ({"lb": np.nan}, r"lb\[0\] is nan; expected a number below inf"),
+        ({"lb": [0, 1e20]}, r"lb\[1\] is inf; expected a number below inf"),
+        ({"ub": [0, -1e20]}, r"ub\[1\] is -inf; expected a number above -inf"),
+        ({"lb": [0, 3], "ub": 2}, "bounds cross at 1: 3 > 2; expected lb ≤ ub"),
         ({"lb": "low"}, "lb is of type <U3"),
         ({"sets": (1,)}, "expected a tuple of convex sets in addition to lb"),
     ],
@@ -117,6 +123,62 @@ WHOLE = r"expected both triangles, P \+ P.T - diag\(diag\(P\)\)"
 def test_invalid_qp_data_are_refused_in_one_line(changes, message):
     with pytest.raises(InputError, match=message) as e:
         QP.from_arrays(**{"P": I2, "q": ZERO, **changes})
+    assert "\n" not in str(e.value)
+
+
+@pytest.mark.parametrize("kind", [np.array, csc_matrix])
+def test_limits_near_1e20_are_infinite_and_unlimited_rows_are_dropped(kind):
+    """1e20·(1 − 1e-7), as 1e20 after scaling and rounding, is infinite; 1e19 is not."""
+    near = 1e20 * (1 - 1e-7)
+    qp = QP.from_arrays(
+        I2, ZERO, kind([[1, 2], [3, 4], [5, 6]]), [np.inf, 1e19, near],
+        lb=[-near, -1e19], ub=[1e19, near],
+    )  # fmt: skip
+
+    assert (csc_matrix(qp.G).toarray().tolist(), qp.h.tolist()) == ([[3, 4]], [1e19])
+    assert (qp.lb.tolist(), qp.ub.tolist()) == ([-np.inf, -1e19], [1e19, np.inf])
+    assert QP.from_arrays(I2, ZERO, [1, 1], np.inf, lb=-1e20).sizes["bounds"] == 0
+
+
+def test_a_problem_of_qpsolvers_has_the_same_parts():
+    parts = dict(
+        P=I2, q=np.array([1.0, -2.0]), G=csc_matrix([[1.0, 1.0]]), h=np.array([3.0]),
+        A=np.array([1.0, -1.0]), b=np.array([0.5]), lb=np.array([0.0, -np.inf]),
+    )  # fmt: skip
+    qp = QP.from_qpsolvers(qpsolvers.Problem(**parts))
+
+    for name in ("q", "h", "b", "lb"):
+        assert getattr(qp, name).tolist() == parts[name].tolist()
+    assert (qp.P.tolist(), qp.A.tolist()) == (I2.tolist(), [[1, -1]])
+    assert (qp.G.toarray().tolist(), qp.ub.tolist()) == ([[1, 1]], [np.inf] * 2)
+
+
+def test_a_problem_of_cvxpy_has_the_same_minimum():
+    """The point of the line x₁ + x₂ = 1 with x₁ ≥ 0.7 nearest to (1, 2) is (0.7, 0.3):
+    its squared distance is 0.3² + 1.7² = 2.98.
+    """
+    x, level = cvxpy.Variable(2), cvxpy.Parameter(value=0.7)
+    rows = [cvxpy.sum(x) == 1, x[0] >= level]
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(x - [1, 2])), rows)
+    qp = QP.from_cvxpy(problem)
+    s = qpsolvers.solve_qp(
+        *(csc_matrix(M) if M.ndim == 2 else M for M in (qp.P, qp.q, qp.G, qp.h)),
+        csc_matrix(qp.A), qp.b, solver="clarabel",
+    )  # fmt: skip
+
+    assert qp.objective(s) == pytest.approx(2.98, abs=1e-6)
+
+
+@pytest.mark.parametrize("reason", ["concave", "cone", "integer", "no value"])
+def test_a_problem_of_cvxpy_that_is_no_qp_is_refused_in_one_line(reason):
+    x, level = cvxpy.Variable(2, integer=reason == "integer"), cvxpy.Parameter()
+    objective = {"concave": -cvxpy.sum_squares(x), "cone": cvxpy.norm(x)}
+    rows = [x >= level] if reason == "no value" else []
+    function = objective.get(reason, cvxpy.sum_squares(x))
+
+    message = r"cvxpy cannot compile .*; expected a convex|parameter .* has no value"
+    with pytest.raises(InputError, match=message) as e:
+        QP.from_cvxpy(cvxpy.Problem(cvxpy.Minimize(function), rows))
     assert "\n" not in str(e.value)
 
 

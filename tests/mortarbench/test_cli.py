@@ -13,6 +13,7 @@ from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mortarbench import progress
@@ -182,8 +183,22 @@ def test_a_picture_is_drawn_only_if_there_is_a_point(cli, tmp_path):
     assert drawn[::2] == (0, "")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert lost[0] == 1
-    assert "no picture: lost returned no point" in lost[2]
+    assert "no file is written: lost returned no point" in lost[2]
     assert not (tmp_path / "b.png").exists()
+
+
+def test_the_answer_is_written_unless_there_is_no_point(cli, tmp_path):
+    written = cli("solve", "well/primal", "--solver", "exact", "--out", "a.npz")
+    lost = cli("solve", "well/primal", "--solver", "lost", "--out", "b.npz")
+    wrong = cli("solve", "well/primal", "--solver", "exact", "--out", "a.csv")
+
+    assert written[::2] == (0, "")
+    with np.load(tmp_path / "a.npz") as stored:
+        assert {"x", "y", "z", "z_box"} <= set(stored)
+    assert "no file is written: lost returned no point" in lost[2]
+    assert not (tmp_path / "b.npz").exists()
+    assert wrong[0] == 2
+    assert "a.csv: unknown format '.csv'; expected .npz" in wrong[2]
 
 
 def test_an_exported_qp_is_the_emitted_qp_with_the_name_of_its_case(cli, tmp_path):
@@ -364,6 +379,50 @@ def test_output_of_a_plugin_is_not_mixed_with_results(cli, pit):
     assert out.count("\n") == 1
     assert "a plug-in says hello" in err
     assert "a family says hello" in err
+
+
+@pytest.mark.slow
+def test_every_command_prints_only_json_even_if_a_library_in_c_prints(pit, tmp_path):
+    """A library may print on the file descriptor 1 of the process of the command."""
+    noise = "\nimport os\nos.write(1, b'from C\\n')\n"
+    with (tmp_path / "plug.py").open("a") as file:
+        file.write(noise)
+    plugin = ("--plugin", "plug.py")
+    commands = {
+        "list": ("list", "solvers", *plugin),
+        "run": pit,
+        "solve": ("solve", "pit/primal", "--solver", "times", *plugin),
+        "test-solver": ("test-solver", "times", *plugin),
+        "validate": ("validate", "out/pit", *plugin),
+        "report": ("report", "out/pit", "--format", "csv"),
+        "replay": ("replay", "out/pit", "RUN_ID", *plugin),
+        "doctor": ("doctor",),
+    }
+    for arguments in commands.values():
+        if "RUN_ID" in arguments:
+            (journal,) = (tmp_path / "out/pit/journal").iterdir()
+            run_id = json.loads(journal.read_text().splitlines()[0])["run_id"]
+            arguments = [run_id if a == "RUN_ID" else a for a in arguments]
+        done = subprocess.run(
+            [sys.executable, "-m", "mortarbench", *arguments, "--json"],
+            capture_output=True, text=True, check=False, cwd=tmp_path,
+        )  # fmt: skip
+
+        assert json.loads(done.stdout), (arguments, done.stderr)
+        assert ("from C" in done.stderr) == ("plug.py" in arguments)
+    assert set(commands) == {
+        name
+        for name, command in main_module._COMMANDS.items()
+        if main_module._JSON in (*command.options, *command.excluding)
+    }
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-", "<&-"])
+def test_closed_streams_do_not_matter(closed):
+    command = f"{sys.executable} -m mortarbench list solvers {closed}"
+    done = subprocess.run(command, shell=True, capture_output=True, check=False)
+
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_missing_numbers_and_inapplicable_units_are_not_shown(cli):

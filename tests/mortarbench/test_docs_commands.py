@@ -6,6 +6,7 @@ that take too long are run in a shorter form, and those that cannot be run here 
 listed with the reason.
 """
 
+import json
 import re
 import shlex
 import shutil
@@ -235,6 +236,8 @@ def execute(tmp_path, monkeypatch, capsys):
             root.main()
         output = capsys.readouterr()
         assert "Traceback" not in output.err, output.err
+        if "--json" in arguments:
+            json.loads(output.out)
         return ended.value.code
 
     return run

@@ -3,10 +3,13 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import cvxpy
 import numpy as np
 import pytest
+import qpsolvers
 from scipy.sparse import csc_matrix
 
 import mortarbench as mb
@@ -29,6 +32,47 @@ def test_a_qp_is_solved_like_a_case():
     assert answer.solution.z == pytest.approx([0.5], abs=1e-7)
     assert answer.case.name == answer.record.case == "qp"
     assert "verified (claimed solved)" in repr(answer)
+
+
+def test_problems_of_qpsolvers_and_cvxpy_are_solved_like_a_qp():
+    """The minimum of x₁² + x₂² − 2x₁ on x₁ + x₂ = 1 is −1, at (1, 0)."""
+    parts = dict(P=2 * np.eye(2), q=np.array([-2.0, 0.0]), A=np.ones(2), b=np.ones(1))
+    x = cvxpy.Variable(2)
+    problem = cvxpy.Problem(
+        cvxpy.Minimize(cvxpy.sum_squares(x) - 2 * x[0]), [cvxpy.sum(x) == 1]
+    )
+    for one in (qpsolvers.Problem(**parts), problem):
+        answer = mb.solve(one, "clarabel")
+
+        assert answer.verdict is mb.Verdict.VERIFIED
+        assert answer.record.objective == pytest.approx(-1)
+    assert mb.verify(qpsolvers.Problem(**parts), [1, 0]).verdict is mb.Verdict.VERIFIED
+
+
+def test_a_written_answer_contains_the_point_and_the_displacements(tmp_path):
+    """The displacement of the loaded corner is the quantity `tip`."""
+    answer = mb.solve(SMALL, "smalbe")
+    with np.load(answer.save(tmp_path / "a.npz")) as stored:
+        arrays = dict(stored)
+    tip = arrays["points"].sum(axis=1).argmax()  # upper right corner
+
+    for name in ("x", "y", "z", "z_box"):
+        np.testing.assert_array_equal(arrays[name], getattr(answer.solution, name))
+    np.testing.assert_allclose(
+        arrays["displacements"][tip], answer.quantities["tip"], rtol=1e-12
+    )
+    mb.solve(QP, "clarabel").save(tmp_path / "b.npz")
+    with np.load(tmp_path / "b.npz") as stored:
+        assert sorted(stored) == ["x", "y", "z", "z_box"]
+        assert stored["x"] == pytest.approx([0.5, 0.5], abs=1e-7)
+
+
+def test_an_answer_without_a_point_is_not_written(tmp_path):
+    answer = mb.solve(QP, ActiveRow(), options={})
+    lost = replace(answer, solution=None)
+    for path, message in (("a.npz", "returned no point"), ("a.mat", "unknown format")):
+        with pytest.raises(mb.InputError, match=message):
+            lost.save(tmp_path / path)
 
 
 def test_a_solver_object_is_measured_in_a_separate_process():
@@ -475,7 +519,7 @@ def test_the_public_names_suffice_for_plug_ins(tmp_path):
         (lambda: mb.solve(None, "clarabel"), "case = None; expected the name of a cas"),
         (
             lambda: mb.solve(Path("a.npz"), "clarabel"),
-            "QP; write 'file:a.npz' for a file",
+            "cvxpy; write 'file:a.npz' for a file",
         ),
         (
             lambda: mb.solve(QP, None),

@@ -5,6 +5,7 @@ Each block has side 2 and Poisson's ratio zero. A pressure p causes the strain p
 the upper end moves by 4p/E if the blocks are pressed together.
 """
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +92,25 @@ def test_bodies_that_overlap_before_any_load_cause_a_remark(
         assert "a slave node lies 0.1 m inside its master" in case.remarks[0]
 
 
+def test_an_answer_has_the_remarks_on_the_input_too(tmp_path, capsys):
+    """The blocks overlap, are softer than rubber and are compressed by 60 %."""
+    toml = BLOCKS.replace("1e9", "1e4").replace("-1e6", "-6e3")
+    case = f"bodies:{stacked_blocks(tmp_path, gap=-0.1, toml=toml)}/dual"
+    answer = mb.solve(case, "smalbe")
+    texts = (
+        "softer than rubber",
+        "softer than rubber",
+        "lies 0.1 m inside",
+        "moves by",
+    )
+
+    assert len(answer.remarks) == len(texts)
+    for remark, text in zip(answer.remarks, texts, strict=True):
+        assert text in remark
+    main(Registries(), ["solve", case, "--solver", "smalbe", "--json"])
+    assert json.loads(capsys.readouterr().out)["remarks"] == [*answer.remarks]
+
+
 @pytest.mark.parametrize(
     ("bound", "told"),
     [
@@ -104,6 +124,15 @@ def test_a_weak_certificate_causes_a_remark(sound, bound, told):
     found = remarks(sound.case, record, sound.solution)
 
     assert [text.startswith(told) for text in found] == [True] * (told is not None)
+
+
+def test_a_master_without_free_nodes_leaves_standard_output_to_results(tmp_path, capfd):
+    """An empty matrix would make LAPACK print an error on standard output."""
+    toml = BLOCKS + '[[supports]]\nboundary = "table"\nfix = ["x", "y"]\n'
+    case = f"bodies:{stacked_blocks(tmp_path, toml=toml)}/dual"
+    main(Registries(), ["solve", case, "--solver", "smalbe", "--json"])
+
+    assert json.loads(capfd.readouterr().out)["status"] == "verified"
 
 
 def test_an_unverified_answer_has_no_remarks(sound):

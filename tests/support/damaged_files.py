@@ -4,6 +4,7 @@ import io
 import json
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -16,13 +17,16 @@ from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh_files.reading import read_msh
+from mortarbench.problems.files.fclib import read_fclib, write_datasets
 from tests.support.bounded import bounded
+from tests.support.box_stack import local_arrays, write_boxes
 from tests.support.mesh_formats import write_inp, write_med
 
 EXTREMES = (
     0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),
     2**64 - 1, 10**9,
 )  # fmt: skip
+SENTINEL = "SENTINEL"  #: name of a file that a pickle would create
 WORDS = (
     b"nan", b"inf", b"-inf", b"1e400", b"1_0", b"-1", b"0", b"99999999999999999999",
     b"\x00", b"\xff", b"\n", b" ", b"(", b"[" * 300, b"'", b"$End", b"-0.0", b"1e308",
@@ -53,6 +57,57 @@ QUADOBJ
     X2        X2        2.0
 ENDATA
 """
+
+
+QPLIB = b"""TINY  # name
+CCL
+Minimize
+2
+1
+2  lower triangle
+1 1 2.0
+2 2 4.0
+0.0
+1
+1 -1.0
+3.0
+2
+1 1 1.0
+1 2 1.0
+1e20
+-1e20
+0
+4.0
+0
+0.0
+1
+2 -1.0
+1e20
+0
+"""
+
+CLARABEL = b"""{"P": {"m": 2, "n": 2, "colptr": [0, 1, 3], "rowval": [0, 0, 1],
+"nzval": [2.0, -0.5, 2.0]}, "q": [1.0, -1.0], "A": {"m": 3, "n": 2,
+"colptr": [0, 2, 4], "rowval": [0, 1, 0, 2], "nzval": [1.0, -1.0, 2.0, -1.0]},
+"b": [1.0, 0.0, 1e20], "cones": [{"ZeroConeT": 1}, {"NonnegativeConeT": 2}]}
+"""
+
+
+class Touch:
+    """Object that creates a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def object_array(value):
+    """Return an array without dimensions that contains a Python object."""
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return array
 
 
 def tiny_qp(dense=False):
@@ -96,7 +151,15 @@ def seeds(folder):
         written("mat", lambda path, f=form: savemat(path, maros, format=f))
     for compression in ("none", "gzip"):
         written("parquet", lambda path, c=compression: repacked(path, c))
-    found["qps"] = [QPS]
+    none = {"G": np.array(None), "h": np.array(None)}
+    hostile = {"G": object_array(Touch(folder / SENTINEL))}
+    for more in (none, hostile):
+        plain = {"P": np.eye(2), "q": np.ones(2), **more}
+        written("npz", lambda path, a=plain: np.savez(path, **a))
+    found |= {"qps": [QPS], "qplib": [QPLIB], "json": [CLARABEL], "hdf5": []}
+    written("hdf5", lambda path: write_boxes(path, 1))
+    one = local_arrays(np.eye(3), np.ones(3), np.ones(1))
+    written("hdf5", lambda path: write_datasets(path, one))
     found["msh"] = [msh_22(), *meshes(folder)]
     (folder / "text.msh").write_bytes(msh_22())
     for kind, write in (("inp", write_inp), ("med", write_med)):
@@ -280,6 +343,10 @@ def read(path):
             assert mesh.cells.max() < len(mesh.points)
             assert np.isfinite(mesh.points).all()
             return True
+        if path.suffix == ".hdf5":
+            contact = read_fclib(path).contact
+            assert contact.W.shape == (contact.q.size,) * 2
+            return True
         family = PROBLEMS["file"]
         params = family.complete({"path": str(path)})
         case = family.build("qp", params, None)
@@ -308,4 +375,5 @@ def fuzz(kind, count, seed, folder, seconds):
         path.write_bytes(data)
         with bounded(seconds):
             survived += read(path)
+    assert not (folder / SENTINEL).exists()
     return survived

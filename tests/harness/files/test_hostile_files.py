@@ -337,34 +337,27 @@ def text(value):
     return np.array(json.dumps(value) if not isinstance(value, str) else value)
 
 
-ONE = (
-    ("data", np.ones(1)), ("indices", np.zeros(1, int)), ("indptr", np.array([0, 1])),
-    ("shape", np.array([1, 1])),
-)  # fmt: skip
-ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
-
-
 @pytest.mark.parametrize(
     ("write", "message"),
     [
         declared("P is not symmetric", {"P_data": np.ones(7),
             "P_indices": np.array([0, 1, 2, 3, 4, 5, 0]),
             "P_indptr": np.array([0, 1, 2, 3, 4, 5, 7])}),
-        declared("P_data contains NaN or inf", {"P_data": np.full(3, np.nan)}),
         declared("A is not a matrix", {"A_indices": np.array([N])}),
         declared("A is not a matrix", {"A_indices": np.array([-1])}),
         declared("A is not a matrix", {"A_shape": np.array([-1, 6])}),
         declared("A is not a matrix", {"A_shape": np.array([1, N])}),
-        declared("QP.A has shape", {"A_shape": np.array([2**40, 6])}),
+        declared("b has 1 entries; expected 1099511627776", {
+            "A_shape": np.array([2**40, 6])}),
         declared("A is not a matrix", {"A_indptr": np.zeros((7, 2), dtype=int)}),
         declared("indptr decreases", {
             "A_indptr": np.array([0, 1, -2**31, -1, 1, 1, 1], dtype=np.int32)}),
         declared("must contain integers", {"A_indices": np.array([0.5])}),
         declared("q is of type", {"q": np.array(["1"] * 6)}),
         declared("q is of type", {"q": np.ones(6, dtype=complex)}),
-        declared("QP.q contains NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
-        declared("bounds contain NaN", {"lb": np.full(6, np.nan)}),
-        declared("QP.h has shape", {"h": np.ones((2, 1))}),
+        declared(r"q\[0\] is inf; expected", {"q": np.full(6, np.longdouble("1e400"))}),
+        declared(r"lb\[0\] is nan; expected a number", {"lb": np.full(6, np.nan)}),
+        declared(r"h has shape \(2, 2\)", {"h": np.ones((2, 2))}),
         declared("meta is not a string", {"meta": np.array([1, 2])}),
         declared("meta is not a JSON object", {"meta": text([])}),
         declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
@@ -376,7 +369,6 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
-        declared("K, B, fixed and q are inc", {"fixed": np.array([9]), **ONE_BY_ONE}),
     ],
 )  # fmt: skip
 def test_numbers_that_define_no_qp_are_named(tmp_path, cheaply, write, message):
@@ -603,17 +595,22 @@ def test_the_undamaged_mesh_is_read(tmp_path):
 
 # random damage
 
-KINDS = ("npz", "mat", "qps", "msh", "inp", "med", "parquet")
+#: numbers of damaged files in the slow test: 3600 QPs, 500 of FCLIB, 3000 meshes
+COUNTS = {
+    **dict.fromkeys(("npz", "mat", "parquet", "qps", "qplib", "json"), 600),
+    "hdf5": 500,
+    **dict.fromkeys(("msh", "inp", "med"), 1000),
+}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", COUNTS)
 def test_a_damaged_file_is_refused_in_one_line_or_is_a_qp(tmp_path, kind):
     fuzz(kind, 2 if kind == "parquet" else 30, 11, tmp_path, seconds=120)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_none_of_a_thousand_damaged_files_causes_a_crash_or_hang(tmp_path, kind):
-    survived = fuzz(kind, 1000, 12, tmp_path, seconds=120)
+@pytest.mark.parametrize(("kind", "count"), COUNTS.items())
+def test_no_damaged_file_causes_a_crash_or_hang_or_runs_code(tmp_path, kind, count):
+    survived = fuzz(kind, count, 12, tmp_path, seconds=120)
 
-    assert 0 < survived < 500  # some files survive the damage, others do not
+    assert 0 < survived < count / 2  # some files survive the damage, others do not

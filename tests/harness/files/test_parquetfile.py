@@ -12,7 +12,11 @@ from scipy.sparse import csc_array, csr_array, eye_array, issparse
 from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness import QP, InputError, no_rows
-from mortarbench.harness.files.parquetfile import load_parquet, save_parquet
+from mortarbench.harness.files.parquetfile import (
+    count_problems,
+    load_parquet,
+    save_parquet,
+)
 
 P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
 COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub", "name")
@@ -116,25 +120,27 @@ def columns(**changes):
     [
         pytest.param(
             {"P": [1.0, 2.0], "q": [1.0, 1.0]},
-            r"QP.P has shape \(1, 2\), expected \(2,",
+            r"P has shape \(1, 2\); expected \(2,",
             marks=pytest.mark.slow,
         ),
         (
             {"P": [1.0] * 3, "q": [1.0, 1.0]},
             "P has 3 entries; expected rows of 2 entries",
         ),
-        pytest.param({"P": [np.nan]}, "P contains NaN or inf", marks=pytest.mark.slow),
+        pytest.param({"P": [np.nan]}, r"P\[0, 0\] is nan", marks=pytest.mark.slow),
         pytest.param(
             {"P": ["one"]}, "P is not a list of numbers", marks=pytest.mark.slow
         ),
         ({"q": None}, "P or q is null"),
         pytest.param(
             {"b": [3.0]},
-            r"QP.A has shape \(0, 1\), expected \(1, 1\)",
+            "A is missing, but b is present",
             marks=pytest.mark.slow,
         ),
         pytest.param(
-            {"lb": [2.0], "ub": [1.0]}, "bounds cross", marks=pytest.mark.slow
+            {"lb": [2.0], "ub": [1.0]},
+            "bounds cross at 0: 2 > 1",
+            marks=pytest.mark.slow,
         ),
         ({"ub": "left out"}, "no column ub"),
         pytest.param({"P": 3.0}, "P is not a list of numbers", marks=pytest.mark.slow),
@@ -148,11 +154,31 @@ def test_a_file_without_a_problem_is_refused_in_one_line(path, changes, message)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("rows", [0, 2])
-def test_a_set_of_several_problems_is_refused(path, rows):
-    one = pa.table(columns())
-    pq.write_table(pa.concat_tables([one] * rows) if rows else one.slice(0, 0), path)
-    with pytest.raises(InputError, match=f"contains {rows} problems; expected one row"):
+def several(path, count, group):
+    """Write min ½x² − ix for i = 0, 1, …, in row groups of the given size."""
+    tables = [pa.table(columns(q=[-float(i)], G=[1.0], h=[9.0])) for i in range(count)]
+    rows = pa.concat_tables(tables) if count else pa.table(columns()).slice(0, 0)
+    pq.write_table(rows, path, row_group_size=group)
+
+
+@pytest.mark.parametrize("group", [1, 2, 5])
+def test_a_row_of_several_problems_is_read(path, group):
+    several(path, 5, group)
+
+    assert count_problems(path) == 5
+    assert [load_parquet(path, i + 1)[0].q.tolist() for i in range(5)] == [
+        [-i] for i in range(5)
+    ]
+    with pytest.raises(InputError, match=r"qp.parquet#6: expected a row from 1 to 5"):
+        load_parquet(path, 6)
+
+
+@pytest.mark.parametrize(
+    ("rows", "choice"), [(0, "one row"), (2, ".*qp.parquet#1 or another row up to #2")]
+)
+def test_several_problems_need_a_row(path, rows, choice):
+    several(path, rows, 1)
+    with pytest.raises(InputError, match=f"has {rows} problems; expected {choice}$"):
         load_parquet(path)
 
 

@@ -1,12 +1,16 @@
 import json
+import pickle
+import zipfile
 
 import numpy as np
 import pytest
+import qpsolvers
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness import QP, InputError, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
+from tests.support.damaged_files import Touch, object_array
 
 P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
 
@@ -86,18 +90,24 @@ def test_a_file_name_is_taken_as_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"h": None, "G_indptr": None}, "h, G_indptr missing"),
+        ({"h": None, "G_indptr": None}, "G_indptr missing, but G_data is present"),
         ({"meta": np.array("[1]")}, "meta is not a JSON object"),
         ({"meta": np.array("{")}, "Expecting property name"),
-        ({"q": np.zeros(2)}, r"QP.P has shape \(3, 3\), expected \(2, 2\)"),
+        ({"q": np.zeros(2)}, r"P has shape \(3, 3\); expected \(2, 2\)"),
         ({"q": np.array(["a", "b", "c"])}, "q is of type <U1; expected numbers"),
-        ({"q": np.array([1.0, np.nan, 0.0])}, "QP.q contains NaN or inf"),
+        (
+            {"q": np.array([1.0, np.nan, 0.0])},
+            r"q\[1\] is nan; expected a finite number",
+        ),
         ({"lb": np.full(3, 2.0)}, "bounds cross"),
         ({"P_indices": np.array([0, 1, 0, 7])}, "P is not a matrix in CSC parts"),
         ({"P_indices": np.array([0.0, 1, 0, 1])}, "must contain integers"),
         ({"P_indptr": np.array([0, 2])}, "P is not a matrix in CSC parts"),
         ({"P_shape": np.array([3])}, "P is not a matrix in CSC parts"),
-        ({"P_data": np.array([2.0, np.nan, 1, 3])}, "P_data contains NaN or inf"),
+        (
+            {"P_data": np.array([2.0, np.nan, 1, 3])},
+            r"P\[1, 0\] is nan; expected a finite number",
+        ),
     ],
 )
 def test_a_malformed_file_is_named_with_the_error(saved, changes, complaint):
@@ -136,6 +146,37 @@ def plain(**changes):
         "A": np.array([[1, -1]]), "b": [0], "lb": [-np.inf, 0], "ub": [1.0, np.inf],
     }  # fmt: skip
     return {k: v for k, v in (arrays | changes).items() if v is not None}
+
+
+@pytest.mark.parametrize("protocol", [3, 4])
+def test_a_file_of_qpsolvers_may_contain_none(tmp_path, protocol):
+    """Absent parts are pickled, in protocol 3 before NumPy 2."""
+    qpsolvers.Problem(np.diag([2.0, 3.0]), np.ones(2), lb=np.zeros(2)).save(
+        tmp_path / "a.npz"
+    )
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    begin = members["G.npy"].index(b"\n") + 1
+    assert pickle.loads(members["G.npy"][begin:]).item() is None
+    none = members["G.npy"][:begin] + pickle.dumps(np.array(None), protocol)
+    with zipfile.ZipFile(tmp_path / "b.npz", "w") as archive:
+        for name, data in {**members, "G.npy": none}.items():
+            archive.writestr(name, data)
+    qp, _ = load_qp(tmp_path / "b.npz")
+
+    assert (qp.P.tolist(), qp.q.tolist()) == ([[2, 0], [0, 3]], [1, 1])
+    assert (qp.lb.tolist(), qp.ub.tolist()) == ([0, 0], [np.inf] * 2)
+    assert qp.G.shape == qp.A.shape == (0, 2)
+
+
+@pytest.mark.parametrize("value", [[1.0], [None], False])
+def test_no_other_object_counts_as_none_and_none_is_unpickled(tmp_path, value):
+    sentinel = tmp_path / "SENTINEL"
+    for held in (value, Touch(sentinel)):
+        np.savez(tmp_path / "a.npz", **plain(G=object_array(held)))
+        with pytest.raises(InputError, match="G is a pickled Python object"):
+            load_qp(tmp_path / "a.npz")
+    assert not sentinel.exists()
 
 
 def test_plain_arrays_are_a_qp(tmp_path):
@@ -182,10 +223,10 @@ def test_a_sparse_matrix_may_be_passed_as_its_arrays(tmp_path):
         ({"P": np.array([[1.0, 2.0], [0.0, 1.0]])}, "P is not symmetric: P["),
         (
             {"G": np.array([[np.nan, 1.0]])},
-            "G contains NaN or inf; expected finite num",
+            "G[0, 0] is nan; expected a finite number",
         ),
         ({"h": np.array(["4"])}, "h is of type <U1; expected numbers"),
-        ({"lb": [2.0, 0.0]}, "QP bounds cross"),
+        ({"lb": [2.0, 0.0]}, "bounds cross at 0: 2 > 1"),
     ],
 )
 def test_plain_arrays_that_do_not_define_a_qp_are_refused(tmp_path, changes, complaint):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -460,3 +461,28 @@ def test_a_suite_takes_a_pattern_and_keeps_copies(tmp_path):
     for seed in range(2):
         (tmp_path / f"{seed}.hdf5").unlink()
     assert mb.replay(tmp_path / "out", run_id).now.verdict is mb.Verdict.VERIFIED
+
+
+def test_a_name_that_is_not_text_is_refused_in_one_line(tmp_path):
+    """A damaged byte in the name of a group is not UTF-8."""
+    path = tmp_path / "one.hdf5"
+    write_datasets(path, one_contact())
+    data = path.read_bytes()
+    assert data.count(b"fclib_local") == 1
+    path.write_bytes(data.replace(b"fclib_local", b"fclib_l\xffcal"))
+
+    with pytest.raises(InputError, match=r"one\.hdf5: damaged, or not HDF5; expected"):
+        read_fclib(path)
+
+
+def test_data_in_another_file_are_not_read(tmp_path):
+    path = tmp_path / "one.hdf5"
+    write_datasets(path, one_contact())
+    with h5py.File(path, "a") as file:
+        del file["fclib_local/vectors/q"]
+        file["fclib_local/vectors"].create_dataset(
+            "q", (3,), dtype="f8", external="/etc/passwd"
+        )
+
+    with pytest.raises(InputError, match=r"one\.hdf5: arrays in other files"):
+        read_fclib(path)

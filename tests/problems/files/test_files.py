@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import highspy
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import loadmat, savemat
 from scipy.sparse import (
@@ -23,11 +24,12 @@ from mortarbench.harness import QP, InputError
 from mortarbench.harness.files.qpfile import explicit_matrices, load_qp, save_qp
 from mortarbench.harness.names import assemble, parse
 from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.files.qps import parse_qps, save_qps
 from mortarbench.problems.files.readers import read
-from mortarbench.problems.files.two_sided import one_sided
+from mortarbench.problems.files.two_sided import loaded
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -114,9 +116,9 @@ def assert_same(one, two):
 
 
 def test_a_qps_text_defines_the_qp_of_its_sections():
-    given, sign = parse_qps(QPS)
+    given = parse_qps(QPS)
 
-    assert sign == 1
+    assert not given.maximise
     assert given.r == 4  # the RHS of the objective is −r
     np.testing.assert_array_equal(given.q, [1.5, -2, 0, 0, 0])
     expected = np.zeros((5, 5))
@@ -153,7 +155,7 @@ def test_highs_reads_the_same_qp(tmp_path, section):
     path = tmp_path / "a.mps"
     path.write_text(text)
 
-    given, _ = parse_qps(text)
+    given = parse_qps(text)
     ours = (given.P.toarray(), given.A.toarray(), given.q, given.l, given.u,
             given.lb, given.ub, given.r)  # fmt: skip
     for mine, theirs in zip(ours, highs_reads(path), strict=True):
@@ -190,7 +192,7 @@ def of_symmetric_part(qp):
 def test_an_exported_qps_comes_back_to_the_last_digit(tmp_path):
     qp = awkward(np.random.default_rng(31))
     save_qps(tmp_path / "a.qps", qp, {"name": "a case", "two": "lines\nof it"})
-    back, scale, constant = read(tmp_path / "a.qps")
+    back, scale, constant, _ = read(tmp_path / "a.qps")
 
     assert_same(qp, back)
     assert (scale, constant) == (1.0, 0.0)
@@ -224,7 +226,9 @@ def test_highs_reads_an_exported_qps(tmp_path):
 def test_values_that_qps_treats_as_infinite_are_not_written(tmp_path):
     qp = replace(awkward(np.random.default_rng(33)), h=np.array([0.0, 1.0, 1e20]))
 
-    with pytest.raises(InputError, match=r"h contains 1e\+20, but QPS treats 1e\+20"):
+    with pytest.raises(
+        InputError, match=r"h contains 1e\+20, but QPS treats 9.99999e\+19"
+    ):
         save_qps(tmp_path / "a.qps", qp, {})
     assert [*tmp_path.iterdir()] == []
 
@@ -264,10 +268,10 @@ def test_unknown_formats_are_refused_compressed_or_not(written, name, message):
 def test_the_name_of_a_set_may_be_left_out():
     bare = re.sub(r"^    (rhs|rng)", "    ", QPS, flags=re.MULTILINE)
     bare = re.sub(r"^ (UP|FR|MI|FX) bnd", r" \1", bare, flags=re.MULTILINE)
-    one, two = parse_qps(QPS)[0], parse_qps(bare)[0]
+    one, two = parse_qps(QPS), parse_qps(bare)
 
     assert bare != QPS
-    assert_same(one_sided(one), one_sided(two))
+    assert_same(loaded(one).qp, loaded(two).qp)
 
 
 @pytest.mark.parametrize(
@@ -280,7 +284,7 @@ def test_the_name_of_a_set_may_be_left_out():
 )
 def test_the_sign_of_a_range_matters_for_equalities_only(old, new, limits):
     assert old in QPS
-    given, _ = parse_qps(QPS.replace(old, new))
+    given = parse_qps(QPS.replace(old, new))
 
     assert list(zip(given.l, given.u, strict=True))[:3] == limits
 
@@ -288,9 +292,95 @@ def test_the_sign_of_a_range_matters_for_equalities_only(old, new, limits):
 def test_a_negative_upper_bound_alone_frees_the_lower_side():
     negative = QPS.replace(" UP bnd       c1                20.0", " UP bnd c1 -3")
 
-    assert parse_qps(negative)[0].lb[0] == -np.inf
+    assert parse_qps(negative).lb[0] == -np.inf
     both = negative.replace(" UP bnd c1", " LO bnd c1 -5\n UP bnd c1")
-    assert parse_qps(both)[0].lb[0] == -5
+    assert parse_qps(both).lb[0] == -5
+
+
+def qptest(r1="r1", r2="r2", c1="c1", c2="c2", rhs="rhs1", bnd="bnd1"):
+    """Return the problem QPTEST of the collection in fixed columns, with given names.
+
+    Its published optimum is 4.371875; here the objective also has the constant 4.
+    """
+
+    def line(*fields):
+        text = "    {:<10}{:<10}{:>12}   {:<10}{:>12}"
+        return text.format(*fields, *[""] * (5 - len(fields))).rstrip()
+
+    lines = [
+        "NAME          QPTEST", "ROWS", " N  obj", f" G  {r1}", f" L  {r2}", "COLUMNS",
+        line(c1, r1, "2.0", r2, "-1.0"), line(c1, "obj", "1.5"),
+        line(c2, r1, "1.0", r2, "2.0"), line(c2, "obj", "-2.0"), "RHS",
+        line(rhs, "obj", "-4.0"), line(rhs, r1, "2.0", r2, "6.0"), "BOUNDS",
+        f" UP {line(bnd, c1, '20.0')[4:]}", "QUADOBJ", line(c1, c1, "8.0"),
+        line(c1, c2, "2.0"), line(c2, c2, "10.0"), "ENDATA",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+QPTEST = qptest()
+
+
+def value_of(case):
+    return case.quantities(solved(case.qp))["value"]
+
+
+def test_the_published_optimum_of_qptest(written):
+    assert value_of(build(written(QPTEST, "a.qps"))) == pytest.approx(8.371875)
+
+
+@pytest.mark.parametrize(
+    ("section", "after", "other"),
+    [
+        ("BOUNDS", "20.0\n", " UP other     c1  0.5\n"),
+        ("RHS", "6.0\n", "    other     r1  3.0\n"),
+        ("RANGES", "6.0\n", "RANGES\n    first  r2  99.0\n    other  r1  0.0\n"),
+    ],
+)
+def test_of_several_sets_the_first_is_used_with_a_remark(
+    written, section, after, other
+):
+    """Any other set would change the optimum."""
+    text = QPTEST.replace(after, after + other, 1)
+    case = build(written(text, "a.qps"))
+
+    assert value_of(case) == pytest.approx(8.371875)
+    (remark,) = case.remarks
+    assert remark.startswith(f"{section}: the set 'other' is ignored")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        QPTEST.replace("1.5", "1.5  $ a cost").replace("N  obj", "N  obj  $ first"),
+        QPTEST.replace("20.0", "20.0 * a comment").replace("10.0", "10.0 $"),
+        f"$ a comment\n* another\n{QPTEST}",
+        qptest(r1="$r1", c2="*c2", rhs="$"),
+        qptest(r1="row 1", r2="a  row", c1="c 1", c2="1 2", rhs="the rhs", bnd="a b"),
+        qptest(r1="row 1").replace("1.5", "1.5   $ a cost"),
+        qptest(c1="c 1", rhs="", bnd=""),
+    ],
+)
+def test_comments_and_names_with_spaces_or_special_characters(written, text):
+    assert value_of(build(written(text, "a.qps"))) == pytest.approx(8.371875)
+
+
+def test_names_with_spaces_need_fixed_columns(written):
+    text = qptest(c1="c 1").replace(" UP bnd1      c 1", " UP bnd1 c 1")
+    with pytest.raises(InputError, match="line 15: column 'bnd1 c 1' is not among COL"):
+        build(written(text, "a.qps"))
+
+
+@pytest.mark.parametrize("line", ["OBJSENSE MAX", "OBJSENSE\n    maximize"])
+def test_a_maximised_linear_objective(written, line):
+    """The maximum of x₁ + 2x₂ for 0 ≤ x and x₁ + x₂ ≤ 2 is 4, at (0, 2)."""
+    text = (
+        f"NAME\n{line}\nROWS\n N obj\n L sum\nCOLUMNS\n x1 obj 1 sum 1\n"
+        " x2 obj 2 sum 1\nRHS\n rhs sum 2 obj -1\nENDATA\n"
+    )
+    case = build(written(text, "a.mps"))
+
+    assert value_of(case) == pytest.approx(5.0)  # with the constant 1
 
 
 def test_a_maximised_objective_is_minus_a_minimised_one(written):
@@ -322,8 +412,13 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
         ("QUADOBJ", "QSECTION r1", "line 29: QSECTION 'r1' belongs to a constraint"),
         ("ENDATA\n", "", "no ENDATA; the file is truncated"),
         (" N  obj\n", " G  obj\n", None),
-        ("MI bnd       c4", "LO bnd c4 1e20", "the limits of variable 3 (from 0)"),
-        ("FX bnd       c5  ", "UP bnd c5 1\n LO bnd c5 ", "the limits of variable 4"),
+        ("MI bnd       c4", "LO bnd c4 1e20", "the limits of variable 'c4' are inf an"),
+        ("FX bnd       c5  ", "UP bnd c5 1\n LO bnd c5 ", "the limits of variable 'c5' "
+         "cross: 2 > 1"),
+        ("FX bnd       c5  ", "UP bnd c5 1\n UP bnd c5 ", "line 29: bound UP of column "
+         "'c5' is given twice"),
+        ("ENDATA", "QMATRIX\nENDATA", "line 33: QMATRIX after QUADOBJ; expected one"),
+        ("c1        c2 ", "col 1     c2 ", "line 31: wrong number of fields"),
     ],
 )  # fmt: skip
 def test_a_bad_qps_text_is_refused_with_its_line(written, old, new, message):
@@ -385,12 +480,25 @@ def test_identity_rows_at_the_end_are_the_bounds(written):
     np.testing.assert_array_equal(qp.ub, [1, np.inf, np.inf, 2])
 
 
-def test_older_names_of_p_and_q_are_accepted(written):
-    older = {"Q": MAT["P"], "c": MAT["q"]} | {
-        k: v for k, v in MAT.items() if k not in ("P", "q", "r", "n", "m")
-    }
+def test_older_names_and_separate_bounds_are_accepted(written):
+    lb, ub = np.array([[0.0, -np.inf, -1, 2]]), np.array([[1.0, 1e20, 1e20, 2]])
+    names = {"P": "Q", "q": "c", "l": "rl", "u": "ru", "A": "A"}
+    older = {new: MAT[old] for old, new in names.items()} | {"lb": lb, "ub": ub}
+    rows = {
+        "A": csc_matrix(vstack([MAT["A"], eye_array(4)])), "m": 9,
+        "l": np.hstack([MAT["l"], lb]), "u": np.hstack([MAT["u"], ub]),
+    }  # fmt: skip
 
-    assert_same(build(written(older, "b.mat")).qp, build(written(MAT, "a.mat")).qp)
+    assert_same(
+        build(written(older, "b.mat")).qp, build(written(MAT | rows, "a.mat")).qp
+    )
+
+
+def test_limits_near_1e20_are_infinite(written):
+    """A limit of 1e20 may change in its seventh digit when a file is converted."""
+    near = MAT | {"l": np.array([[1.0, -9.999_999_9e19, -2, -9.999_995e19, -1]])}
+
+    assert_same(build(written(near, "b.mat")).qp, build(written(MAT, "a.mat")).qp)
 
 
 @pytest.mark.parametrize(
@@ -401,6 +509,12 @@ def test_older_names_of_p_and_q_are_accepted(written):
         ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
         ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
         ({"q": np.full(4, np.nan)}, "q contains NaN"),
+        ({"q": np.full(4, np.inf)}, "q[0] is inf; expected a finite number"),
+        ({"lb": np.zeros(3)}, "lb has shape (3,), expected (4,)"),
+        (
+            {"lb": np.full(4, 3), "ub": np.full(4, 2)},
+            "the limits of variable 0 (from 0) cross: 3 > 2",
+        ),
         ({"q": "text"}, "q is not a matrix of numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
         ({"m": 7}, "m contradicts the other variables; expected 5"),
@@ -626,6 +740,50 @@ def test_a_file_can_be_solved_by_name(written, command):
     assert record["case"] == "file:a.qps"
     assert len(record["params"]["sha256"]) == 12
     assert record["quantities"]["value"] == pytest.approx(record["objective"] + 4)
+
+
+@pytest.fixture
+def two_rows(tmp_path, monkeypatch):
+    """A Parquet file in the working directory with the minima of ½x² − x and ½x² − 2x,
+    which are −½ and −2."""
+    monkeypatch.chdir(tmp_path)
+    frame = {name: [None, None] for name in ("G", "h", "A", "b", "lb", "ub")}
+    frame |= {"P": [[1.0], [1.0]], "q": [[-1.0], [-2.0]], "name": ["one", "two"]}
+    pd.DataFrame(frame).to_parquet("two.parquet", index=False)
+    return "two.parquet"
+
+
+def test_a_row_of_a_parquet_file_is_a_case(two_rows):
+    first, second = (build(f"file:{two_rows}#{i}") for i in (1, 2))
+
+    assert parse(f"file:{two_rows}#2", PROBLEMS).name == f"file:{two_rows}#2"
+    assert value_of(first) == pytest.approx(-0.5)
+    assert value_of(second) == pytest.approx(-2.0)
+    with pytest.raises(InputError, match=r"two.parquet: has 2 problems; expected two"):
+        build(f"file:{two_rows}")
+
+
+def test_only_parquet_files_have_rows(written):
+    with pytest.raises(InputError, match=r"a.qps#2: only Parquet files contain sev"):
+        build(f"{written(QPS, 'a.qps')}#2")
+
+
+@pytest.mark.parametrize("path", ["two.parquet", "*.parquet"])
+def test_a_suite_contains_all_rows_of_a_file_even_without_the_file(
+    two_rows, tmp_path, command, path
+):
+    (tmp_path / "s.toml").write_text(
+        'name = "s"\nrepeats = 1\nsolvers = ["clarabel"]\n[[problems]]\n'
+        f'family = "file"\nparams = {{ path = "{path}" }}\n'
+    )
+    for _ in range(2):  # the second time, only the copy exists
+        assert command("run", "s.toml", "--out", "out", "--quiet")[0] == 0
+        (tmp_path / two_rows).unlink(missing_ok=True)
+    records = read_journal(tmp_path / "out")
+
+    assert sorted((r.case, round(r.objective, 6)) for r in records) == [
+        ("file:two.parquet#1", -0.5), ("file:two.parquet#2", -2.0)
+    ]  # fmt: skip
 
 
 def test_a_run_does_not_continue_with_a_changed_file(written, command, tmp_path):
