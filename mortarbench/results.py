@@ -156,7 +156,8 @@ class Results:
 
         target = None if path is None else check_output_file(path, PICTURES)
         available = figures(self.folder)
-        names = [n for n in available if n == kind or n.startswith(f"{kind}-")]
+        names = [n for n in available if n.startswith(f"{kind}-")]
+        names = [kind] if kind in available else names
         if len(names) != 1:
             raise unknown("figure", str(kind), available, where=str(self.folder))
         figure = available[names[0]]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mortarbench.harness.errors import unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.reports.data.environment import dateline
+from mortarbench.reports.data.environment import by_environment, dateline
 from mortarbench.reports.data.evidence import Evidence, read_evidence
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
@@ -103,20 +103,23 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
         If the folder contains no measurements.
 
     """
-    composed = opening(Analysis(read_evidence(Path(directory), factor)))
+    evidence = read_evidence(Path(directory), factor)
+    composed = opening(*map(Analysis, by_environment(evidence)))
     return [line for s in composed for each in s.statements for line in each.lines]
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
     """Compose the report: first the conclusions, then the evidence for them.
 
+    If the folder contains several environments, each has its own sections.
     The conclusions compare combinations of solver and form, and the solvers within each
     form; `pool_forms` does not change these conclusions.
     """
     collecting = gc.isenabled()
     gc.disable()  # table cells form no cycles; collection took a third of the time
+    parts = by_environment(evidence)
     try:
-        composed = tuple(sections(Analysis(evidence, pool_forms=pool_forms)))
+        composed = tuple(sections(*(Analysis(e, pool_forms=pool_forms) for e in parts)))
     finally:
         if collecting:
             gc.enable()
@@ -124,6 +127,6 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         title=clean(evidence.name),
         dateline=dateline(evidence),
         sections=composed,
-        records=evidence.records,
+        records=tuple(r for e in parts for r in e.records),
         solvers=evidence.solvers,
     )

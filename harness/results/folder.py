@@ -434,12 +434,14 @@ def differences(
 
 
 def same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return True if times measured in two environments may be divided.
+    """Return True if two environments describe the same machine, threads and BLAS.
 
-    Differences in versions, source and plug-ins are usually the subject of such a
-    comparison.
+    Differences in versions, source and plug-ins are usually the subject of a comparison
+    of times. An unknown machine is not the same as any other.
     """
-    return all(one.get(part) == other.get(part) for part in HARDWARE)
+    return bool(one.get("machine")) and all(
+        one.get(part) == other.get(part) for part in HARDWARE
+    )
 
 
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
