@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 from mortarbench.harness.errors import unknown
@@ -88,12 +89,12 @@ def figures(
     return {picture.name: picture.figure for picture in pictures}
 
 
-def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
-    """Return the opening sentences of the report on a result folder.
+def answer(directory: Path, factor: float = VERIFIED_FACTOR) -> list[str]:
+    """Return the first sentence of the report for each environment.
 
-    If the forms of the problems can be compared, the first sentences name the
-    combination of solver and form that leads fastest from the mesh to a verified
-    answer. The others compare the solvers of each form and name failures.
+    If the forms of the problems can be compared, the sentence names the combination of
+    solver and form that leads fastest from the mesh to a verified answer; otherwise, it
+    compares the solvers of the first form.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 
@@ -103,9 +104,11 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
         If the folder contains no measurements.
 
     """
-    evidence = read_evidence(Path(directory), factor)
-    composed = opening(*map(Analysis, by_environment(evidence)))
-    return [line for s in composed for each in s.statements for line in each.lines]
+    opened = map(
+        opening, map(Analysis, by_environment(read_evidence(directory, factor)))
+    )
+    said = ((s.lines[0] for part in of for s in part.statements) for of in opened)
+    return [line for first in said for line in islice(first, 1)]
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:

@@ -196,7 +196,7 @@ class Section:
         return replace(
             self,
             name=self.name + mark,
-            title=f"{self.title}: {place}",
+            title=f"{self.title} ({place})",
             statements=tuple(
                 replace(
                     s,

@@ -136,10 +136,11 @@ def sections(*analyses: Analysis) -> Iterator[Section]:
             missing.append(entry.needs)
 
 
-def opening(*analyses: Analysis) -> list[Section]:
+def opening(analysis: Analysis) -> Iterator[Section]:
     """Compose the sections with conclusions, which precede the evidence."""
-    entries = [entry for entry in _entries() if entry.place < EVIDENCE]
-    return [one for entry in entries for one in _composed(entry, analyses)]
+    for entry in _entries():
+        if entry.place < EVIDENCE:
+            yield from _composed(entry, [analysis])
 
 
 def _composed(entry: _Entry, analyses: Sequence[Analysis]) -> Iterator[Section]:

@@ -109,7 +109,7 @@ def test_every_number_of_a_machine_is_the_number_of_its_own_folder(folders):
         assert contents(both[name]) == contents(one[name]), name
         there = both[f"{name}-etwo"]
         assert contents(there) == contents(two[name]), name
-        assert there.title.endswith(": other machine @etwo")
+        assert there.title.endswith(" (other machine @etwo)")
         assert all(t.notes[0].endswith("machine @etwo.") for t in there.tables)
         assert all("other machine @etwo" in p.caption for p in there.pictures)
         assert all("other machine @etwo" in s.subject for s in there.statements)
@@ -146,7 +146,7 @@ def test_another_version_on_the_same_machine_is_called_an_environment(tmp_path):
     merge([a, b], tmp_path / "c")
     titles = [s.title for s in compose(read_evidence(tmp_path / "c")).sections]
 
-    assert "Times: other environment @e2" in titles
+    assert "Times (other environment @e2)" in titles
 
 
 def test_folders_of_two_machines_are_compared_without_ratios(folders):
@@ -274,5 +274,5 @@ def test_a_repeat_that_disagrees_with_the_environment_file_is_kept(tmp_path):
     page = compose(read_evidence(folder))
 
     assert len(page.records) == len(mixed)
-    assert "Times: other machine @gone" in [s.title for s in page.sections]
+    assert "Times (other machine @gone)" in [s.title for s in page.sections]
     assert json.loads((folder / "environment.json").read_text())["digest"] == "e"
