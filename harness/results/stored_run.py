@@ -121,20 +121,16 @@ def _cell(r: Record) -> tuple[Any, ...]:
 
 
 def _find_record(folder: Path, name: str, records: Sequence[Record]) -> Record:
+    names = [r.identity if "-" in name else r.run_id for r in records]
     for matches in (str.__eq__, str.startswith):
-        found = [
-            r
-            for r in records
-            if name and (matches(r.run_id, name) or matches(r.identity, name))
-        ]
-        if len(found) == 1:
+        found = [r for r, n in zip(records, names, strict=True) if matches(n, name)]
+        if len(found) == 1 and name:
             return found[0]
-        if found:
+        if found and name:
             first = ", ".join(sorted(r.identity for r in found)[:3])
             raise InputError(
-                f"{folder} contains {len(found)} measurements whose run_id, or session "
-                f"and run_id, begin with {name!r} ({first}); give more digits, or "
-                "SESSION-RUN_ID"
+                f"{folder} contains {len(found)} measurements whose run_id begins with "
+                f"{name!r} ({first}); give more digits, or SESSION-RUN_ID"
             )
     near = get_close_matches(name, [r.run_id for r in records], n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
