@@ -128,7 +128,8 @@ class Record(Measurement):
     """
 
     schema: int = SCHEMA
-    run_id: str  #: digest of the task; equal in every run of the same suite
+    #: digest of the task; equal in every run of the same suite, see `identity`
+    run_id: str
     case: str  #: canonical name
     family: str
     params: Mapping[str, Any]
@@ -200,13 +201,19 @@ class Record(Measurement):
     objective: float | None = None
     #: physical results by name, in SI units
     quantities: Mapping[str, Any] = field(default_factory=dict)
-    qp: str | None = None  #: digest of the emitted QP; None in old journals
+    #: digest of the emitted QP, which identifies the problem; None if no QP was emitted
+    qp: str | None = None
     environment: str = ""  #: digest of environment.json, or of a file in environments/
     node: str = ""  #: host name of the cluster node; empty without a cluster
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
     started: str = ""  #: start of the measurement, UTC, ISO 8601
-    session: str = ""  #: id of the run command; empty in old journals
+    session: str = ""  #: id of the run command; empty outside a result folder
+
+    @property
+    def identity(self) -> str:
+        """Session and run_id, "SESSION-RUN_ID", which only this measurement has."""
+        return f"{self.session}-{self.run_id}" if self.session else self.run_id
 
     @property
     def tighten(self) -> float:

@@ -23,7 +23,7 @@ from mortarbench.harness.files.store import (
     point_arrays,
 )
 from mortarbench.harness.record import Record, finite
-from mortarbench.harness.results.folder import differences
+from mortarbench.harness.results.folder import differences, same_machine
 from mortarbench.harness.results.stored_run import (
     StoredRun,
     open_stored_run,
@@ -54,9 +54,11 @@ class Replay:
     distance: float | None
     ratios: Mapping[str, tuple[float, float, float] | None]
     """New time, smallest stored time and largest stored time, each divided by the
-    median of the stored repeats. None if a time was not measured.
+    median of the stored repeats. None if a time was not measured, or if it was measured
+    on another machine.
     """
     stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, in s
+    same_machine: bool  #: True if machine and threads are equal
     #: differences of the environments: dotted key, old value, new value
     environment: list[tuple[str, Any, Any]]
 
@@ -97,7 +99,8 @@ def replay(
     Parameters
     ----------
     folder : result folder, as `run` writes it
-    run_id : `run_id` in a line of the journal, or its first digits
+    run_id : `run_id` in a line of the journal, or its first digits; SESSION-RUN_ID if
+        several sessions contain the `run_id`
     plugins : Python files with more solvers or families
     registries : used instead of built-in registries, installed plug-ins and `plugins`
 
@@ -135,9 +138,9 @@ def replay(
     ):
         *_, result = execute(iter([unit]))
     if isinstance(result, BuildFailure):
-        raise InputError(f"{stored.record.run_id}: {result.reason}")
+        raise InputError(f"{stored.record.identity}: {result.reason}")
     if isinstance(result, MeasurementFault):
-        raise FaultError(f"{stored.record.run_id}: {result.reason}")
+        raise FaultError(f"{stored.record.identity}: {result.reason}")
     return compare(path, stored, result, environment)
 
 
@@ -153,6 +156,7 @@ def compare(
     environment : environment of the new measurement
     """
     then, now = run.record, result.record
+    is_same = same_machine(run.environment, environment)
     stored = {
         name: tuple(s for r in run.repeats if (s := getattr(r, name)) is not None)
         for name in _SECONDS
@@ -164,8 +168,12 @@ def compare(
         same_options=then.options == now.options,
         same_counts=(then.iterations, then.counts) == (now.iterations, now.counts),
         distance=_distance(folder, then, result.point),
-        ratios={name: _ratio(stored[name], getattr(now, name)) for name in _SECONDS},
+        ratios={
+            name: _ratio(stored[name], getattr(now, name)) if is_same else None
+            for name in _SECONDS
+        },
         stored=stored,
+        same_machine=is_same,
         environment=list(
             differences(
                 _pools_by_library(run.environment), _pools_by_library(environment)
@@ -242,9 +250,9 @@ def _numbers(c: Replay) -> Iterable[list[str]]:
 def _times(c: Replay) -> Iterable[list[str]]:
     for name, ratio in c.ratios.items():
         a, b = getattr(c.then, name), getattr(c.now, name)
-        if ratio is None:
+        if ratio is None and (c.same_machine or None in (a, b)):
             continue
-        row = _ratio_text(ratio, c.stored[name])
+        row = _ratio_text(ratio, c.stored[name]) if ratio else "other machine"
         yield [
             name.removesuffix("_seconds") + ", s",
             _text(a, ".3g"),

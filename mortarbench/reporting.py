@@ -120,7 +120,7 @@ def report(
             return Report(files=tuple(files))
         from mortarbench.reports import answer
 
-        return Report(files=tuple(files), said=tuple(answer(first, factor)[:1]))
+        return Report(files=tuple(files), said=tuple(answer(first, factor)))
     if pool_forms:
         raise InputError(
             "--pool-forms applies to the report on one folder, not to a comparison of "

@@ -156,7 +156,8 @@ class Results:
 
         target = None if path is None else check_output_file(path, PICTURES)
         available = figures(self.folder)
-        names = [n for n in available if n == kind or n.startswith(f"{kind}-")]
+        names = [n for n in available if n.startswith(f"{kind}-")]
+        names = [kind] if kind in available else names
         if len(names) != 1:
             raise unknown("figure", str(kind), available, where=str(self.folder))
         figure = available[names[0]]
@@ -186,6 +187,7 @@ class Results:
 def _named(r: Record) -> dict[str, Any]:
     """Return the identity and the verdict of a measurement."""
     return {
+        "session": r.session,
         "run_id": r.run_id,
         "case": r.case,
         "solver": r.solver,
@@ -238,21 +240,23 @@ def merge(
 ) -> Results:
     """Merge result folders into a new folder or the result of an earlier merge.
 
-    Duplicate measurements are stored once. The records of each environment remain
-    distinguishable in reports.
+    All measurements are kept: sessions on one machine are pooled in reports, and
+    environments are reported separately. A measurement that several folders contain is
+    stored once.
 
     Parameters
     ----------
     folders : result folders
     out : new folder, or result of an earlier merge
-    tell : called with messages about duplicate records, files too large to be copied,
-        and missing solutions and environments
+    tell : called with messages about repeated measurements, files too large to be
+        copied, and missing solutions and environments
 
     Raises
     ------
     InputError
-        If a folder contains no measurements, or if the suites of two folders differ in
-        their limits, their accuracy or the meaning of a label; `out` is then unchanged.
+        If a folder contains no measurements, if two folders contain different records
+        of one measurement, or if the suites of two folders differ in their limits,
+        their accuracy or the meaning of a label; `out` is then unchanged.
 
     """
     if not folders:

@@ -119,19 +119,18 @@ def listing(rows: Iterable[Mapping[str, Any]]) -> str:
     )
 
 
-def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
+def summary(records: Sequence[Record], solvers: Sequence[str]) -> str:
     """Return `summary_rows` as aligned text."""
     rows = summary_rows(records, solvers)
     return align(rows, right=range(1, len(rows[0])))
 
 
-def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
+def summary_rows(records: Sequence[Record], solvers: Sequence[str]) -> list[list[str]]:
     """Count the claims and verdicts of each solver; return a table with a header row.
 
     The rows of `solvers` come first, followed by the rows of other solvers in
     `records`.
     """
-    latest = {r.run_id: r for r in records}.values()
     header = [
         "solver",
         "measured",
@@ -142,9 +141,9 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
         "other",
     ]
     rows = [header]
-    present = {r.solver for r in latest}
+    present = {r.solver for r in records}
     for solver in dict.fromkeys([*solvers, *sorted(present)]):
-        every = [r for r in latest if r.solver == solver]
+        every = [r for r in records if r.solver == solver]
         declined = [r for r in every if r.verdict is Verdict.DECLINED]
         measured = [r for r in every if r.verdict is not Verdict.DECLINED]
         claimed = [r for r in measured if r.claimed == CLAIMED_SOLVED]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from html import escape
@@ -46,6 +46,7 @@ TIME_LIMIT = 60.0  #: time limit for each check of the conformance suite, in s
 MEMORY_LIMIT = 4096.0  #: memory limit for each check, in MiB
 #: largest number of entries in a list on the terminal; the page lists all entries
 _MAX_ENTRIES = 12
+_EQUAL_FAILURES = 3  #: smallest number of checks with equal failures that are one line
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -300,10 +301,23 @@ class Conformance:
         return {"solver": self.solver, "conforms": self.conforms, "checks": checks}
 
     def __repr__(self) -> str:
-        rows = [(r.grade, name, r.message) for name, r in self.results.items()]
         grades = Counter(r.grade for r in self.results.values())
         counts = ", ".join(f"{grades[g]} {g}" for g in Grade)
-        return f"{align(rows)}\n{self.solver}: {counts}"
+        return f"{align(self._rows())}\n{self.solver}: {counts}"
+
+    def _rows(self) -> Iterator[tuple[str, str, str]]:
+        """Yield grade, name and message of the checks; equal failures are one row."""
+        unfinished = (Grade.WEAK, Grade.FAIL)
+        equal = Counter((r.grade, r.message) for r in self.results.values())
+        seen = set()
+        for name, r in self.results.items():
+            message, count = r.message, equal[r.grade, r.message]
+            if r.grade in unfinished and count >= _EQUAL_FAILURES:
+                if (r.grade, r.message) in seen:
+                    continue
+                seen.add((r.grade, r.message))
+                message += f" (the same in {count} checks)"
+            yield r.grade, name, message
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"

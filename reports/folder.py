@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 from mortarbench.harness.errors import unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.reports.data.environment import dateline
+from mortarbench.reports.data.environment import by_environment, dateline
 from mortarbench.reports.data.evidence import Evidence, read_evidence
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
@@ -88,12 +89,12 @@ def figures(
     return {picture.name: picture.figure for picture in pictures}
 
 
-def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
-    """Return the opening sentences of the report on a result folder.
+def answer(directory: Path, factor: float = VERIFIED_FACTOR) -> list[str]:
+    """Return the first sentence of the report for each environment.
 
-    If the forms of the problems can be compared, the first sentences name the
-    combination of solver and form that leads fastest from the mesh to a verified
-    answer. The others compare the solvers of each form and name failures.
+    If the forms of the problems can be compared, the sentence names the combination of
+    solver and form that leads fastest from the mesh to a verified answer; otherwise, it
+    compares the solvers of the first form.
 
     factor : residuals of verified answers are ≤ factor·tol; the journal uses 10·tol
 
@@ -103,20 +104,25 @@ def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
         If the folder contains no measurements.
 
     """
-    composed = opening(Analysis(read_evidence(Path(directory), factor)))
-    return [line for s in composed for each in s.statements for line in each.lines]
+    opened = map(
+        opening, map(Analysis, by_environment(read_evidence(directory, factor)))
+    )
+    said = ((s.lines[0] for part in of for s in part.statements) for of in opened)
+    return [line for first in said for line in islice(first, 1)]
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
     """Compose the report: first the conclusions, then the evidence for them.
 
+    If the folder contains several environments, each has its own sections.
     The conclusions compare combinations of solver and form, and the solvers within each
     form; `pool_forms` does not change these conclusions.
     """
     collecting = gc.isenabled()
     gc.disable()  # table cells form no cycles; collection took a third of the time
+    parts = by_environment(evidence)
     try:
-        composed = tuple(sections(Analysis(evidence, pool_forms=pool_forms)))
+        composed = tuple(sections(*(Analysis(e, pool_forms=pool_forms) for e in parts)))
     finally:
         if collecting:
             gc.enable()
@@ -124,6 +130,6 @@ def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
         title=clean(evidence.name),
         dateline=dateline(evidence),
         sections=composed,
-        records=evidence.records,
+        records=tuple(r for e in parts for r in e.records),
         solvers=evidence.solvers,
     )

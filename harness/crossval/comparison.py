@@ -51,7 +51,7 @@ MIN_PEERS = 3
 class Answer:
     """An answer with its verdict, its errors and the reasons that refute it."""
 
-    run_id: str
+    run_id: str  #: `Record.identity`
     repeats: int  #: number of measurements that returned exactly this point
     solver: str
     case: str
@@ -177,7 +177,7 @@ def _answer(
     """Determine the verdict on one answer, and the reasons why its claim is false."""
     r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
     answer = Answer(
-        run_id=r.run_id,
+        run_id=r.identity,
         repeats=g.repeats,
         solver=g.label,
         case=r.case,

@@ -22,6 +22,7 @@ from mortarbench.harness.crossval.comparison import (
     compare_answers,
 )
 from mortarbench.harness.crossval.ground_truth import StoredAnswer
+from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -51,7 +52,7 @@ MAX_SOLUTION_ERROR = 1e-2
 class Listed:
     """A measurement with a remark."""
 
-    run_id: str
+    run_id: str  #: `Record.identity`
     solver: str
     case: str
     tol: float
@@ -133,7 +134,7 @@ def validate_folder(
         stored point nor a proven claim of infeasibility.
 
     """
-    records = [_apart(r) for r in {r.run_id: r for r in read_journal(path)}.values()]
+    records = [_apart(r) for r in read_journal(path)]
     if not any(
         (r.vectors and is_stored(path, r.vectors)) or _is_proven(r) for r in records
     ):
@@ -163,7 +164,7 @@ def validate_folder(
             for r in records
             if r.claimed != Status.SOLVED
             and not (r.verdict.is_verified or r.verdict is Verdict.DECLINED)
-            and r.run_id not in {x.run_id for x in false_claims}
+            and r.identity not in {x.run_id for x in false_claims}
         ),
         not_validated=tuple(x for part in parts for x in part.lost),
         declined=sum(r.verdict is Verdict.DECLINED for r in records),
@@ -182,23 +183,21 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     """Assess the answers to one physical case, and claims of its infeasibility."""
-    cases, lost = _built(folder, records)
-    answers, damaged = _stored_answers(
-        folder, [r for r in records if r.case in cases], cases
-    )
+    cases, records, lost = _built(folder, records)
+    answers, damaged = _stored_answers(folder, records, cases)
     lost += damaged
-    claims = [r for r in records if _is_proven(r) and r.case in cases]
+    claims = list(filter(_is_proven, records))
     contradictory = set()
     # the run did not store the certificate of the solver: search for a new one
     for r in claims:
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status(r.claimed or "infeasible"))
         if certificate_of(qp, claim, r.judged_at)[0]:
-            contradictory.add(r.run_id)
+            contradictory.add(r.identity)
     lost += [
         _listed(r, "the certificate could not be computed again")
         for r in claims
-        if r.run_id not in contradictory
+        if r.identity not in contradictory
     ]
     # forms with equal mechanics belong to one problem; without mechanics, each form is
     # a separate problem
@@ -228,7 +227,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     false = [
         _listed(r, text)
         for r in records
-        if r.run_id not in contradictory
+        if r.identity not in contradictory
         and (text := _falsehood(r, solvable.get(r.case, elastic)))
     ]
     return _Part(problems, lost, false, forces, truths, len(contradictory))
@@ -244,20 +243,46 @@ def _pointless(records: Sequence[Record]) -> str:
 
 
 def _built(
-    folder: _Folder, records: Sequence[Record]
-) -> tuple[dict[str, Case], list[Listed]]:
-    """Rebuild the cases of answers; list the answers whose case cannot be rebuilt."""
+    folder: _Folder, records: Iterable[Record]
+) -> tuple[dict[str, Case], list[Record], list[Listed]]:
+    """Rebuild the cases of answers.
+
+    Returns
+    -------
+    the cases by name, the records that can be assessed, and the others with the reason:
+    the case of an answer cannot be rebuilt, or the QP of the record is another one. If
+    several ranks assembled a QP, its digest is computed in another way and not compared
+
+    """
     cases: dict[str, Case] = {}
+    same: list[Record] = []
     lost: list[Listed] = []
-    answered = [r for r in records if r.vectors or _is_proven(r)]
-    for first in {r.case: r for r in answered}.values():
+    by_case: dict[str, list[Record]] = {}
+    for r in records:
+        by_case.setdefault(r.case, []).append(r)
+    for name, mine in by_case.items():
+        answered = [r for r in mine if r.vectors or _is_proven(r)]
+        known: tuple[str | None, ...] = ()
         try:
-            cases[first.case] = rebuild(
-                first, folder.path, folder.families, folder.reference
-            )
+            if answered:
+                cases[name] = rebuild(
+                    answered[0], folder.path, folder.families, folder.reference
+                )
+                known = None, qp_digest(cases[name].qp, serialised=True)
         except InputError as e:
-            lost += [_listed(r, str(e)) for r in answered if r.case == first.case]
-    return cases, lost
+            lost += [_listed(r, str(e)) for r in answered]
+            mine = [r for r in mine if not (r.vectors or _is_proven(r))]
+        for r in mine:
+            if not known or r.qp in known or f"{r.qp}".startswith(DISTRIBUTED_DIGEST):
+                same.append(r)
+            else:
+                text = (
+                    f"its QP has the digest {known[1]} now, {r.qp} when it was "
+                    "measured; expected the same version of the code, of its libraries "
+                    "and of plug-ins"
+                )
+                lost.append(_listed(r, text))
+    return cases, same, lost
 
 
 def _stored_answers(
@@ -329,7 +354,7 @@ def _apart(r: Record) -> Record:
 
 
 def _listed(r: Record, text: str) -> Listed:
-    return Listed(run_id=r.run_id, solver=r.solver, case=r.case, tol=r.tol, text=text)
+    return Listed(run_id=r.identity, solver=r.solver, case=r.case, tol=r.tol, text=text)
 
 
 def _true_forces(
@@ -351,11 +376,11 @@ def _suspects(problem: Problem, answers: Sequence[StoredAnswer]) -> dict[str, Ve
     """Return the multipliers of refuted answers by run_id."""
     refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
     return {
-        g.record.run_id: g.case.mechanics.multipliers(
+        g.record.identity: g.case.mechanics.multipliers(
             g.case.mechanics.to_primal(g.solution)
         )
         for g in answers
-        if g.record.run_id in refuted and g.case.mechanics is not None
+        if g.record.identity in refuted and g.case.mechanics is not None
     }
 
 

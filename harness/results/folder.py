@@ -41,6 +41,8 @@ _FILES = ("environment.json", "suite.toml")
 _RESULT_FILES = ("validation.json", FAULTS)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: largest depth of nested folders; runs write three levels
+#: parts of an environment that describe the machine and its threads
+HARDWARE = ("machine", "threads", "cholmod")
 _LOCK = ".lock"
 _LOCK_CONTENT = b"held by runs of mortarbench\n"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
@@ -429,6 +431,17 @@ def differences(
             yield from ((f"{key}.{k}", *pair) for k, *pair in differences(a, b))
         elif a != b:
             yield key, a, b
+
+
+def same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return True if two environments describe the same machine, threads and BLAS.
+
+    Differences in versions, source and plug-ins are usually the subject of a comparison
+    of times. An unknown machine is not the same as any other.
+    """
+    return bool(one.get("machine")) and all(
+        one.get(part) == other.get(part) for part in HARDWARE
+    )
 
 
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -82,9 +82,9 @@ def read_journal(
 ) -> list[Record]:
     """Read all records of a result folder, in the order of file names and lines.
 
-    Every run_id occurs once in the result: a line is skipped if its record equals an
-    earlier record. Equal strings and tables of different records in one file are stored
-    only once in memory.
+    Every measurement, which session and run_id identify, occurs once in the result: a
+    line is skipped if its record equals an earlier record. Equal strings and tables of
+    different records in one file are stored only once in memory.
 
     tell : called with a message of one line if lines are skipped
 
@@ -93,7 +93,7 @@ def read_journal(
     InputError
         If the folder or its journal is missing; if the folder contains a link; if a
         line is damaged, except for an incomplete last line of a file; or if two
-        different records have the same run_id.
+        different records have the same session and run_id.
 
     """
     if not os.path.isdir(folder):
@@ -104,11 +104,11 @@ def read_journal(
     if not paths:
         raise InputError(f"no journal in {folder}; expected journal/*.jsonl there")
     records: list[Record] = []
-    at: dict[str, int] = {}  # index in the result by run_id
+    at: dict[str, int] = {}  # index in the result by identity
     repeated = []
     for path in paths:
         for number, record in _records(path):
-            first = at.setdefault(record.run_id, len(records))
+            first = at.setdefault(record.identity, len(records))
             if first == len(records):
                 records.append(record)
                 continue
@@ -118,12 +118,12 @@ def read_journal(
                     f"{path}, line {number}"
                     for path in paths
                     for number, other in _records(path)
-                    if other.run_id == record.run_id
+                    if other.identity == record.identity
                 )
                 raise InputError(
                     f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
                     f"differs from the record at {place}; expected one line per "
-                    "run_id; delete the wrong line"
+                    "run_id and session; delete the wrong line"
                 )
     if repeated:
         lines = "line repeats" if len(repeated) == 1 else "lines repeat"

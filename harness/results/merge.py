@@ -1,10 +1,8 @@
 """Merging of result folders that may contain measurements of several environments.
 
-A measurement is identified by its run_id and its environment. If two folders contain
-the same measurement, the measurement of the first folder is kept. Measurements with
-equal run_ids but different environments are all kept. Except for the first, each of
-these measurements gets a new run_id, which is a digest of its old run_id and its
-environment.
+All measurements of all folders are kept unchanged. Session and run_id identify a
+measurement; if two folders contain the same measurement, for example because both are
+merges of a third folder, its line is written once.
 
 The journal of the new folder is written last, in a single step. A folder without a
 journal contains no measurements, so the same command can be given again if a merge was
@@ -16,12 +14,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.copies import check_copies, merge_copies
 from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.store import copy_stored
@@ -38,44 +34,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_DUPLICATES_NOTE = "measurements are already present and are counted once"
 JOURNAL = "merged"  #: name of the only journal of a merged folder
-
-
-@dataclass(eq=False)
-class _Union:
-    """Union of the measurements of several folders."""
-
-    records: dict[str, Record] = field(
-        default_factory=dict
-    )  #: measurements by run_id, in order
-    _keys: set[tuple[str, str]] = field(
-        default_factory=set
-    )  # (run_id, environment) of each measurement
-    _contents: set[str] = field(
-        default_factory=set
-    )  # digests of the records without run_id
-
-    def add(self, record: Record) -> bool:
-        """Add a measurement; return True if it is a duplicate."""
-        # Compare the content first, since an earlier merge may have added the same
-        # record with a new run_id.
-        content = hex_digest([record.replace(run_id="").to_json().encode()], 32)
-        if content in self._contents:
-            return True
-        if (record.run_id, record.environment) in self._keys:
-            return True
-        self._keys.add((record.run_id, record.environment))
-        if record.run_id in self.records:
-            record = record.replace(
-                run_id=hex_digest([f"{record.run_id} {record.environment}".encode()])
-            )
-        if record.run_id in self.records:
-            return True
-        self._keys.add((record.run_id, record.environment))
-        self._contents.add(content)
-        self.records[record.run_id] = record
-        return False
 
 
 def merge(
@@ -83,7 +42,7 @@ def merge(
 ) -> list[Record]:
     """Merge result folders into a new folder, or into the result of an earlier merge.
 
-    tell : called with messages of one line on duplicates and missing files
+    tell : called with messages of one line on repeated measurements and missing files
 
     Returns
     -------
@@ -92,11 +51,11 @@ def merge(
     Raises
     ------
     InputError
-        If a source contains no measurements, or contains a link; if the suites differ
-        in settings on which measurements depend; if `out` is a source, lies in a
-        source, or contains a source; if `out` contains results of a run or files of the
-        user; or if the disk is full. In these cases, the journal of `out` does not
-        change.
+        If a source contains no measurements, or contains a link; if two folders contain
+        different records of one measurement; if the suites differ in settings on which
+        measurements depend; if `out` is a source, lies in a source, or contains a
+        source; if `out` contains results of a run or files of the user; or if the disk
+        is full. In these cases, the journal of `out` does not change.
 
     """
     for source in sources:
@@ -112,25 +71,27 @@ def merge(
     for folder in folders:
         check_copies(folder)
     with report_full_disk(out), lock_folder(out):
-        union = _Union()
+        merged: dict[str, Record] = {}
         for folder in existing:
-            for record in read_journal(folder):
-                union.add(record)
+            merged |= {r.identity: r for r in read_journal(folder)}
         for source, records in journals.items():
-            if duplicates := sum(map(union.add, records)):
-                tell(f"{source}: {duplicates} of {len(records)} {_DUPLICATES_NOTE}")
+            if repeated := _add(merged, records, source):
+                tell(
+                    f"{source}: {repeated} of {len(records)} measurements are already "
+                    "present and are counted once"
+                )
         for source, records in journals.items():
             _copy_solutions(source, out, records, tell)
         merge_copies(list(journals), out, tell)
-        _copy_environments(folders, out, union.records.values(), tell)
+        _copy_environments(folders, out, merged.values(), tell)
         faults = [f.to_json() for folder in folders for f in read_faults(folder)]
         if faults:
             text = "".join(f"{line}\n" for line in dict.fromkeys(faults))
             replace_file(out / FAULTS, text.encode())
         replace_file(out / "suite.toml", suite.encode())
-        lines = "".join(f"{r.to_json()}\n" for r in union.records.values())
+        lines = "".join(f"{r.to_json()}\n" for r in merged.values())
         replace_file(_journal(out), lines.encode())
-    return [*union.records.values()]
+    return [*merged.values()]
 
 
 def _journal(folder: Path) -> Path:
@@ -138,28 +99,34 @@ def _journal(folder: Path) -> Path:
 
 
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
-    """Read the records of a folder, and add a session to old records without a session.
-
-    The session is a digest of the environment and of the earliest start of a record
-    without a session in this environment.
-    """
+    """Read the records of a folder, of which there must be at least one."""
     records = read_journal(source, tell)
     if not records:
         raise InputError(
             f"{source}: no measurements; expected a result folder of `run`"
         )
-    first: dict[str, str] = {}
+    return records
+
+
+def _add(merged: dict[str, Record], records: Iterable[Record], source: Path) -> int:
+    """Add the records of a folder in place; return how many were already present.
+
+    Raises
+    ------
+    InputError
+        If another folder contains a different record of the same measurement.
+
+    """
+    repeated = 0
     for r in records:
-        if not r.session:
-            earliest = min(first.get(r.environment, r.started), r.started)
-            first[r.environment] = earliest
-    sessions = {
-        environment: hex_digest([f"{environment} {started}".encode()])
-        for environment, started in first.items()
-    }
-    return [
-        r if r.session else r.replace(session=sessions[r.environment]) for r in records
-    ]
+        if r != merged.setdefault(r.identity, r):
+            raise InputError(
+                f"{source}: the record of run_id {shown(r.run_id)} in session "
+                f"{shown(r.session)} differs from that of another folder; expected "
+                "equal records of one measurement; restore the changed journal"
+            )
+        repeated += r is not merged[r.identity]
+    return repeated
 
 
 def _refuse_nested(source: Path, out: Path) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Case, Family, Reference, Solver
 from mortarbench.harness.record import Record
@@ -33,7 +31,7 @@ class StoredRun:
     """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    #: records of all repeats of the measurement, including `record`
+    #: records of all repeats of the measurement in its environment, with `record`
     repeats: list[Record]
     #: cases to measure: the case of the measurement, preceded by the earlier steps if
     #: it belongs to a sequence
@@ -52,7 +50,8 @@ def open_stored_run(
 ) -> StoredRun:
     """Find a measurement, and look up its case and solver in the current registries.
 
-    run_id : a run_id, or an unambiguous prefix of a run_id
+    run_id : a run_id, or `Record.identity` if several sessions contain the run_id, or
+        the first digits of either
 
     Raises
     ------
@@ -118,24 +117,25 @@ def work_unit_of(
 
 
 def _cell(r: Record) -> tuple[Any, ...]:
-    return r.mode, r.case, r.solver, r.options, r.tol, r.accuracy
+    return r.mode, r.case, r.qp, r.solver, r.options, r.tol, r.accuracy, r.environment
 
 
-def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
-    by_id = {r.run_id: r for r in records}
-    candidates = [name for name in by_id if run_id and name.startswith(run_id)]
-    if run_id in by_id or len(candidates) == 1:
-        return by_id[run_id if run_id in by_id else candidates[0]]
-    if candidates:
-        first = ", ".join(sorted(candidates)[:3])
-        raise InputError(
-            f"{folder} contains {len(candidates)} measurements whose run_id begins "
-            f"with {run_id!r} ({first}); give more digits"
-        )
-    near = get_close_matches(run_id, by_id, n=1, cutoff=0.0)
+def _find_record(folder: Path, name: str, records: Sequence[Record]) -> Record:
+    names = [r.identity if "-" in name else r.run_id for r in records]
+    for matches in (str.__eq__, str.startswith):
+        found = [r for r, n in zip(records, names, strict=True) if matches(n, name)]
+        if len(found) == 1 and name:
+            return found[0]
+        if found and name:
+            first = ", ".join(sorted(r.identity for r in found)[:3])
+            raise InputError(
+                f"{folder} contains {len(found)} measurements whose run_id begins with "
+                f"{name!r} ({first}); give more digits, or SESSION-RUN_ID"
+            )
+    near = get_close_matches(name, [r.run_id for r in records], n=1, cutoff=0.0)
     hint = f"; the nearest is {near[0]}" if near else ""
-    count = f"{len(by_id)} measurement{'s' * (len(by_id) != 1)}"
-    raise InputError(f"unknown run_id {run_id!r}: {folder} contains {count}{hint}")
+    count = f"{len(records)} measurement{'s' * (len(records) != 1)}"
+    raise InputError(f"unknown run_id {name!r}: {folder} contains {count}{hint}")
 
 
 def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
@@ -184,10 +184,7 @@ def rebuild(
     Raises
     ------
     InputError
-        If the family is unknown or raises an exception, or if the digest of the QP
-        differs from the digest in the record. If several ranks assembled the QP, the
-        digests are not compared, because the digest of a distributed QP is computed in
-        another way.
+        If the family is unknown or raises an exception.
 
     """
     if r.family not in families:
@@ -198,14 +195,6 @@ def rebuild(
         raise InputError(f"unknown family {r.family!r}{needs}")
     name = assemble(families[r.family], r.params, r.form)
     try:
-        case = name.build(reference)
+        return name.build(reference)
     except (Exception, SystemExit) as e:  # raised by code of the family
         raise InputError(unbuilt(r.case, e)) from None
-    if r.qp is None or r.qp.startswith(DISTRIBUTED_DIGEST):
-        return case
-    if (digest := qp_digest(case.qp, serialised=True)) != r.qp:
-        raise InputError(
-            f"its QP has the digest {digest} now, {r.qp} when it was measured; "
-            "expected the same version of the code, of its libraries and of plug-ins"
-        )
-    return case

@@ -471,8 +471,8 @@ _COMMANDS = {
             _Option(
                 "run_id",
                 "RUN_ID",
-                "run_id of a line of the journal, or its first digits; an HTML report "
-                "shows the run_id when the mouse points at a number",
+                "run_id of a line of the journal, or SESSION-RUN_ID, or the first "
+                "digits; an HTML report shows it when the mouse points at a number",
             ),
             _PLUGIN,
             _JSON,

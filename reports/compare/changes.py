@@ -1,7 +1,8 @@
 """Changes between two result folders, for each cell and each solver.
 
 A cell is one solver in one mode on one case at one tolerance. Its times before and
-after are two unpaired samples, because the folders are different sessions.
+after are two unpaired samples, because the folders are different sessions. Times are
+divided only if they were measured on one machine, on one problem.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from scipy.special import ndtri, stdtrit
 
 from mortarbench.harness.running.pairs import Ratio, unpaired_ratio
 from mortarbench.reports.compare.conditions import hardware
+from mortarbench.reports.data.environment import by_environment
 from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Outcome
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
@@ -50,6 +52,19 @@ class Pair:
         return self.same_sizes and len(digests - {None}) < 2
 
     @property
+    def same_problem(self) -> bool:
+        """True if the QPs differ at most by rounding errors.
+
+        QPs with different digests, as with another version of BLAS, count as one
+        problem if their parameters and sizes are equal, and if their verified answers
+        have equal energies.
+        """
+        same_params = self.before.first.params == self.after.first.params
+        return self.same_qp or (
+            same_params and self.same_sizes and not self.other_answer
+        )
+
+    @property
     def both_verified(self) -> bool:
         """True if both answers are verified and the QPs have equal sizes."""
         return self.before.verified and self.after.verified and self.same_sizes
@@ -61,7 +76,8 @@ class Pair:
         None if the times cannot be compared.
         """
         a, b = _seconds(self.after), _seconds(self.before)
-        if not (self.both_verified and self.same_machine and a and b):
+        comparable = self.both_verified and self.same_machine and self.same_problem
+        if not (comparable and a and b):
             return None
         return float(np.mean(np.log(a)) - np.mean(np.log(b)))
 
@@ -169,27 +185,38 @@ class Comparison:
 def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
     """Pair the cells of two folders, in the order of the later folder.
 
+    If a folder contains several environments, outcomes of one machine are paired first.
+
     folders : number of folders compared with `before`, including `after`
     """
-    a, b = ({_key(o): o for o in e.flat} for e in (before, after))
     machines = hardware(before) | hardware(after)
-
-    def same(key: Key) -> bool:
-        records = (*a[key].records, *b[key].records)
-        return len({machines[r.environment] for r in records}) == 1
-
+    left, pairs, only_after = _cells(before), list[Pair](), list[Outcome]()
+    for key, outcomes in _cells(after).items():
+        for on_one_machine in (True, False):
+            for o in [*outcomes]:
+                here = machines[o.first.environment]
+                for other in left.get(key, ()):
+                    same = here == machines[other.first.environment]
+                    if same or not on_one_machine:
+                        pairs.append(Pair(before=other, after=o, same_machine=same))
+                        left[key].remove(other)
+                        outcomes.remove(o)
+                        break
+        only_after += outcomes
     return Comparison(
         before=before,
         after=after,
-        pairs=tuple(
-            Pair(before=a[key], after=b[key], same_machine=same(key))
-            for key in b
-            if key in a
-        ),
-        only_before=tuple(o for key, o in a.items() if key not in b),
-        only_after=tuple(o for key, o in b.items() if key not in a),
+        pairs=tuple(pairs),
+        only_before=tuple(o for outcomes in left.values() for o in outcomes),
+        only_after=tuple(only_after),
         folders=folders,
     )
+
+
+def _cells(evidence: Evidence) -> dict[Key, list[Outcome]]:
+    """Return the outcomes of every cell, one for each environment."""
+    parts = by_environment(evidence)
+    return grouped((o for part in parts for o in part.flat), _key)
 
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
@@ -205,17 +232,19 @@ def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     None if no other solver has times.
     """
     competing = (p for p in c.pairs if p.after.solver != solver)
-    rivals = grouped(
-        (p for p in competing if not p.after.first.role),
-        lambda p: (p.after.case, p.after.tol),
-    )
+    rivals = grouped((p for p in competing if not p.after.first.role), block_of)
     changes = []
     for p in c.of(solver):
-        others = rivals.get((p.after.case, p.after.tol), ())
+        others = rivals.get(block_of(p), ())
         logs = [other.log for other in others if other.log is not None]
         if p.log is not None and logs:
             changes.append((p, p.log - float(np.mean(logs))))
     return _over_cells(changes)
+
+
+def block_of(p: Pair) -> tuple[str, float, str]:
+    """Return case, tolerance and environment, which the solvers of a block share."""
+    return p.after.case, p.after.tol, p.after.first.environment
 
 
 def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:

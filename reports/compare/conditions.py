@@ -7,13 +7,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from mortarbench.harness import InputError
-from mortarbench.harness.results.folder import differences, environment_of
+from mortarbench.harness.results.folder import HARDWARE, differences, environment_of
 from mortarbench.reports.data.environment import flatten
 from mortarbench.reports.data.evidence import Evidence
-
-#: parts of an environment that must be equal for times to be comparable; differences in
-#: the other parts (versions, source, plugins) are usually the subject of a comparison
-HARDWARE = ("machine", "threads", "cholmod")
 
 Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 

@@ -7,12 +7,16 @@ from functools import partial
 
 from mortarbench.reports.compare.changes import Comparison, mean_ratio, side
 from mortarbench.reports.compare.conclusions import change_word, headline, ratio_text
+from mortarbench.reports.compare.conditions import hardware
 from mortarbench.reports.compare.page import time_cell
 from mortarbench.reports.data.cells import answer_columns
-from mortarbench.reports.data.environment import dateline
+from mortarbench.reports.data.environment import by_environment, dateline
+from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import TIMED, clean
 from mortarbench.reports.document.layout import Cell, Page, Part, Point, Section, Table
 from mortarbench.reports.statistics.intervals import COVERAGE
+
+Key = tuple[str, float, str, str]  #: case, tolerance, solver and machine
 
 
 def overview(found: Sequence[Comparison]) -> Page:
@@ -58,11 +62,15 @@ def _summary(
 def _times(
     found: Sequence[Comparison], first: str, names: Sequence[str]
 ) -> Iterator[Part]:
-    folders = [found[0].before, *(c.after for c in found)]
-    answers = [{(o.case, o.tol, o.solver): o for o in e.flat} for e in folders]
+    answers = [_by_machine(e) for e in (found[0].before, *(c.after for c in found))]
     known = {key: o for of in reversed(answers) for key, o in of.items()}
+    machines = list(dict.fromkeys(key[-1] for of in answers for key in of))
 
-    def time(folder: int, key: tuple[str, float, str]) -> Cell:
+    def machine(key: Key) -> Cell:
+        number = machines.index(key[-1])
+        return Cell.words(f"other machine {number}" if number else "first machine")
+
+    def time(folder: int, key: Key) -> Cell:
         o = answers[folder].get(key)
         if o is None:
             return Cell(title="not measured")
@@ -74,7 +82,21 @@ def _times(
         dict.fromkeys(key for of in answers for key in of),
         (
             *answer_columns(known.__getitem__),
+            *[("machine", machine)] * (len(machines) > 1),
             *((name, partial(time, k)) for k, name in enumerate((first, *names))),
         ),
         text_columns=2,
     )
+
+
+def _by_machine(evidence: Evidence) -> dict[Key, Outcome]:
+    """Return the outcomes by case, tolerance, solver and hardware.
+
+    If several environments have the same hardware, the first of them is chosen.
+    """
+    machines = hardware(evidence)
+    return {
+        (o.case, o.tol, o.solver, machines[o.first.environment]): o
+        for part in reversed(by_environment(evidence))
+        for o in part.flat
+    }

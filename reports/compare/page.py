@@ -141,6 +141,8 @@ def _change(p: Pair) -> Cell:
         return Cell(text=change_word(p.ratio), value=p.change, kind=kind)
     if not p.same_machine:
         return Cell(text="other machine", kind="quiet")
+    if not p.same_problem:
+        return Cell(text="other QP", kind="quiet")
     why = "1 repeat" if p.both_verified else "not comparable"
     return Cell(text=why, kind="quiet")
 

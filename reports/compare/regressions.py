@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from mortarbench.harness.running.pairs import Ratio, unpaired_ratio
-from mortarbench.reports.compare.changes import FEWEST, Comparison
+from mortarbench.reports.compare.changes import FEWEST, Comparison, block_of
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
@@ -142,6 +142,8 @@ def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
 def _why_not(c: Comparison) -> str:
     if not any(p.same_machine for p in c.pairs):
         return "no cell was measured on equal machines in both folders"
+    if not any(p.same_problem for p in c.pairs):
+        return "no cell has the same QP in both folders"
     if lacking := _unverified(c, folders=1):
         return "; ".join(lacking)
     if not c.timed:
@@ -158,7 +160,7 @@ def _why_not(c: Comparison) -> str:
 def _changes(c: Comparison) -> list[_Change]:
     """Return the changes of cells that have times and other solvers in both folders."""
     timed = [p for p in c.timed if not p.after.first.role]
-    rows = grouped(timed, lambda p: (p.after.case, p.after.tol, p.after.first.mode))
+    rows = grouped(timed, lambda p: (*block_of(p), p.after.first.mode))
     found = []
     for row in rows.values():
         for p in row:

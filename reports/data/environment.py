@@ -1,14 +1,62 @@
-"""Machine and date of the measurements."""
+"""Machine and date of the measurements, and their division by environment."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
+from mortarbench.harness import InputError
+from mortarbench.harness.results.folder import environment_of, same_machine
 from mortarbench.reports.data.evidence import Evidence
 from mortarbench.reports.document.formatting import clean, plural
+from mortarbench.reports.document.grouping import grouped
 
 QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
+_DIGITS = 6  #: number of digits of an environment's digest in its name
+
+
+def by_environment(evidence: Evidence) -> tuple[Evidence, ...]:
+    """Return the part of the evidence from each environment.
+
+    The environment of environment.json comes first. The others are named: "other
+    machine @1a2b3c" or, if they differ from the first only in versions, code or
+    plug-ins, "other environment @1a2b3c".
+    """
+    records = grouped(evidence.records, lambda r: r.environment)
+    if len(records) < 2:
+        return (evidence,)
+    main = evidence.environment.get("digest")
+    first, *others = sorted(records, key=lambda digest: digest != main)
+    found = {digest: _environment(evidence, digest) for digest in records}
+    places = {}
+    for digest in others:
+        same = same_machine(found[first], found[digest])
+        kind = "environment" if same else "machine"
+        name = re.sub(r"\W", "", digest)[:_DIGITS]
+        places[digest] = f"other {kind} @{name}"
+    return tuple(
+        replace(
+            evidence,
+            records=tuple(records[digest]),
+            environment=found[digest],
+            faults=() if digest in places else evidence.faults,
+            place=places.get(digest, ""),
+            places=places,
+        )
+        for digest in (first, *others)
+    )
+
+
+def _environment(evidence: Evidence, digest: str) -> Mapping[str, Any]:
+    """Return a stored environment; empty if the folder does not contain it."""
+    if digest == evidence.environment.get("digest"):
+        return evidence.environment
+    with suppress(InputError):
+        return environment_of(evidence.directory, digest)
+    return {}
 
 
 def busy_with(evidence: Evidence) -> float | None:
@@ -19,10 +67,12 @@ def busy_with(evidence: Evidence) -> float | None:
 
 
 def dateline(evidence: Evidence) -> str:
-    """Return date and machine of the measurements in one line."""
+    """Return date and machines of the measurements in one line."""
     days = sorted({r.started[:10] for r in evidence.records if r.started})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
-    return f"{clean(when)} · {machine(evidence.environment)}"
+    first, *others = by_environment(evidence)
+    named = [machine(first.environment), *(e.place for e in others)]
+    return f"{clean(when)} · {', '.join(named)}"
 
 
 def machine(environment: Mapping[str, Any]) -> str:

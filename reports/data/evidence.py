@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.record import PROVEN, VERIFIED_FACTOR
@@ -23,7 +24,7 @@ from mortarbench.harness.verify.kkt import allowed, rejudged
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 FROM_FILE = "file"  #: family of QPs from files, whose case names are paths
-_MARK_DIGITS = 6  #: number of digits of an environment's digest in a solver label
+_MARK_DIGITS = 6  #: number of digits of the digest of a QP in a case name
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
@@ -110,8 +111,8 @@ class Outcome:
 
     @property
     def run_ids(self) -> tuple[str, ...]:
-        """Identifiers of the measurements of this outcome."""
-        return tuple(r.run_id for r in self.records)
+        """Identities of the measurements of this outcome."""
+        return tuple(r.identity for r in self.records)
 
     def largest(self, name: str) -> float | None:
         """Return the largest value of a field; None if a repeat lacks it."""
@@ -194,7 +195,11 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evidence:
-    """Measurements and metadata of a result folder, from which a report is composed."""
+    """Measurements and metadata of a result folder, from which a report is composed.
+
+    Times of different environments must not be compared: reports are composed from the
+    parts of the evidence, see `reports.data.environment.by_environment`.
+    """
 
     directory: Path
     records: tuple[Record, ...]  #: judged at `factor`, in the order of the report
@@ -205,9 +210,10 @@ class Evidence:
     faults: tuple[
         Fault, ...
     ] = ()  #: reasons for missing measurements that are not due to a solver
-    #: digest of an environment → mark appended to the labels of its solvers; empty
-    #: unless several environments repeat the same measurement
-    marks: Mapping[str, str] = field(default_factory=dict)
+    #: name of the environment, if this is a part of the evidence from a further one
+    place: str = ""
+    #: names of all further environments of the folder, by digest
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -271,14 +277,14 @@ def read_evidence(
     journal = tuple(records)
     environment = _environment(directory / "environment.json")
     suite = directory / "suite.toml"
-    records = _one_name_per_qp(_unite_environments(directory, records))
-    marks = _marks(records, str(environment.get("digest", "")))
+    records = _one_qp_per_name(
+        _one_name_per_qp(_unite_environments(directory, records))
+    )
     return Evidence(
         directory=directory,
         journal=journal,
-        records=arrange(_judged_and_labelled(r, factor, marks) for r in records),
+        records=arrange(_judged_and_labelled(r, factor) for r in records),
         environment=environment,
-        marks=marks,
         suite=read_stored(suite) if os.path.lexists(suite) else {},
         factor=factor,
         faults=tuple(
@@ -326,6 +332,32 @@ def _one_name_per_qp(records: list[Record]) -> list[Record]:
     ]
 
 
+def _one_qp_per_name(records: list[Record]) -> list[Record]:
+    """Add the first digits of the QP to the name and the parameters of further QPs.
+
+    A name denotes several QPs if a default, a file or a plug-in changed between two
+    sessions. Rounding errors, and hence digests, differ between environments, which
+    have separate tables. Ranks compute the digest of a QP in another way, so that their
+    digests are compared with each other only.
+    """
+    digests: dict[tuple[str, str, bool], dict[str, None]] = {}
+    named = []
+    for r in records:
+        if r.qp is not None:
+            by_ranks = r.qp.startswith(DISTRIBUTED_DIGEST)
+            known = digests.setdefault((r.environment, r.case, by_ranks), {})
+            known[r.qp] = None
+            if r.qp != next(iter(known)):
+                mark = r.qp.removeprefix(DISTRIBUTED_DIGEST)[:_MARK_DIGITS]
+                physical = r.case.removesuffix(f"/{r.form}")
+                r = r.replace(
+                    case=f"{physical}/QP={mark}{r.case.removeprefix(physical)}",
+                    params={**r.params, "QP": mark},
+                )
+        named.append(r)
+    return named
+
+
 def _warn_of_contradictions(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
@@ -336,7 +368,7 @@ def _warn_of_contradictions(
         if r.verdict is Verdict.VERIFIED and max(values, default=0) > allowed(
             r.judged_at
         ):
-            wrong.append(r.run_id)
+            wrong.append(r.identity)
     if wrong:
         warn(
             f"{directory}: residuals of verified records exceed "
@@ -355,37 +387,14 @@ def _environment(path: Path) -> dict[str, Any]:
     return table
 
 
-def _judged_and_labelled(
-    record: Record, factor: float, marks: Mapping[str, str]
-) -> Record:
-    """Judge a record at `factor`, and append mode and environment to its solver label.
-
-    The mode is appended unless it is cold. The mark of the environment is appended if
-    several environments repeat the same measurement.
-    """
+def _judged_and_labelled(record: Record, factor: float) -> Record:
+    """Judge a record at `factor`; append its mode to the label unless it is cold."""
     changes: dict[str, Any] = {}
     if factor != VERIFIED_FACTOR:
         changes["verdict"] = rejudged(record, factor)
-    mode = "" if record.mode == "cold" else f" ({record.mode})"
-    if after := mode + marks.get(record.environment, ""):
-        changes["solver"] = record.solver + after
+    if record.mode != "cold":
+        changes["solver"] = f"{record.solver} ({record.mode})"
     return record.replace(**changes) if changes else record
-
-
-def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
-    """Return label marks of environments that repeat the same measurement.
-
-    One environment stays without a mark.
-
-    first : digest of the environment without a mark, if it repeats a measurement
-    """
-    cells: dict[tuple[Any, ...], dict[str, None]] = {}
-    for r in records:
-        cell = r.mode, r.case, r.solver, r.tol, r.repeat
-        cells.setdefault(cell, {})[r.environment] = None
-    several = dict.fromkeys(e for of in cells.values() if len(of) > 1 for e in of)
-    plain = first if first in several else next(iter(several), "")
-    return {e: f" @{e[:_MARK_DIGITS]}" for e in several if e != plain}
 
 
 def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
@@ -410,10 +419,8 @@ def shared(outcomes: Iterable[Outcome]) -> str:
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Sort by case, tolerance, solver and repeat; keep the last of equal run_ids."""
-    # run_ids are unique within a journal, but not across several folders
-    latest = {r.run_id: r for r in records}
-    return tuple(sorted(latest.values(), key=_position))
+    """Sort by case, tolerance, solver, repeat and session."""
+    return tuple(sorted(records, key=_position))
 
 
 def _position(r: Record) -> tuple[Any, ...]:
@@ -421,7 +428,7 @@ def _position(r: Record) -> tuple[Any, ...]:
         (k, (0, v, "") if isinstance(v, int | float) else (1, 0, str(v)))
         for k, v in r.params.items()
     ]
-    return (r.family, params, r.case, -r.tol, r.solver, r.repeat, r.run_id)
+    return (r.family, params, r.case, -r.tol, r.solver, r.repeat, r.identity)
 
 
 def _label(entry: Any) -> str:

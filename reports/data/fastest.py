@@ -54,7 +54,6 @@ class Finding(Enum):
     TIE = "the first is not significantly faster than all others"
     DIVIDED = "on few cases, different solvers are fastest"
     ONE_BLOCK = "few cases, and too few blocks for an interval"
-    ENVIRONMENTS = "times of different environments are not compared"
     ALONE = "no other solver was measured"
     ONE_COMPLETE = "only one solver was verified on every case"
     NONE_COMPLETE = "no solver was verified on every case"
@@ -220,23 +219,20 @@ def _compared(
 ) -> Competitor:
     """Compare a competitor with the first one on the cases that both solved.
 
-    If their times on a case come from different environments, return the competitor
-    without ratios. On each case, the ratio is taken within the blocks in which both
+    On each case, the ratio is taken within the blocks in which both
     were measured (unpaired if there are fewer than two such blocks). Over cases, each
     end of Student's interval is moved out to the end of the sign-flip interval if that
     end is farther out. Student's interval assumes normally distributed logarithms of
     ratios, the sign-flip interval only a symmetric distribution. Neither assumption is
     safe for six cases, so both intervals must exclude 1 for a significant difference.
     """
-    both = [case for case in c.verified if not _mixed(c, first, case)]
-    if len(both) < len(c.verified):
-        return c
+    both = c.verified
     paired = {
         case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
         for case in both
     }
     by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
-    on_cases = replace(c, compared=tuple(both), by_case=by_case)
+    on_cases = replace(c, compared=both, by_case=by_case)
     if not over_cases:
         every = len(by_case) == len(c.outcomes)
         slower = every and all(ratio.low > 1 for ratio in by_case.values())
@@ -259,17 +255,6 @@ def _compared(
     return replace(on_cases, ratio=ratio, slower=slower, apart=apart)
 
 
-def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
-    """Return whether the compared times come from different environments."""
-    mine, its = (
-        {(r.session, r.repeat): r.environment for r in one.outcomes[case].records}
-        for one in (a, b)
-    )
-    if common := mine.keys() & its.keys():
-        return any(mine[block] != its[block] for block in common)
-    return len({*mine.values(), *its.values()}) > 1
-
-
 def _finding(
     group: ComparisonGroup,
     solved: Mapping[str, Row],
@@ -285,8 +270,6 @@ def _finding(
         return Finding.ALONE
     if len(full) < 2:
         return Finding.ONE_COMPLETE if full else Finding.NONE_COMPLETE
-    if any(_mixed(c, full[0], case) for c in full[1:] for case in solved):
-        return Finding.ENVIRONMENTS
     if all(c.slower for c in full[1:]):
         return Finding.FASTEST
     if over_cases:

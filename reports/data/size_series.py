@@ -81,7 +81,7 @@ class SeriesKey(NamedTuple):
     @property
     def title(self) -> str:
         """Family, fixed parameters, form, solver and tolerance in one line."""
-        keys = [f"{k}={v}" for k, v in self.fixed]
+        keys = [f"{k}={v}" for k, v in self.fixed if v is not None]
         name = clean(
             "/".join([self.family, *keys, *([self.form] if self.form else [])])
         )
@@ -118,14 +118,20 @@ def fixed_keys(
 ) -> dict[str, dict[str, None]]:
     """Return, by family, the parameters in which cases of equal size differ.
 
-    Each inner dict serves as an ordered set; its values are None.
+    Each inner dict serves as an ordered set; its values are None. A parameter that only
+    some cases have differs from None.
 
     apart : parameters that are never fixed
     """
+    answers = list(answers)
+    keys: dict[str, dict[str, None]] = {}
+    for _, o in answers:
+        keys.setdefault(o.first.family, {}).update(dict.fromkeys(o.first.params))
     seen: dict[tuple[str, str, int], set[Any]] = {}
     for n, o in answers:
-        for key, value in o.first.params.items():
+        for key in keys[o.first.family]:
             if key not in apart:
+                value = o.first.params.get(key)
                 seen.setdefault((o.first.family, key, n), set()).add(value)
     fixed: dict[str, dict[str, None]] = {}
     for (family, key, _), values in seen.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mortarbench.harness import Record
@@ -19,7 +19,7 @@ from mortarbench.reports.document.formatting import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_RUN = "run "  #: prefix of the run_ids in the title of a cell
+_RUN = "run "  #: prefix of the identities in the title of a cell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +32,7 @@ class Cell:
     #: a verdict, "best", "tied", "over" (emphasised), "void" (not comparable), "quiet",
     #: "none", "words" or "total"; empty for a plain entry
     kind: str = ""
-    title: str = ""  #: hover text; run_ids in the format of `sources` become links
+    title: str = ""  #: hover text; identities in the format of `sources` become links
     value: float | None = None  #: sort key; None to sort by text
 
     @classmethod
@@ -186,6 +186,32 @@ class Section:
             pictures=pictures,
         )
 
+    def at(self, place: str) -> Section:
+        """Return the section with every name, title and caption extended by a place.
+
+        place : name of an environment, see `reports.data.environment.by_environment`
+        """
+        mark = "-" + place.rpartition("@")[2]
+        note = f"Measured on the {place}."
+        return replace(
+            self,
+            name=self.name + mark,
+            title=f"{self.title} ({place})",
+            statements=tuple(
+                replace(
+                    s,
+                    subject=f"{s.subject} ({place})",
+                    evidence=tuple(name + mark for name in s.evidence),
+                )
+                for s in self.statements
+            ),
+            tables=tuple(replace(t, notes=(note, *t.notes)) for t in self.tables),
+            pictures=tuple(
+                replace(p, name=p.name + mark, caption=f"{p.caption} {note}")
+                for p in self.pictures
+            ),
+        )
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Page:
@@ -204,19 +230,19 @@ class Page:
 
 
 def sources(records: Iterable[Record]) -> str:
-    """Return hover text with the run_ids of records; empty if there are none."""
-    names = ", ".join(short(r.run_id) for r in records)
+    """Return hover text with the identities of records; empty if there are none."""
+    names = ", ".join(short(r.identity) for r in records)
     return _RUN + names if names else ""
 
 
 def named(title: str) -> list[str]:
-    """Return the run_ids in a hover text, as printed by `short` (see `sources`)."""
+    """Return the identities in a hover text, as printed by `short` (see `sources`)."""
     before, run, names = title.rpartition(_RUN)
     at_end = run and (not before or before.endswith(" "))
     return names.split(", ") if at_end else []
 
 
-def short(run_id: str) -> str:
-    """Return a run_id, sanitised unless it is short, alphanumeric and ASCII."""
-    is_safe = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
-    return run_id if is_safe else clean(run_id, 40)
+def short(identity: str) -> str:
+    """Return an identity, sanitised unless it is short, alphanumeric and ASCII."""
+    is_safe = len(identity) <= 40 and identity.isascii() and identity.isalnum()
+    return identity if is_safe else clean(identity, 40)

@@ -24,6 +24,7 @@ from mortarbench.reports.data.comparison_groups import (
     ComparisonGroup,
     comparison_groups,
 )
+from mortarbench.reports.data.environment import by_environment
 from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
 from mortarbench.reports.data.quantities import spreads
 from mortarbench.reports.data.size_series import SizeSeries, size_series
@@ -41,10 +42,22 @@ def csv_tables(
     The table `measurements` has one row per measurement; `outcomes` has one row per
     case, tolerance and solver, with medians of times and their intervals; `energies`
     and `scaling` contain the numbers of these sections of the report. For `contests`
-    and `means`, see `comparison_tables`.
+    and `means`, see `comparison_tables`. Every row belongs to one environment, whose
+    digest is in the column `environment`.
 
     pool_forms : compare the cases of all forms together
     """
+    tables: dict[str, list[pd.DataFrame]] = {}
+    for part in by_environment(evidence):
+        for name, frame in _tables(part, pool_forms=pool_forms).items():
+            if len(frame):
+                digest = part.records[0].environment
+                tables.setdefault(name, []).append(frame.assign(environment=digest))
+    return {name: _counted(pd.concat(frames)) for name, frames in tables.items()}
+
+
+def _tables(evidence: Evidence, *, pool_forms: bool) -> dict[str, pd.DataFrame]:
+    """Return the tables of one environment."""
     tables = {
         "measurements": _measurements(evidence.records),
         "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
@@ -64,8 +77,7 @@ def csv_tables(
             for solver in series.solvers
         ),
     }
-    tables |= comparison_tables(evidence, pool_forms=pool_forms)
-    return {name: _counted(frame) for name, frame in tables.items() if len(frame)}
+    return tables | comparison_tables(evidence, pool_forms=pool_forms)
 
 
 def frame_csv(frame: pd.DataFrame) -> str:

@@ -167,7 +167,7 @@ def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
             ),
             colour=_style(c, run).colour,
             solver=run.outcome.solver,
-            runs=((run.record.run_id,),),
+            runs=((run.record.identity,),),
         )
         for row, run in enumerate(outer)
     )
@@ -194,7 +194,7 @@ def _line(c: CaseHistories, run: SolverRun, x: Vector, y: Vector) -> Series:
         y=numbers(y),
         look=_style(c, run),
         solver=run.outcome.solver,
-        runs=((run.record.run_id,),),
+        runs=((run.record.identity,),),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from mortarbench.harness.running.pairs import Ratio
 from mortarbench.reports.data.comparison_groups import time_of
 from mortarbench.reports.data.evidence import case_set
-from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding
+from mortarbench.reports.data.fastest import Competitor, FastestSolver
 from mortarbench.reports.document.figure import (
     INK,
     Axis,
@@ -73,7 +73,7 @@ def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
 
 def _height(f: FastestSolver, most: int) -> float:
     """Return the height of all rows, inches."""
-    shared = _has_reference(f) and any(c.compared for c in f.others)
+    shared = f.competitors and any(c.compared for c in f.others)
     return max(len(_rows(f, most)), 4) * (_TALL if shared else _ROW)
 
 
@@ -88,7 +88,7 @@ def _panel(f: FastestSolver, solvers: Sequence[str], most: int, length: int) -> 
         style = replace(look(solvers.index(c.solver)), dash=None)
         failed = c in f.others
         below = _BELOW if failed and c.compared else 0.0
-        if _has_reference(f):
+        if f.competitors:
             marks += _marks(_RAISED - k if below else -float(k), c, f, style)
         if failed:
             texts.append(
@@ -103,7 +103,7 @@ def _panel(f: FastestSolver, solvers: Sequence[str], most: int, length: int) -> 
         x=_ratios(f),
         y=categories([_short(_name(c)) for c in _rows(f, most)]),
         marks=tuple(marks),
-        rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if _has_reference(f) else (),
+        rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if f.competitors else (),
         texts=tuple(texts),
         title=f"{legible(f.key.title)}, {legible(_cases(f), length)}",
         grid="x",
@@ -117,7 +117,7 @@ def _cases(f: FastestSolver) -> str:
 
 
 def _ratios(f: FastestSolver) -> Axis:
-    if not _has_reference(f):
+    if not f.competitors:
         return Axis(low=0.0, high=1.0, ticks=())
     time = "time from the mesh" if f.first.form else "time"
     label = f"{time} relative to {legible(_name(f.first), 44)}"
@@ -145,10 +145,6 @@ def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
     return [
         replace(p, x=replace(p.x, low=low, high=high)) if p.x.log else p for p in panels
     ]
-
-
-def _has_reference(f: FastestSolver) -> bool:
-    return bool(f.competitors) and f.finding is not Finding.ENVIRONMENTS
 
 
 def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]:

@@ -89,8 +89,8 @@ def below(keys: Sequence[Key], columns: int, title: str = "") -> Legend:
 
 
 def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
-    """Return the run_ids of the measurements behind a point."""
-    return tuple(r.run_id for r in records)
+    """Return the identities of the measurements behind a point."""
+    return tuple(r.identity for r in records)
 
 
 def curve(

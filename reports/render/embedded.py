@@ -17,12 +17,12 @@ from mortarbench.reports.document.layout import Cell, Page, Table, named, short
 from mortarbench.reports.figures.style import look
 from mortarbench.reports.render.plots import Data, panels
 
-Rows = Mapping[str, int]  #: run_id in the short form of titles → index of the record
+Rows = Mapping[str, int]  #: identity in the short form of titles → index of the record
 
 
 def rows_of(records: Sequence[Record]) -> Rows:
-    """Map every run_id to its index in the order of the report."""
-    return {short(r.run_id): i for i, r in enumerate(records)}
+    """Map every identity to its index in the order of the report."""
+    return {short(r.identity): i for i, r in enumerate(records)}
 
 
 def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
@@ -93,7 +93,7 @@ def plots(page: Page, rows: Rows) -> dict[str, list[Data]]:
 
 
 def _numbered(panel: Data, rows: Rows) -> Data:
-    """Replace run_ids by indices of records."""
+    """Replace identities by indices of records."""
     traces = [
         {**t, "runs": [spans(map(short, ids), rows) for ids in t.get("runs", ())]}
         for t in panel["traces"]
@@ -143,7 +143,7 @@ def spans(ids: Iterable[str], rows: Rows) -> list[int]:
 
 
 def _keys(records: Sequence[Record]) -> Data:
-    """Return the columns used by filters, and the run_ids used by links."""
+    """Return the columns used by filters, and the identities used by links."""
     shown: dict[str, Callable[[Record], str]] = {
         "case": lambda r: clean(r.case),
         "tol": lambda r: tolerance(r.tol),
@@ -151,7 +151,7 @@ def _keys(records: Sequence[Record]) -> Data:
         "status": lambda r: VERDICTS[r.verdict][1],
     }
     keys = {name: _coded([show(r) for r in records]) for name, show in shown.items()}
-    return {"id": [short(r.run_id) for r in records], **keys}
+    return {"id": [short(r.identity) for r in records], **keys}
 
 
 def _coded(values: Sequence[str]) -> Data:

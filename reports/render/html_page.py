@@ -29,7 +29,7 @@ FIRST = 50  #: number of table rows in the HTML itself; the script adds the othe
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
 _NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
 _LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
-_RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
+_IDENTITY = re.compile(r"\b([0-9a-f]{12}-)?[0-9a-f]{12}\b")
 
 
 def html(page: Page, drawings: Mapping[str, Svg] | None = None) -> str:
@@ -90,14 +90,14 @@ def breakable(text: str) -> Markup:
 
 
 def prose(text: str, rows: Rows) -> Markup:
-    """Render prose with formulas as MathML, breakable names and linked run_ids."""
+    """Render prose with formulas as MathML, breakable names and linked identities."""
 
     def linked(match: re.Match[str]) -> str:
-        run_id = match[0]
-        return f'<a href="#run-{run_id}">{run_id}</a>' if run_id in rows else run_id
+        name = match[0]
+        return f'<a href="#run-{name}">{name}</a>' if name in rows else name
 
     parts = split(text)
-    parts[::2] = [_RUN_ID.sub(linked, str(breakable(part))) for part in parts[::2]]
+    parts[::2] = [_IDENTITY.sub(linked, str(breakable(part))) for part in parts[::2]]
     for i in range(1, len(parts), 2):
         try:
             parts[i] = mathml(parts[i])
@@ -111,7 +111,7 @@ def link(cell: Cell, page: Page, rows: Rows) -> Markup:
     runs = runs_of(cell, rows)
     if not runs:
         return Markup("")
-    target = quote(short(page.records[runs[0]].run_id), safe="")
+    target = quote(short(page.records[runs[0]].identity), safe="")
     return Markup(f'href="#run-{target}" data-runs="{",".join(map(str, runs))}"')
 
 

@@ -7,7 +7,7 @@ package, and decorate it with `@section`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from importlib import import_module
 from pkgutil import iter_modules
@@ -28,7 +28,7 @@ from mortarbench.reports.document.layout import Part, Section
 
 
 class Analysis:
-    """Evidence of a result folder, and derived results that several sections use.
+    """Evidence from one environment, and derived results that several sections use.
 
     pool_forms : compute means, ranks and profiles over the cases of all forms together
     """
@@ -90,6 +90,7 @@ class _Entry(NamedTuple):
 _ENTRIES: list[_Entry] = []
 EVIDENCE = 10  #: sections at smaller positions contain conclusions
 APPENDIX = 90  #: from this position on: conditions and definitions
+COMMON = 94  #: from this position on: the same for all environments
 
 
 def section(
@@ -115,8 +116,11 @@ def section(
     return register
 
 
-def sections(analysis: Analysis) -> Iterator[Section]:
-    """Compose all sections; list the omitted ones with `needs` before the appendix."""
+def sections(*analyses: Analysis) -> Iterator[Section]:
+    """Compose every section for the analysis of each environment.
+
+    Sections with `needs` that no environment has are listed before the appendix.
+    """
     missing: list[str] = []
     for entry in _entries():
         if entry.place >= APPENDIX and missing:
@@ -126,17 +130,24 @@ def sections(analysis: Analysis) -> Iterator[Section]:
             title = "Not in this report"
             yield Section(name="absent", title=title, prose=prose, points=(*missing,))
             missing = []
-        composed = entry.compose(analysis)
-        if composed is not None:
-            yield composed
-        elif entry.needs:
+        composed = list(_composed(entry, analyses))
+        yield from composed
+        if entry.needs and not composed:
             missing.append(entry.needs)
 
 
-def opening(analysis: Analysis) -> list[Section]:
+def opening(analysis: Analysis) -> Iterator[Section]:
     """Compose the sections with conclusions, which precede the evidence."""
-    composed = [e.compose(analysis) for e in _entries() if e.place < EVIDENCE]
-    return [one for one in composed if one is not None]
+    for entry in _entries():
+        if entry.place < EVIDENCE:
+            yield from _composed(entry, [analysis])
+
+
+def _composed(entry: _Entry, analyses: Sequence[Analysis]) -> Iterator[Section]:
+    for analysis in analyses[:1] if entry.place >= COMMON else analyses:
+        composed, place = entry.compose(analysis), analysis.evidence.place
+        if composed is not None:
+            yield composed.at(place) if place else composed
 
 
 def _entries() -> list[_Entry]:

@@ -87,9 +87,9 @@ def answer(a: Analysis) -> Iterator[Part]:
         yield from _form_statements(a)
         own = [part for part in own_results(a) if isinstance(part, Picture)]
         yield from own or _picture("answer", shown(a.fastest), a, FIRST_ROWS)
-    machines = len({r.environment for r in a.evidence.records})
+    others = () if a.evidence.place else tuple(a.evidence.places.values())
     busy = busy_with(a.evidence) is not None
-    yield from TEXT.parts("cautions", a.ways.uncharged, machines, busy)
+    yield from TEXT.parts("cautions", a.ways.uncharged, others, busy)
 
 
 @section(2, "forms", "Solver times for each form")

@@ -31,7 +31,7 @@ def convergence(a: Analysis) -> Iterator[Part]:
     for i, c in enumerate(chosen(a.evidence), 1):
         facts = {
             "one": c.runs[0].outcome,
-            "runs": ", ".join(run.record.run_id for run in c.runs),
+            "runs": ", ".join(run.record.identity for run in c.runs),
             "over": "products with P" if c.counted else "iterations",
             "ends": any(run.outer_ends.any() for run in c.runs),
         }

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
-from mortarbench.harness import Verdict
+from mortarbench.harness import Record, Verdict
 from mortarbench.harness.record import PROVEN, REFUTED
 from mortarbench.reports.data.cells import (
     answer_columns,
@@ -17,13 +19,28 @@ from mortarbench.reports.data.cells import (
     verdict_cell,
 )
 from mortarbench.reports.data.evidence import RESIDUALS, Outcome
-from mortarbench.reports.document.formatting import clean, fixed, plain_value, power
-from mortarbench.reports.document.layout import Cell, Column, Part, Table, sources
+from mortarbench.reports.data.quantities import best_of
+from mortarbench.reports.document.formatting import (
+    ENDINGS,
+    clean,
+    fixed,
+    plain_value,
+    power,
+)
+from mortarbench.reports.document.grouping import grouped
+from mortarbench.reports.document.layout import (
+    Cell,
+    Column,
+    Part,
+    Point,
+    Table,
+    sources,
+)
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.profiles import share
 
-TEXT = Sentences(__name__)
+TEXT = Sentences(__name__, ENDINGS=ENDINGS)
 #: (claimed to be solved, verified) → heading of the column
 KINDS = {
     (True, True): "claimed, verified",
@@ -31,6 +48,8 @@ KINDS = {
     (False, True): "verified, not claimed",
     (False, False): "neither",
 }
+_MESSAGE = 160  #: largest number of characters of a message
+_REASONS = 20  #: largest number of reasons in the list of answers without a claim
 
 
 @section(16, "tally", "Claims and verdicts: counts")
@@ -67,30 +86,90 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
 @section(18, "verdicts", "Claims and verdicts")
 def claims(a: Analysis) -> Iterator[Part]:
-    """Tabulate claims and verdicts; list refuted and unproven claims."""
+    """Tabulate claims and verdicts; state why answers are not verified."""
     yield from TEXT.parts("claims")
     yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
-    refuted = [o for o in a.evidence.flat if o.verdict in REFUTED]
+    ended = [
+        _Ended.of(o, row)
+        for row in a.evidence.outcomes.values()
+        for o in row.values()
+        if not o.verified and o.verdict is not Verdict.DECLINED
+    ]
+    alike = grouped(
+        ended, lambda e: (e.record.solver, e.record.tol, e.record.verdict, e.why)
+    )
+    refuted = [of for of in alike.values() if of[0].record.verdict in REFUTED]
     if refuted:
         columns = (
-            *answer_columns(),
-            ("verdict", verdict_cell),
+            ("case", _cases),
+            *answer_columns(lambda of: of[0].outcome)[1:],
+            ("verdict", lambda of: verdict_cell(of[0].outcome)),
             ("evidence", _refutation),
-            ("message of the solver", lambda o: Cell.label(o.first.message, 60)),
+            (
+                "message of the solver",
+                lambda of: Cell.label(of[0].record.message, _MESSAGE),
+            ),
         )
         caption = TEXT("refuted_caption")
         yield Table.of(caption, refuted, columns, text_columns=2)
+    others = [of for of in alike.values() if of[0].record.verdict not in REFUTED]
+    others.sort(key=len, reverse=True)
+    yield from (Point(TEXT("ended", of[0], len(of))) for of in others[:_REASONS])
+    if len(others) > _REASONS:
+        yield Point(TEXT("more", len(others) - _REASONS))
 
 
-def _refutation(outcome: Outcome) -> Cell:
-    """Return a cell with the residual or distance that is too large, and its limit."""
-    values = {name: outcome.largest(name) for name in RESIDUALS}
-    errors = {name: value for name, value in values.items() if value is not None}
-    if not errors:
-        return Cell(text="no point", title=source(outcome))
-    name = max(errors, key=lambda n: errors[n])
-    text = f"{name} {power(errors[name])} > {power(outcome.allowed)}"
-    return Cell(text=text, title=source(outcome))
+class _Ended(NamedTuple):
+    """An answer that is not verified, and the reasons."""
+
+    outcome: Outcome
+    record: Record  #: first repeat with the verdict of the outcome
+    reason: str  #: largest error, and the difference of the objective; empty if unknown
+
+    @property
+    def why(self) -> str:
+        """Reason and message in one line."""
+        message = clean(self.record.message, _MESSAGE)
+        return "; ".join(filter(None, (self.reason, message))) or "no point"
+
+    @classmethod
+    def of(cls, o: Outcome, row: Mapping[str, Outcome]) -> _Ended:
+        """State why an answer is not verified.
+
+        The objective is compared with that of the most accurate verified answer in the
+        row. It is mentioned if the difference, relative to the larger absolute value,
+        exceeds the largest residual that verification allows.
+
+        row : outcomes of all solvers on the same case at the same tolerance
+        """
+        record = next(r for r in o.records if r.verdict is o.verdict)
+        errors = {name: o.largest(name) for name in RESIDUALS}
+        known = [(value, name) for name, value in errors.items() if value is not None]
+        if not known:
+            return cls(o, record, "")
+        error, name = max(known, key=lambda each: each[0])
+        reason = f"{name} {power(error)} > {power(o.allowed)}"
+        peers = [p for p in row.values() if p.verdict is Verdict.VERIFIED]
+        mine = record.objective
+        theirs = best_of(peers).first.objective if peers else None
+        if mine is not None and theirs is not None:
+            apart, size = mine - theirs, max(abs(mine), abs(theirs))
+            if abs(apart) > o.allowed * size:
+                side = "above" if apart > 0 else "below"
+                gap = f"{power(abs(apart) / size)} {side} that of the other solvers"
+                reason = f"{reason}; the objective is {gap}"
+        return cls(o, record, reason)
+
+
+def _cases(alike: Sequence[_Ended]) -> Cell:
+    """Return a cell with the first case, and the number of answers with this result."""
+    cell, count = Cell.name(alike[0].outcome.case), len(alike)
+    return replace(cell, after=f"the same in {count} answers" if count > 1 else "")
+
+
+def _refutation(alike: Sequence[_Ended]) -> Cell:
+    title = source(*(e.outcome for e in alike))
+    return Cell(text=alike[0].reason or "no point", title=title)
 
 
 def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:

@@ -80,7 +80,7 @@ def environment(a: Analysis) -> Iterator[Part]:
     limits = {
         "tolerances": ", ".join(map(tolerance, tols)),
         "verified if every residual ≤": f"{evidence.factor:g} × tolerance",
-        "repeats, each prepared again": 1 + max(r.repeat for r in evidence.records),
+        "repeats, each prepared again": max(len(o.records) for o in evidence.flat),
         "time limit in s": evidence.suite.get("time_limit"),
         "memory limit in MiB": evidence.suite.get("memory_limit"),
         "environment digest": ", ".join(digests),

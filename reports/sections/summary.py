@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness import InputError, Verdict
 from mortarbench.harness.record import PROVEN, SCHEMA, VERIFIED_FACTOR
 from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import ENDINGS, VERDICTS, clean
+from mortarbench.reports.document.formatting import ENDINGS, VERDICTS
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.document.layout import Cell, Part, Point, Table, sources
 from mortarbench.reports.document.templates import Sentences
@@ -46,8 +46,8 @@ def summary(a: Analysis) -> Iterator[Part]:
         made=_measurement_counts(evidence),
         cases=len({o.case for o in evidence.flat}),
         tols=sorted({o.tol for o in evidence.flat}, reverse=True),
-        digests=sorted({r.environment for r in evidence.records}),
-        marks=_marks(evidence),
+        sessions=len({r.session for r in evidence.records}),
+        others=_others(evidence),
         faults=in_words(evidence.faults),
         judged=sorted({r.accuracy for r in evidence.records if r.accuracy is not None}),
         schemas=sorted({r.schema for r in evidence.records} - {SCHEMA}),
@@ -79,26 +79,30 @@ def summary(a: Analysis) -> Iterator[Part]:
     )
 
 
-def _marks(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
-    """List the marks after solver labels, their environments, and keys that differ."""
+def _others(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
+    """List the further environments: name, machine, and keys that differ."""
     found: list[tuple[str, str, list[str]]] = []
-    for digest, mark in evidence.marks.items():
+    for digest, place in evidence.places.items():
         try:
             there = environment_of(evidence.directory, digest)
         except InputError:
-            found.append((mark.strip(), clean(digest), []))
+            found.append((place, "not described in the folder", []))
         else:
             keys = [key for key, *_ in differences(evidence.environment, there)]
-            found.append((mark.strip(), clean(machine(there)), keys))
+            found.append((place, machine(there), keys))
     return found
 
 
 def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
     """Return the numbers of measurements: completed, planned, declined and missing.
 
-    If a solver declines a case, the journal has one line for all repeats.
+    If a solver declines a case, the journal has one line for all repeats. If the folder
+    contains several environments, the suite does not define what is planned in each.
     """
     made = sum(r.verdict is not Verdict.DECLINED for r in evidence.records)
+    if evidence.places:
+        declined = len(evidence.records) - made
+        return made, made + declined, declined, 0
     asked = evidence.suite.get("repeats")
     most = max(len(o.records) for o in evidence.flat)
     repeats = asked if isinstance(asked, int) and asked > 0 else most
@@ -112,18 +116,13 @@ def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
 def _cells(evidence: Evidence) -> int:
     """Count the planned combinations of case, tolerance and solver.
 
-    Every solver is planned on the cases of its mode (cold or a sequence) and
-    environment.
+    Every solver is planned on the cases of its mode (cold or a sequence).
     """
-
-    def kind(r: Record) -> tuple[str, str]:
-        return r.mode, evidence.marks.get(r.environment, "")
-
-    kinds = {r.solver: kind(r) for r in evidence.records}
+    modes = {r.solver: r.mode for r in evidence.records}
     rows = evidence.outcomes.values()
-    present = [{kind(o.first) for o in row.values()} for row in rows]
+    present = [{o.first.mode for o in row.values()} for row in rows]
     return sum(
-        kinds[solver] in of_case for of_case in present for solver in evidence.solvers
+        modes[solver] in of_case for of_case in present for solver in evidence.solvers
     )
 
 

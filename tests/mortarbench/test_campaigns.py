@@ -18,6 +18,7 @@ from mortarbench.harness.files.store import is_stored
 from mortarbench.harness.results.folder import environment_of
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.registries import Registries
+from mortarbench.reports.data.environment import by_environment
 from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.markdown import markdown
@@ -193,49 +194,63 @@ def test_parts_of_a_campaign_are_merged_into_one_folder(measure, tmp_path):
     assert len(read_journal(tmp_path / "all")) == 2 * 3 * 2
 
 
-def test_equal_measurements_of_two_machines_are_kept_and_marked(
+def test_equal_measurements_of_two_machines_are_kept_and_reported_apart(
     measure, campaign, tmp_path, environment
 ):
     shutil.copytree(campaign / "before", tmp_path / "a")
     environment["machine"] = {"cpu": "two"}
     measure("b")
     orders = [
-        {
-            r.replace(run_id="").to_json()
-            for r in mb.merge(
-                tmp_path / x, tmp_path / y, out=tmp_path / f"{x}{y}"
-            ).records
-        }
-        for x, y in ("ab", "ba")
+        {r.to_json() for r in mb.merge(*sources, out=tmp_path / out).records}
+        for out, sources in (
+            ("ab", (tmp_path / "a", tmp_path / "b")),
+            ("ba", (tmp_path / "b", tmp_path / "a")),
+        )
     ]
     records = read_journal(tmp_path / "ab")
     evidence = read_evidence(tmp_path / "ab")
     said = markdown(compose(evidence))
 
     assert orders[0] == orders[1]
-    assert len(records) == len({r.run_id for r in records}) == 16
+    assert len(records) == len({r.identity for r in records}) == 16
+    assert len({r.run_id for r in records}) == 8
     digests = [*dict.fromkeys(r.environment for r in records)]
     assert [environment_of(tmp_path / "ab", d)["machine"]["cpu"] for d in digests] == [
         "one", "two",
     ]  # fmt: skip
-    mark = f"@{digests[1][:6]}"
-    assert set(evidence.solvers) == {"exact", "lax", f"exact {mark}", f"lax {mark}"}
-    assert all(len(o.records) == 2 for o in evidence.flat)
-    assert f"{mark} is two (other: machine.cpu)" in said
+    place = f"other machine @{digests[1][:6]}"
+    assert set(evidence.solvers) == {"exact", "lax"}
+    for part in by_environment(evidence):
+        assert [len(o.records) for o in part.flat] == [2] * 4
+    assert f"{place} is two (other: machine.cpu)" in said.replace("\\", "")
     assert "not made yet" not in said
     mb.merge(tmp_path / "ba", tmp_path / "a", out=tmp_path / "ab")  # nothing new
     assert read_journal(tmp_path / "ab") == records
 
 
-def test_duplicates_in_one_environment_count_once(measure, campaign, tmp_path):
+def test_two_sessions_on_one_machine_are_kept_and_pooled(measure, campaign, tmp_path):
+    """The second session measures a part of the first one again."""
     first = measure("a", depths="1")
     shutil.copytree(campaign / "before", tmp_path / "b")
     merged = mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
+    row = read_evidence(tmp_path / "all").outcomes["well/dual", 1e-6]
 
     assert merged.records[:4] == first.records
-    assert len(merged) == 8
-    row = read_evidence(tmp_path / "all").outcomes["well/dual", 1e-6]
-    assert [len(o.records) for o in row.values()] == [2, 2]
+    assert merged.records[4:] == tuple(read_journal(tmp_path / "b"))
+    assert [len(o.records) for o in row.values()] == [4, 4]
+    assert {o.seconds("total").samples for o in row.values()} == {4}
+
+
+def test_a_measurement_of_two_sessions_is_replayed_by_session_and_run_id(
+    measure, tmp_path
+):
+    a, b = (measure(name, depths="1").records for name in "ab")
+    mb.merge(tmp_path / "a", tmp_path / "b", out=tmp_path / "all")
+
+    again = mb.replay(tmp_path / "all", b[0].identity, plugins=[TOY_PROBLEM])
+    assert again.then == b[0]
+    with pytest.raises(mb.InputError, match=f"2 measurements .*{a[0].identity}"):
+        mb.replay(tmp_path / "all", a[0].run_id, plugins=[TOY_PROBLEM])
 
 
 @pytest.mark.parametrize(

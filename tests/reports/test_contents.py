@@ -390,6 +390,54 @@ def test_every_refuted_claim_is_listed_with_its_evidence(measured, page):
     assert len(section(page(records[:1]), "verdicts").tables) == 1
 
 
+def test_the_objective_of_an_unverified_answer_is_compared_with_the_others(
+    measured, page
+):
+    """The planted optimum is −2; other objectives are relative to the larger value."""
+    wrong = {"verdict": Verdict.WRONG, "gap": 3e-3}
+    late = {"verdict": Verdict.ITERATION_LIMIT, "claimed": "iteration_limit"}
+    records = [
+        measured("sound", objective=-2.0),
+        measured("rough", objective=-2.1, gap=9e-8),  # verified, but less accurate
+        measured("high", objective=-1.998, message="row 3 violated", **wrong),
+        measured("low", objective=-2.5, **wrong),
+        measured("near", objective=-2.0 - 1e-8, **wrong),
+        measured("late", objective=1.0, gap=0.1, **late),
+    ]
+    found = section(page(records), "verdicts")
+    text = {row["solver"].text: row["evidence"].text for row in rows(found.tables[1])}
+    gap = "gap 3.0e-3 > 1.0e-7"
+
+    assert text == {
+        "high": f"{gap}; the objective is 1.0e-3 above that of the other solvers",
+        "low": f"{gap}; the objective is 0.20 below that of the other solvers",
+        "near": gap,
+    }
+    (point,) = found.points
+    assert point.startswith("late reached the iteration limit on ")
+    assert "the objective is 1.5 above that of the other solvers" in point
+
+
+def test_identical_failures_are_one_line(measured, page):
+    lost = {"verdict": Verdict.CRASHED, "claimed": None, "message": "SIGSEGV"}
+    blind = {"verdict": Verdict.WRONG, "message": "NaN in z"}
+    nothing = dict.fromkeys(("primal", "dual", "complementarity", "gap"))
+    records = [
+        measured(solver, physical=f"beam-ring/n={n}", **end, **nothing)
+        for solver, end in (("fragile", lost), ("blind", blind))
+        for n in range(52)
+    ]
+    found = section(page([measured(), *records]), "verdicts")
+
+    assert [point.partition("tol 1e-8: ")[2] for point in found.points] == [
+        "SIGSEGV (the same in 52 answers)."
+    ]
+    (row,) = rows(found.tables[1])
+    assert row["case"].after == "the same in 52 answers"
+    assert row["message of the solver"].text == "NaN in z"
+    assert len(row["evidence"].title.split(", ")) == 52
+
+
 def test_a_scaling_figure_grows_with_its_legend(measured, tmp_path):
     """With thirty solvers, the axes have at least 80 % of the height with three."""
 

@@ -47,7 +47,7 @@ async function fill(dialog, run, others) {
   const at = others.indexOf(run);
   const close = make("button", { type: "button", class: "close" }, "close");
   close.addEventListener("click", () => dialog.close());
-  const command = `mortarbench replay ${folder()} ${quoted(record.run_id)}`;
+  const command = `mortarbench replay ${folder()} ${quoted([record.session, record.run_id].filter(Boolean).join("-"))}`;
   const stored = ["vectors", "fields"].filter((name) => record[name]).map((name) =>
     make("li", {}, `${name}: `, make("a", { href: `../vectors/${encodeURIComponent(record[name])}.npz` }, `vectors/${record[name]}.npz`)));
   const rest = Object.entries(record).filter(([name]) => !SHORT.includes(name));

@@ -33,6 +33,7 @@ from mortarbench.harness.conformance.manufactured import (
 from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
+from mortarbench.validation import Conformance
 from tests.support import FAULTY_SOLVERS, ROOT
 from tests.support.faulty_solvers import (
     MEMORY,
@@ -427,6 +428,20 @@ def test_failures_are_reported_with_exit_code_1(capsys, monkeypatch):
 
     assert command("test-solver", "sound", "--plugin", FAULTY_SOLVERS) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_equal_failures_are_one_line_that_counts_them():
+    broken = {f"check {k}": conformance.Result(Grade.FAIL, "no x") for k in range(52)}
+    other = {"signs": conformance.Result(Grade.FAIL, "z < 0")}
+    passed = {f"good {k}": conformance.Result(Grade.PASS) for k in range(3)}
+    text = repr(Conformance(solver="mine", results=broken | other | passed))
+
+    assert [line.split() for line in text.splitlines()[:2]] == [
+        ["fail", "check", "0", "no", "x", "(the", "same", "in", "52", "checks)"],
+        ["fail", "signs", "z", "<", "0"],
+    ]
+    assert text.count("pass  good") == 3
+    assert text.endswith("mine: 3 pass, 0 decline, 0 weak, 53 fail")
 
 
 def test_an_unknown_solver_is_invalid_input(capsys):

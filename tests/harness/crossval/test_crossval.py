@@ -612,6 +612,25 @@ def test_cases_that_cannot_be_built_as_they_were_are_listed(truths, tmp_path, cl
     assert "digest" in why[f"{BEAM}/step=1/dual-bounds"]
 
 
+def test_an_answer_to_another_qp_of_the_same_name_is_listed_but_not_judged(
+    truths, tmp_path, cli
+):
+    """Two sessions have the same run_id; a default changed before the second one."""
+    _, s = truths[2, "dual-bounds"]
+    write(tmp_path, [("a", f"{BEAM}/dual-bounds", s)])
+    write_point(tmp_path / "vectors/wrong.npz", replace(s, x=2 * s.x))
+    with Journal(tmp_path, "here") as journal:
+        (r,) = read_journal(tmp_path)
+        journal.append(r.replace(session="later", qp="0" * 16, vectors="wrong"))
+
+    code, verdict = verdict_on(cli, tmp_path)
+
+    assert (code, verdict["counts"]["answers"]) == (0, 1)
+    (listed,) = verdict["not_validated"]
+    assert listed["run_id"] == f"later-{r.run_id}"
+    assert "0" * 16 in listed["text"]
+
+
 def pulled():
     return reference_solution(built("half/qp").qp)
 

@@ -224,6 +224,11 @@ def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
     assert ["versions.numpy", "1.2.3"] in [words[:2] for words in told]
     assert any(w[:1] and w[0].startswith("threads.pools.") and "7" in w for w in told)
     assert "threads.variables" not in out
+    # times of seven threads are not divided by those of one
+    assert [words[-2:] for words in told if words[1:2] == ["s"]] == 3 * [
+        ["other", "machine"]
+    ]
+    assert "stored repeat" not in out
 
 
 def test_the_first_digits_of_a_run_id_suffice(cli, stored):

@@ -24,6 +24,7 @@ from mortarbench.reports.compare.changes import (
 )
 from mortarbench.reports.compare.conclusions import change_word, verdict_lines
 from mortarbench.reports.compare.page import compose
+from mortarbench.reports.data.environment import by_environment
 from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
 from mortarbench.reports.render.markdown import markdown
 
@@ -550,13 +551,13 @@ def test_folders_with_and_without_a_plug_in_merge_into_one_comparison(
     merge([a, b], tmp_path / "both")
     found = read_evidence(tmp_path / "both")
     assert set(found.solvers) == set(SOLVERS)
-    assert found.marks == {}
+    assert by_environment(found) == (found,)
     assert {len(o.records) for o in found.flat} == {6}
 
     slow = with_it | {"machine": {"cpu": "slow"}}
     (b / "environment.json").write_text(json.dumps(slow))
     merge([a, b], tmp_path / "apart")
-    assert len(read_evidence(tmp_path / "apart").marks) == 1
+    assert len(by_environment(read_evidence(tmp_path / "apart"))) == 2
 
 
 def from_file(path, **changes):

@@ -384,20 +384,6 @@ def test_times_at_equal_certified_error_are_compared(record, opened):
     assert "accuracy" in statement.evidence
 
 
-def test_times_of_different_environments_give_no_winner(record, opened):
-    records = [
-        r.replace(environment="other" if r.solver == "new" else "abc")
-        for r in one_case(record, old=1.0, new=0.5)
-    ]
-    (claim,) = opened(records)["dual"].claims
-    assert "different environments, whose times are not comparable" in claim
-    nodes = [
-        r.replace(environment=f"node{r.repeat % 2}")
-        for r in one_case(record, a=1.0, b=2.0)
-    ]
-    assert opened(nodes)["dual"].claims[0].startswith("a was the fastest")
-
-
 def test_declined_cases_are_reported_separately_from_failures(record, opened):
     shy = record(
         "shy", 0, None, verdict=Verdict.DECLINED, claimed="", message="too large"
