@@ -2,11 +2,13 @@
 
 import gc
 import os
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib import import_module
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
@@ -20,11 +22,13 @@ from mortarbench.harness.processes import supervisor
 from tests.support import ROOT
 from tests.support.fork_server import Forks
 
-# On a loaded machine, examples may take longer than the limits of hypothesis.
+# Examples depend on the test alone. On a loaded machine, they may take longer than the
+# limits of hypothesis.
 settings.register_profile(
-    "untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)
-settings.load_profile("untimed")
+    "reproducible", derandomize=True, deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)  # fmt: skip
+settings.load_profile("reproducible")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -140,6 +144,15 @@ def how_processes_start(forks):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(supervisor, "subprocess", forks)
         yield
+
+
+@pytest.fixture
+def rng(request: pytest.FixtureRequest) -> np.random.Generator:
+    """Return a generator of random numbers, seeded by the test's name and parameters.
+
+    The numbers therefore depend neither on other tests nor on the machine.
+    """
+    return np.random.default_rng(zlib.crc32(request.node.name.encode()))
 
 
 @pytest.fixture

@@ -179,3 +179,29 @@ def test_the_harness_names_no_solver_and_no_unit_of_physics():
     assert {path for path, _ in found} - {"harness/qp.py"} == {
         "harness/conformance/equivalence.py"
     }
+
+
+def import_statements(text, indent=""):
+    """Yield the statements of a module that are executed when it is imported."""
+    for statement in re.split(rf"(?m)^(?={indent}[^\s)])", text):
+        if statement.startswith(f"{indent}class "):
+            yield from import_statements(statement.partition("\n")[2], indent + "    ")
+        elif not re.match(" *(async )?def ", statement):
+            yield statement
+
+
+def test_random_data_of_a_test_do_not_depend_on_other_tests():
+    """A generator that several tests share makes their data depend on their order."""
+    generator = re.compile(
+        r"^(?!.*\blambda\b).*\b(default_rng|Generator|RandomState|Random)\(", re.M
+    )
+    example = "import random\n\nclass Test:\n    rng = np.random.default_rng(1)\n"
+    assert any(map(generator.search, import_statements(example)))
+
+    shared = [
+        (path, statement)
+        for path, text in modules("tests")
+        for statement in import_statements(text)
+        if generator.search(statement)
+    ]
+    assert shared == []

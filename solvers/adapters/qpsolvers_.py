@@ -30,6 +30,7 @@ from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     dense,
+    fixed_in_rows,
     needs_dense,
     needs_independent_rows,
     objective_factor,
@@ -82,6 +83,10 @@ DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadpro
 #: itself, with a wrong result
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
+#: backends that receive equal bounds as equality rows; with equal bounds, quadprog
+#: claims for one of eight feasible QPs (conformance, shape 'fixed') that no point is
+#: feasible
+NEEDS_FIXED_IN_ROWS = ("quadprog",)
 
 #: claim for a status message without a solution; the first pattern that matches counts
 STATUS_PATTERNS = (
@@ -140,6 +145,8 @@ class QPSolvers:
             return "needs a row or a bound; qpsolvers solves unconstrained QPs itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
+        if self.backend in NEEDS_FIXED_IN_ROWS:
+            qp, _ = fixed_in_rows(qp)
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
         if needs_rank and (reason := needs_independent_rows(qp)):
             return reason
@@ -147,6 +154,13 @@ class QPSolvers:
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        if self.backend not in NEEDS_FIXED_IN_ROWS:
+            return self._prepare(qp, tol)
+        other, back = fixed_in_rows(qp)
+        solve = self._prepare(other, tol)
+        return lambda: back(solve())
+
+    def _prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import qpsolvers
 
         call = CALLS.get(self.backend, Call())

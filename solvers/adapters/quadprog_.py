@@ -16,6 +16,7 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from mortarbench.harness import QP, About, Solution, Status
 from mortarbench.solvers.common.conversion import (
     dense,
+    fixed_in_rows,
     needs_dense,
     needs_independent_rows,
     objective_factor,
@@ -56,9 +57,16 @@ class Quadprog:
     )
 
     def declines(self, qp: QP) -> str | None:
-        return needs_dense(qp, 4) or needs_independent_rows(qp)
+        return needs_dense(qp, 4) or needs_independent_rows(fixed_in_rows(qp)[0])
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
+        # with equal bounds as inequalities, quadprog claims that one of eight feasible
+        # QPs (conformance, shape 'fixed') is infeasible
+        other, back = fixed_in_rows(qp)
+        solve = self._prepare(other)
+        return lambda: back(solve())
+
+    def _prepare(self, qp: QP) -> Callable[[], Solution]:
         import quadprog
 
         scale = objective_factor(qp, 1.0)

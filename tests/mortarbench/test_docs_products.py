@@ -11,15 +11,17 @@ sys.path.append(str(ROOT / "tools"))
 import products  # tools/products.py, which writes the tables
 
 LINES = products.PAGE.read_text("utf-8").splitlines()
-CELLS = [
-    pytest.param(case, head, int(LINES[index].split("|")[column]), id=f"{case} {head}")
-    for index, case, column, head in products.cells(LINES)
-]
 #: cases that take a fraction of a second
 SHORT = re.compile(
     r"beam-ring/Nr=4/.*step=\d+/|greco/n=16/|membranes/S=[12]/n=[48]/|string/n=100/"
 )
-QUICK = [cell for cell in CELLS if SHORT.match(cell.values[0])]
+CELLS = [
+    pytest.param(
+        case, head, int(LINES[index].split("|")[column]),
+        id=f"{case} {head}", marks=() if SHORT.match(case) else pytest.mark.slow,
+    )
+    for index, case, column, head in products.cells(LINES)
+]  # fmt: skip
 
 
 def test_the_page_has_measured_tables_of_every_kind():
@@ -27,22 +29,19 @@ def test_the_page_has_measured_tables_of_every_kind():
 
     assert modes == {None, "warm", "tightened"}
     assert len(CELLS) >= 200
-    assert len(QUICK) >= 20
+    assert sum(not cell.marks for cell in CELLS) >= 20
 
 
-@pytest.mark.parametrize(("case", "head", "shown"), QUICK)
-def test_a_short_count_is_the_one_shown(case, head, shown):
-    """Counts may differ slightly, because another BLAS rounds differently."""
-    assert products.products(case, head) == pytest.approx(shown, abs=1, rel=0.03)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("case", "head", "shown"), CELLS)
 def test_a_count_is_the_one_shown(case, head, shown):
-    """Rounding changes the counts of long runs by up to a third, and those of short
-    runs by a few steps.
-    """
-    assert products.products(case, head) == pytest.approx(shown, abs=3, rel=0.35)
+    """The bounds are those of the page's section on reproducible counts: rounding
+    changes counts of `smalbe` by one, and counts of the presets by a half."""
+    count = products.products(case, head)
+
+    if head.startswith("`smalbe"):
+        assert abs(count - shown) <= 1
+    else:
+        assert shown / 1.5 <= count <= 1.5 * shown
 
 
 def test_smalbe_needs_at_most_half_of_the_products_of_permon_on_the_benchmark():

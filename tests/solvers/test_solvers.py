@@ -5,6 +5,7 @@ does not test.
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -351,6 +352,17 @@ def test_highs_drops_no_small_entries(name):
     unit = 1e-5
     small = replace(qp, P=qp.P * unit, b=qp.b / unit)
     assert kkt_residuals(small, solve(name, small)).worst <= 1e-8
+
+
+def test_quadprog_solves_qps_with_fixed_variables(manufactured):
+    """If equal bounds are inequalities, quadprog claims that one of eight QPs is
+    infeasible."""
+    backend = replace(SOLVERS["qpsolvers:*"], backend="quadprog")
+    for seed, solver in product(range(60), (SOLVERS["quadprog"], backend)):
+        qp, expected = manufactured("fixed", seed=seed)
+        answer = solver.prepare(qp, 1e-6)()
+        assert answer.x == pytest.approx(expected.x, rel=0, abs=1e-12)
+        assert answer.z_box == pytest.approx(expected.z_box, rel=0, abs=1e-11)
 
 
 def test_a_hessian_that_is_not_definite_is_declined_by_quadprog(manufactured):

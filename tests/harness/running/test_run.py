@@ -186,8 +186,8 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_valid(
             assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
             said = got[solver].message
-            # a pause of a busy machine also causes a note
-            if not said.startswith("took "):
+            # a pause, or what a library loads in its first call, also causes a note
+            if not said.startswith("the first solve took "):
                 assert message in (None, said)
 
 

@@ -17,8 +17,7 @@ def searched(**drawn):
 
     def decorate(check):
         def test(examples):
-            some = settings(derandomize=True, max_examples=examples, deadline=None)
-            some(given(**drawn)(check))()
+            settings(max_examples=examples)(given(**drawn)(check))()
 
         test.__name__, test.__doc__ = check.__name__, check.__doc__
         counts = [10, pytest.param(40, marks=pytest.mark.slow)]

@@ -13,12 +13,10 @@ from mortarbench.problems.contact.space.node_to_face import (
 from mortarbench.problems.contact.space.triangles import triangulated
 from mortarbench.problems.contact.surface import faceted_surface
 
-RNG = np.random.default_rng(5)
 
-
-def test_closest_points_of_triangles_are_those_of_a_fine_search():
-    triangle = RNG.standard_normal((60, 3, 3))
-    x = 2 * RNG.standard_normal((60, 3))
+def test_closest_points_of_triangles_are_those_of_a_fine_search(rng):
+    triangle = rng.standard_normal((60, 3, 3))
+    x = 2 * rng.standard_normal((60, 3))
     at = np.einsum("pv,pvx->px", closest_in_triangles(x, triangle), triangle)
     distance = np.linalg.norm(x - at, axis=1)
     a, b = np.meshgrid(*[np.linspace(0, 1, 101)] * 2)
@@ -44,13 +42,13 @@ def extruded(chain, layers, width):
 
 
 @pytest.mark.parametrize("tangential", [False, True])
-def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
+def test_rows_of_extruded_sides_are_those_of_the_plane(tangential, rng):
     t = np.linspace(0, 1, 7)
     lower = np.stack([1 - t, 0.1 * np.sin(3 * (1 - t))], axis=-1)  # its body below
     s = np.linspace(0.05, 0.97, 9)
     upper = np.stack([s, 0.12 * np.sin(3 * s) + 0.02], axis=-1)  # its body above
     flat = np.concatenate([upper, lower])
-    u = 0.003 * RNG.standard_normal(flat.shape)
+    u = 0.003 * rng.standard_normal(flat.shape)
     plane = node_to_segment(
         flat, u.ravel(), np.arange(9), 9 + np.arange(7), tangential=tangential
     )
@@ -65,7 +63,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
     )  # fmt: skip
 
     # every layer has the displacement of the plane problem
-    motion = RNG.standard_normal(flat.shape)
+    motion = rng.standard_normal(flat.shape)
     in_space = np.zeros_like(points)
     in_space[:, [0, 2]] = np.concatenate(
         [np.tile(motion[:9], (layers, 1)), np.tile(motion[9:], (layers, 1))]
@@ -84,7 +82,7 @@ def test_rows_of_extruded_sides_are_those_of_the_plane(tangential):
     assert_allclose(total, plane.share, atol=1e-3)  # areas per width are lengths
 
 
-def test_the_closest_face_is_that_of_an_exhaustive_search():
+def test_the_closest_face_is_that_of_an_exhaustive_search(rng):
     n = 9
     a, b = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n))
     height = 0.2 * np.sin(5 * a) * np.cos(4 * b)
@@ -93,7 +91,7 @@ def test_the_closest_face_is_that_of_an_exhaustive_search():
     corners = (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1])
     table = np.stack([c.ravel() for c in corners], axis=-1)
     faces = triangulated(faceted_surface(points, table, "master"))
-    x = RNG.uniform([-0.5, -0.5, -1], [1.5, 1.5, 2], (200, 3))
+    x = rng.uniform([-0.5, -0.5, -1], [1.5, 1.5, 2], (200, 3))
     closest = closest_points(x, faces)
     at = np.einsum("sc,scx->sx", closest.N, points[table[closest.face]])
     for one, foot in zip(x, at, strict=True):

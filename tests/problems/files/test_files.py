@@ -435,13 +435,13 @@ def test_a_bad_qps_text_is_refused_with_its_line(written, old, new, message):
 
 # Maros-Mészáros in .mat
 
-RNG = np.random.default_rng(20240613)
-HALF = RNG.standard_normal((4, 4))
+HALF = np.array([[2, 0, 1, 0], [1, 3, 0, 0], [0, -1, 2, 1], [0.5, 0, 0, 1]])
+ROWS = [[1, 2, 0, -1], [0, 1, 1, 0], [3, 0, -1, 2], [1, 0, 0, 1], [-2, 1, 0.5, 1]]
 MAT = {
     "P": csc_matrix(HALF @ HALF.T),
-    "q": RNG.standard_normal((4, 1)),
+    "q": np.array([[1.0], [-2.0], [0.5], [3.0]]),
     "r": 2.5,
-    "A": csc_matrix(RNG.standard_normal((5, 4))),
+    "A": csc_matrix(np.array(ROWS)),
     "l": np.array([[1.0, -1e20, -2, -1e20, -1]]),
     "u": np.array([[1.0, 3, 1e20, 1e20, 4]]),
     "n": 4,
