@@ -33,7 +33,6 @@ from mortarbench.harness.results.work_unit import (
     WorkUnit,
 )
 from mortarbench.harness.solution import Solution, Status
-from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
@@ -199,7 +198,6 @@ class Executor:
         request = {
             "out": str(self._point),
             "source": source,
-            "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
             **({"step": step} if block.is_sequence else {}),
             **({"tightens": True} if record.tighten else {}),
         }
