@@ -41,6 +41,9 @@ MAX_UNTIMED_SECONDS = 1.0
 REMEMBERED_SPEEDUP = 5.0
 #: Number of perturbed solves that must all be slower. Other programs may delay a few.
 MIN_PERTURBED_SOLVES = 3
+#: Total time of perturbed solves, s, after which the timed solves follow each other. It
+#: is exceeded only if perturbed solves are slower than the timed ones.
+MAX_PERTURBED_SECONDS = 2 * SAMPLE_SECONDS
 #: Largest number of rows of an operator P that is assembled for a solver.
 MAX_ASSEMBLED_ROWS = 3000
 #: largest count that is stored, since doubles do not represent all larger integers
@@ -122,7 +125,7 @@ def measure(
             if not (once or prepare or sum(seconds) > MAX_UNTIMED_SECONDS):
                 rest = _Perturbed(run, qp, answer) if perturbs else None
                 answer, repeats = _repeated(run, qp, rest)
-                remembered = rest and rest.remembered(repeats)
+                remembered = None if rest is None else rest.remembered(repeats)
                 untimed = run.solves - len(repeats)
         except DeclinedError as e:
             return _without_point(qp, Status.DECLINED, str(e))
@@ -249,6 +252,7 @@ class _Perturbed:
         self._answers = [first]  # answers to `qp` and to the last perturbed QP
         self._same = False  # True if the same point was returned for two QPs
         self._seconds: list[float] = []
+        self.total_seconds = 0.0  #: total time of the solves, s
 
     def solve(self) -> None:
         """Solve one further perturbed QP, and ignore errors of the solver."""
@@ -272,6 +276,7 @@ class _Perturbed:
         )
         self._answers[1:] = [s]
         self._seconds.append(sum(seconds))
+        self.total_seconds += sum(seconds)
 
     def remembered(self, repeats: Sequence[tuple[float, float]]) -> bool | None:
         """Return True if the solver reuses answers; None if this cannot be decided.
@@ -298,13 +303,13 @@ def _repeated(
     the QP by identity.
     """
     repeats: list[tuple[float, float]] = []
-    while not repeats or (
-        sum(map(sum, repeats)) < SAMPLE_SECONDS and len(repeats) < MAX_INNER_LOOPS
-    ):
-        if rest is not None:
+    total = 0.0
+    while not repeats or (total < SAMPLE_SECONDS and len(repeats) < MAX_INNER_LOOPS):
+        if rest is not None and rest.total_seconds < MAX_PERTURBED_SECONDS:
             rest.solve()
         answer, seconds, _ = run(_fresh_copy(qp))
         repeats.append(seconds)
+        total += sum(seconds)
     return answer, repeats
 
 
