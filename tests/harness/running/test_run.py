@@ -124,9 +124,9 @@ OUTCOMES = {
     "raises": (
         Verdict.FAILED,
         "failed",
-        "ValueError: first line second line (adversaries.py:133)",
+        "ValueError: first line second line (adversaries.py:134)",
     ),
-    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:138)"),
+    "exits": (Verdict.FAILED, "failed", "SystemExit: 3 (adversaries.py:139)"),
     "dies": (Verdict.CRASHED, None, "exit code 7: my last words"),
     "segfaults": (Verdict.CRASHED, None, "SIGSEGV"),
     "hangs": (Verdict.TIME_LIMIT, None, "killed after 3 s"),
@@ -151,9 +151,10 @@ OUTCOMES = {
     "zero": (Verdict.WRONG, "solved", ""),
     "mutates": (
         Verdict.FAILED, "failed",
-        "ValueError: assignment destination is read-only (adversaries.py:388)",
+        "ValueError: assignment destination is read-only (adversaries.py:389)",
     ),
-    "mutatesbyforce": (Verdict.VERIFIED, "solved", ""),
+    # the timed solves are those of another QP, and the last one is judged
+    "mutatesbyforce": (Verdict.FAILED, "failed", ""),
     "declines": (Verdict.DECLINED, "declined", "never on a Monday"),
 }  # fmt: skip
 
@@ -185,10 +186,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_valid(
             status, claimed, message = OUTCOMES[solver]
             assert got[solver].verdict == status, (solver, case)
             assert claimed in (..., got[solver].claimed), (solver, case)
-            said = got[solver].message
-            # a pause of a busy machine also causes a note
-            if not said.startswith("took "):
-                assert message in (None, said)
+            assert message in (None, got[solver].message)
 
 
 def test_a_verified_record_contains_costs_and_quantities(measure, tmp_path):
