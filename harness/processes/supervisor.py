@@ -34,6 +34,7 @@ from typing import Any, ClassVar
 from weakref import WeakSet
 
 from mortarbench.harness import limits
+from mortarbench.harness.environment.cpus import fastest_first
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.footprint import Footprint
@@ -132,7 +133,7 @@ class WorkerProcess:
     """Worker process, started by the first request and replaced after it has died.
 
     Two file descriptors, for requests and for replies, are appended to `command`. The
-    worker runs in its own session, on the last CPU that this process may use.
+    worker runs in its own session, on the fastest CPU that this process may use.
     Environment variables set the thread pools of common libraries to one thread.
     The output of the worker goes to the file `log`.
 
@@ -198,7 +199,7 @@ class WorkerProcess:
         memory_limit : limit for all processes of the worker together, in MiB
         """
         self._peak_mib, self._emitted = 0.0, None
-        cpu = max(os.sched_getaffinity(0))
+        cpu = fastest_first(os.sched_getaffinity(0))[0]
         # Stop other workers before this worker resumes, since two workers must never
         # run on one CPU.
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
@@ -363,8 +364,7 @@ class WorkerProcess:
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
         """Start a fork that calls `serve`, or the command if `serve` is None."""
-        usable = os.sched_getaffinity(0)
-        self._cpu = max(usable)
+        self._cpu = fastest_first(os.sched_getaffinity(0))[0]
         self._footprint = Footprint()
         self._unread = bytearray()
         their_requests, self._requests = _pipe()
