@@ -291,14 +291,16 @@ def measure_once(
     reference: Reference,
     *,
     source: Source = Source.FILE,
+    time_limit: float = inf,
 ) -> tuple[Record, Solution | None]:
-    """Measure once without limits, judge the answer, compute quantities and bounds.
+    """Measure once, judge the answer, and compute quantities and bounds.
 
     case : returns the case; the first call builds it
     reference : reference solver, called if the residuals alone do not decide the
         verdict
     source : origin of the QP. For `Source.RANKS`, the ranks judge their answer
         themselves, and the case is built only for values that the ranks cannot evaluate
+    time_limit : limit of the solve, in s
 
     Raises
     ------
@@ -323,7 +325,7 @@ def measure_once(
             lambda: case().qp,
             record,
             request,
-            time_limit=inf,
+            time_limit=time_limit,
             memory_limit=inf,
             prove=proves(reference),
         )
