@@ -96,7 +96,7 @@ def measure(
 
     The solver reuses answers (`Measurement.remembered`) if it returns the same point
     for both QPs, or if each solve of a perturbed QP takes more than
-    `REMEMBERED_SPEEDUP` times the recorded time.
+    `REMEMBERED_SPEEDUP` times as long as the fastest timed solve.
 
     Errors of the solver are not raised. After an exception, a missing library or a
     malformed answer, the result is a solution without a point that has a status and a
@@ -283,8 +283,8 @@ class _Perturbed:
 
         repeats : times of the timed solves, s
         """
-        mean = sum(map(sum, repeats)) / len(repeats)
-        limit = REMEMBERED_SPEEDUP * mean
+        # shortest times, since other programs may delay single solves
+        limit = REMEMBERED_SPEEDUP * min(map(sum, repeats))
         while self._is_possible and len(self._seconds) < MIN_PERTURBED_SOLVES:
             if min(self._seconds) <= limit:
                 break
